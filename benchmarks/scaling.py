@@ -44,12 +44,12 @@ from jaxrl_vis.bench.record import Measurement, to_record, write_json
 from jaxrl_vis.config import Config
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.learner.sharding import make_layout
-from jaxrl_vis.learner.shards import DATA
+from jaxrl_vis.learner.parallel.sharding import make_layout
+from jaxrl_vis.learner.parallel.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.arrays import named_leaves
 from jaxrl_vis.run.checkpoint import FULL, Checkpoints
-from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.compiled.programs import Programs
 
 QUICK = {
     "image_size": 16,
@@ -245,7 +245,7 @@ def compare(kind: str, config: Config, one: list[float], seconds: list[float], i
 def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
     """The time of an update's all-reduce: a line, and the record."""
     train, count = figure.timed.programs.shapes.train, figure.timed.config.devices
-    numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.actor, train.critic)))
+    numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.agent.actor, train.agent.critic)))
     seconds = all_reduce_seconds(numbers, count)
     updates = figure.timed.config.updates_per_iteration
     line = (

@@ -57,7 +57,7 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
     from jaxrl_vis.devices import check_devices, enable_compilation_cache, start_devices
     from jaxrl_vis.learner.environment import locate_env, make_env
     from jaxrl_vis.learner.train_step import make_train_step
-    from jaxrl_vis.run.programs import Programs
+    from jaxrl_vis.run.compiled.programs import Programs
 
     # As `make_trainer` does it: devices start while MuJoCo is imported.
     start_devices()
@@ -75,7 +75,7 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
 
 def parts(clock: Clock, options: argparse.Namespace) -> None:
     """Every program by itself."""
-    import jax
+    from jaxrl_vis.learner.acting.rollout_parts import played_spec
 
     programs = imported(clock, options)
     program, shapes, keys = programs.program, programs.shapes, programs.run_keys
@@ -85,16 +85,14 @@ def parts(clock: Clock, options: argparse.Namespace) -> None:
         clock.lap(f"{name}: trace and lower")
         lowered.compile()
         clock.lap(f"{name}: compile")
-    episodes, _ = jax.eval_shape(program.rollout, shapes.train, keys)
-    clock.lap("rollout: trace")  # JAX keeps what it traced, so what is part of something above takes less than it would alone
-    arguments = {
-        "rollout": (shapes.train, keys),
+    episodes, _ = played_spec(program.env, programs.config.num_envs, len(programs.seeds))
+    arguments = {  # JAX keeps what it traced, so what is part of something above takes less than it would alone
         "insert": (shapes.train, shapes.replay, episodes, keys, shapes.iteration),
         "update_many": (shapes.train, shapes.replay, keys, shapes.iteration),
     }
     for name, inputs in arguments.items():
         traced = getattr(program, name).trace(*inputs)
-        clock.lap(f"{name}: trace again" if name == "rollout" else f"{name}: trace")
+        clock.lap(f"{name}: trace")
         lowered = traced.lower()
         clock.lap(f"{name}: lower")
         lowered.compile()

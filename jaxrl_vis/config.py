@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.methods import METHODS, AuxTaskName, MethodName, WeightingName
+from jaxrl_vis.methods import METHODS, AlgorithmName, AuxTaskName, MethodName, WeightingName
 
 # Values that a field allows, for checks, the command line and its help.
 Pixels = Literal["rgbd", "rgb", "depth"]
@@ -33,7 +33,9 @@ class Config:
     """Preset that this configuration was derived from; for the record only."""
     method: MethodName = "oracle"
     """Source of the rewards: the true state (oracle), similarity in the latent space of an autoencoder trained alongside, or
-    equality of observations (indicator), without or with balancing and filtering."""
+    equality of observations (indicator), without or with balancing and filtering; module:Name for your own."""
+    algorithm: AlgorithmName = "ddpg"
+    """Learning algorithm; module:Name for your own."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
@@ -133,9 +135,9 @@ class Config:
 
     # -- Auxiliary losses (thesis, section 5.2; docs/auxiliary_losses.md)
     aux_tasks: tuple[AuxTaskName, ...] = ()
-    """Auxiliary tasks that the encoders are also trained on."""
+    """Auxiliary tasks that the encoders are also trained on; module:Name for your own."""
     weighting: WeightingName = "none"
-    """Weighting of the auxiliary losses."""
+    """Weighting of the auxiliary losses; module:Name for your own."""
     weighting_interval: int = 5
     """N of OL-AUX: gradient steps between updates of the weights; divides updates_per_iteration."""
     weighting_beta: float | None = None
@@ -151,9 +153,6 @@ class Config:
     """Minimise the logarithms of the losses, with weighting cosine."""
     aux_form: Literal["thesis", "release"] = "thesis"
     """Form of the auxiliary tasks' targets, where the thesis and the authors' release differ (`auxtasks.Options`)."""
-    aux_gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
-    """Method of computing and comparing the gradients of losses, for weightings that compare them; all methods agree
-    (`learner.weighting.gradients`). auto: latents, the fastest, or one_hot for weightings that store whole gradients."""
 
     # -- Networks
     encoder_filters: tuple[int, ...] = (16, 32, 64, 64)
@@ -316,9 +315,10 @@ def preset(name: str, **overrides: Any) -> Config:
     config = PRESETS[name]
     env = str(overrides.get("env", config.env))
     of_task = OF_TASK.get((name, env.removeprefix("Visual")), {})
-    method = METHODS.get(overrides.get("method", config.method))
+    method_name = overrides.get("method", config.method)
+    method = METHODS.get(method_name)
     left_out: tuple[str, ...] = ()
-    if method is not None and method.reward != "oracle":
+    if ":" in str(method_name) or (method is not None and method.reward != "oracle"):
         left_out += OF_ORACLE
     if not env.startswith("Visual") or (method is not None and method.reward == "autoencoder"):
         left_out += OF_IMAGES
@@ -334,6 +334,7 @@ def data_devices_of(config: Config) -> int:
 
 
 _OLD_NAMES = {"frames": "frame_stack"}
+_REMOVED = ("aux_gradients",)  # gradients are the same up to rounding, however they were found
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
@@ -350,6 +351,8 @@ def config_from_dict(values: Mapping[str, Any]) -> Config:
     found: dict[str, Any] = {}
     for saved_name, value in values.items():
         name = _OLD_NAMES.get(saved_name, saved_name)
+        if name in _REMOVED:
+            continue
         if name not in hints:
             raise RequestError(f"unknown option {name!r}{nearest(str(name), hints)}")
         if name in found:

@@ -1,15 +1,17 @@
 """Validation of dataclass fields against their annotations, for values read from JSON or from a command line.
 
-Annotations may be bool, int, float, str, Path, a Literal of words, an optional one of these, or a tuple of any length.
+Annotations may be bool, int, float, str, Path, a Literal of words, a word that is annotated with `Names`, an optional one of
+these, or a tuple of any length.
 """
 
+import dataclasses
 import math
 import numbers
 import types
 import typing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 from jaxrl_vis.errors import RequestError, nearest
 
@@ -18,13 +20,46 @@ _TRUTH = {"true": True, "false": False}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a word", Path: "a path"}
 
 
+@dataclasses.dataclass(frozen=True)
+class Names:
+    """Marks a word that names a part: one of these, or ``module:Name``.
+
+    Attributes:
+        known: Names of the built-in parts.
+    """
+
+    known: tuple[str, ...]
+
+
 def hints(record: type) -> dict[str, Any]:
-    """Maps field names to annotations, without `typing.Annotated`."""
-    return typing.get_type_hints(record)
+    """Field name -> annotation, without what `typing.Annotated` adds, but for `Names`."""
+    return {name: _plain(hint) for name, hint in typing.get_type_hints(record, include_extras=True).items()}
+
+
+def _plain(hint: Any) -> Any:
+    if typing.get_origin(hint) is Annotated:
+        names = _names(hint)
+        return Annotated[str, names] if names else _plain(typing.get_args(hint)[0])
+    if typing.get_origin(hint) is tuple and typing.get_args(hint)[1:] == (...,):
+        return tuple[_plain(typing.get_args(hint)[0]), ...]
+    return hint
+
+
+def _names(hint: Any) -> Names | None:
+    """Return the `Names` of an annotation of one value; None where it is of another kind."""
+    return next((extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Names)), None)
+
+
+def _is_own(name: Any) -> bool:
+    """Return True if a name is written ``module:Name``."""
+    if not isinstance(name, str):
+        return False
+    module, colon, part = name.partition(":")
+    return bool(colon) and all(word.isidentifier() for word in (*module.split("."), part))
 
 
 def unwrap(hint: Any) -> tuple[Any, bool, bool]:
-    """Unwraps optional and tuple annotations.
+    """Split an annotation.
 
     Returns:
         The annotation of a single value, True if None is allowed, and True if the field holds several values.
@@ -38,18 +73,25 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
     return hint, optional, several
 
 
+def names_parts(hint: Any) -> bool:
+    """Return True if a field with this annotation names a part, or several."""
+    return _names(unwrap(hint)[0]) is not None
+
+
 def is_known(hint: Any) -> bool:
     """Returns True if values with this annotation can be checked and parsed."""
     try:
         one, _, _ = unwrap(hint)
     except (ValueError, IndexError):  # a union of several kinds, an empty tuple
         return False
-    return one in _KINDS or typing.get_origin(one) is Literal
+    return one in _KINDS or typing.get_origin(one) is Literal or _names(one) is not None
 
 
 def choices(hint: Any) -> tuple[str, ...]:
-    """Returns the choices of a Literal field, optional or not, or a tuple of them; empty for other fields."""
+    """The words that a field allows, where it is a Literal or `Names`, optional or not, or a tuple of them; else none."""
     hint, _, _ = unwrap(hint)
+    if names := _names(hint):
+        return names.known
     return typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
 
 
@@ -71,6 +113,10 @@ def check(label: str, hint: Any, value: Any) -> Any:
         if not isinstance(value, list | tuple):
             raise RequestError(f"{label} must be a list, not {_quote(value)}")
         return tuple(check(label, one, item) for item in value)
+    if names := _names(one):
+        if value not in names.known and not _is_own(value):
+            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_LONGEST], names.known)}")
+        return value
     if typing.get_origin(one) is Literal:
         if value not in typing.get_args(one):
             raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_LONGEST], typing.get_args(one))}")

@@ -1,15 +1,18 @@
-"""The methods that a learner can be trained with, as data: where rewards come from, and which of them are trusted.
+"""Names of the parts that a learner can be trained with, and its reward methods as data.
 
-Imports no JAX. A new method is a row here and a name in `MethodName`; a new kind of reward is a name in `RewardName` as well.
+A method says where rewards come from, and which of them are trusted. A person's own is a `Method` in a module, named
+``module:Name``, with a function for its reward. Imports no JAX.
 """
 
 import dataclasses
-from typing import Literal
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
 
-MethodName = Literal["oracle", "autoencoder", "indicator", "indicator_balance_filter"]
+from jaxrl_vis.fields import Names
+
 RewardName = Literal["oracle", "autoencoder", "indicator"]
-WeightingName = Literal["none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"]
-AuxTaskName = Literal["forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"]
+RewardFunction = Callable[..., Any]
+"""(`types.Batch`; [B, ...] what was reached, as a goal would show it; R+; R-) -> rewards [B] float32."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,13 +21,14 @@ class Method:
 
     Attributes:
         reward: oracle: distance of the true states; autoencoder: cosine similarity of the latents of an autoencoder that is
-            trained along; indicator: equality of observations.
+            trained along; indicator: equality of observations. Or a function. Rewards are computed anew at every sample, so it
+            must read nothing else than its arguments.
         filter: Whether negatives that the critic contradicts are dropped as false.
         reward_positive, reward_negative: Defaults of R+ and R-.
         balance_probability: Default of p2.
     """
 
-    reward: RewardName
+    reward: RewardName | RewardFunction
     filter: bool
     reward_positive: float
     reward_negative: float = -1.0
@@ -32,18 +36,23 @@ class Method:
 
     @property
     def balance(self) -> bool:
-        """Whether samples are balanced: some take the very next observation as their goal, which is a sure positive."""
+        """True if samples are balanced: some take the very next observation as their goal, which is a sure positive."""
         return self.balance_probability > 0.0
 
     @property
     def needs_images(self) -> bool:
-        """Whether rewards are made from images, so that the environment must show some."""
+        """True if rewards are made from images, so that the environment must show some."""
         return self.reward == "autoencoder"
 
 
-METHODS: dict[MethodName, Method] = {
+METHODS: dict[str, Method] = {
     "oracle": Method(reward="oracle", filter=False, reward_positive=0.0),
     "autoencoder": Method(reward="autoencoder", filter=False, reward_positive=1.0, reward_negative=0.0),
     "indicator": Method(reward="indicator", filter=False, reward_positive=1.0),
     "indicator_balance_filter": Method(reward="indicator", filter=True, reward_positive=1.0, balance_probability=0.5),
 }
+
+MethodName = Annotated[str, Names(tuple(METHODS))]
+WeightingName = Annotated[str, Names(("none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"))]
+AuxTaskName = Annotated[str, Names(("forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"))]
+AlgorithmName = Annotated[str, Names(("ddpg",))]

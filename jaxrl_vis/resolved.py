@@ -1,18 +1,20 @@
-"""What follows from a configuration and an environment's horizon: discount, rewards, filter, bounds of targets."""
+"""Values that follow from a configuration and an environment's horizon: discount, rewards, filter, bounds of targets."""
 
 import dataclasses
 import math
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.methods import METHODS
+from jaxrl_vis.methods import METHODS, Method
+from jaxrl_vis.plugins import call, find
 
 
 @dataclasses.dataclass(frozen=True)
 class Resolved:
-    """What follows from a `Config` and the environment's horizon: no None left.
+    """Values that follow from a `Config` and the environment's horizon: no None left.
 
     Attributes:
+        method: Source of rewards.
         horizon: T, control steps in an episode.
         discount: gamma.
         reward_positive, reward_negative: R+ and R-.
@@ -22,6 +24,7 @@ class Resolved:
         target_minimum, target_maximum: Bounds of the critic's targets.
     """
 
+    method: Method
     horizon: int
     discount: float
     reward_positive: float
@@ -41,9 +44,10 @@ def resolve(config: Config, horizon: int) -> Resolved:
     rewards 0/-1 a fresh critic (Q near 0) does: there it starts at R-/(1-gamma), the least value any state can have.
 
     Raises:
-        RequestError: The discount or the filter threshold lies outside its range.
+        RequestError: The discount or the filter threshold lies outside its range, or there is no such method.
     """
-    method = METHODS[config.method]
+    method = find("method", config.method, METHODS, config.env_folder)
+    method = call("method", config.method, method, of=Method)
     discount = 1.0 - 1.0 / horizon if config.discount is None else config.discount
     if not 0.0 <= discount < 1.0:
         raise RequestError(f"discount must lie in [0, 1), not {discount}; leave it out for 1 - 1/horizon")
@@ -63,6 +67,7 @@ def resolve(config: Config, horizon: int) -> Resolved:
         if not low < threshold < best:
             raise RequestError(f"filter_threshold {threshold} lies outside its band ({low:g}, {best:g})")
     return Resolved(
+        method=method,
         horizon=horizon,
         discount=discount,
         reward_positive=positive,

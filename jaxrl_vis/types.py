@@ -8,7 +8,7 @@ An observation is a planar image [C, H, W] uint8 or a state vector [S] float32; 
 """
 
 import dataclasses
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 
@@ -36,14 +36,13 @@ class Episodes(Replaceable):
         observations: [E, T+2, ...] after 0, 1, ... T steps, then the goal's.
         states: [E, T+2, G] float32, the true goal-space states at the same times.
         actions: [E, T, A] float32, as executed (with exploration noise).
-        flow: [E, T, H, W] uint8, magnitude of the optical flow of each step (`auxtasks.optical_flow.to_bytes`); None if no
-            auxiliary task uses it.
+        stored: [E, T, ...] uint8 or float32, values that auxiliary tasks computed for each step, by task (`AuxTask.episode`).
     """
 
     observations: jax.Array
     states: jax.Array
     actions: jax.Array
-    flow: jax.Array | None = None
+    stored: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
 
 @jax.tree_util.register_dataclass
@@ -76,7 +75,8 @@ class Batch(Replaceable):
             goals may still change, and where the learner itself computes the reward (method autoencoder).
         discount: [B] float32, discount of the value after these steps; None: that of one step.
         shift: [B, 2] int32, pixels by which to shift the images down and to the right; None: no shift.
-        targets: `auxtasks.Targets` of auxiliary tasks; None without such tasks.
+        views: [B, ...] images in the observation's dtype that auxiliary tasks have computed, by task (`AuxTask.view`).
+        targets: Targets of auxiliary tasks, by task.
         reached: [B, ...] the observation after the action in the form of a goal, if the forms differ (stacked images); else
             None.
         success: [B] float32, 1 where the true state after the action reaches the goal, else 0; for diagnostics only. None if
@@ -90,7 +90,8 @@ class Batch(Replaceable):
     reward: jax.Array | None = None
     discount: jax.Array | None = None
     shift: jax.Array | None = None
-    targets: Any = None
+    views: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    targets: dict[str, Any] = dataclasses.field(default_factory=dict)
     reached: jax.Array | None = None
     success: jax.Array | None = None
 
@@ -126,38 +127,42 @@ class NormalizerState(Replaceable):
     sum_of_squares: jax.Array
 
 
+class Statistics(NamedTuple):
+    """Observation statistics of a learner.
+
+    Attributes:
+        observations: Statistics of observations; of goals, too, unless they have their own.
+        own_goals: Those of goals alone; None where they have not.
+    """
+
+    observations: NormalizerState
+    own_goals: NormalizerState | None
+
+    @property
+    def goals(self) -> NormalizerState:
+        """Statistics that goals are normalised with."""
+        return self.observations if self.own_goals is None else self.own_goals
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrainState(Replaceable):
-    """The learner: networks, their targets, optimisers, observation statistics.
+    """The learner: an agent, and observation statistics.
 
     Attributes:
-        actor, critic: Online parameters. The actor is only a head if it shares the critic's encoder.
-        target_actor, target_critic: Slowly updated copies; only heads if there is no target encoder.
-        actor_optimizer, critic_optimizer: optax states.
+        agent: State of the algorithm, a pytree of its own (`learner.algorithm`).
         normalizer: Observation statistics.
         goal_normalizer: Separate statistics of goals; None if they share ``normalizer``.
-        weighting: `weighting.WeightingState` of the auxiliary losses; None for a stateless weighting.
-        autoencoder: `latent_reward.AutoencoderState`; None unless the rewards come from it.
-        updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
     """
 
-    actor: Params
-    critic: Params
-    target_actor: Params
-    target_critic: Params
-    actor_optimizer: Any
-    critic_optimizer: Any
+    agent: Any
     normalizer: NormalizerState
-    updates: jax.Array
     goal_normalizer: NormalizerState | None = None
-    weighting: Any = None
-    autoencoder: Any = None
 
     @property
-    def goal_statistics(self) -> NormalizerState:
-        """Statistics that normalise goals."""
-        return self.normalizer if self.goal_normalizer is None else self.goal_normalizer
+    def statistics(self) -> Statistics:
+        """Both statistics."""
+        return Statistics(self.normalizer, self.goal_normalizer)
 
 
 @jax.tree_util.register_dataclass

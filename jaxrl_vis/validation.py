@@ -67,8 +67,7 @@ def validate(config: Config) -> Config:
         raise RequestError(
             f"actor_interval ({config.actor_interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
         )
-    method = METHODS[config.method]
-    if config.n_step > 1 and method.filter:
+    if config.n_step > 1 and config.method in METHODS and METHODS[config.method].filter:
         raise RequestError(f"n_step {config.n_step} with method {config.method}: the filter's valid range assumes one step")
     _validate_reward(config)
     _validate_auxiliary(config)
@@ -121,7 +120,7 @@ def _validate_devices(config: Config) -> None:
 
 def _validate_reward(config: Config) -> None:
     """Raises a RequestError for reward options that do not fit the method or contradict each other."""
-    kind = METHODS[config.method].reward
+    kind = METHODS[config.method].reward if config.method in METHODS else "own"  # a function of transitions
     errors = {name: getattr(config, name) > 0.0 for name in ("reward_noise", *_FALSE_REWARDS)}
     reads_states = {"n_step": config.n_step > 1, "trivial_goals": config.trivial_goals < 1.0, **errors}
     for name, is_set in reads_states.items():

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-LANGUAGES = {"python", "sh", "toml", "diff"}
+LANGUAGES = {"python", "sh", "toml"}
 # What begins a line of a shell block; a block without a language that begins otherwise is a drawing.
 PROGRAMS = {"cd", "git", "jaxrl-vis", "make", "pip", "python", "source", "uv"}
 
@@ -92,17 +92,3 @@ def check_other(words: list[str]) -> None:
         for word in rest:
             option = word.partition("=")[0]
             assert not option.startswith("--") or f'"{option}"' in script, f"{rest[0]} has no {option}"
-
-
-def apply_diff(text: str, root: Path) -> None:
-    """Applies a diff block to the files below ``root``: `--- path`, then hunks, parted by `@@`, of context, - and + lines."""
-    for part in re.split(r"^--- ", text, flags=re.MULTILINE)[1:]:
-        name, _, body = part.partition("\n")
-        file = root / name
-        for hunk in body.split("@@\n"):
-            lines = hunk.splitlines()
-            before = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "+")
-            after = "".join(f"{line[1:]}\n" for line in lines if line[:1] != "-")
-            source = file.read_text()
-            assert source.count(before) == 1, f"{name} has no such lines any more:\n{before}"
-            file.write_text(source.replace(before, after))

@@ -16,8 +16,12 @@ import numpy as np
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import Terminated
-from jaxrl_vis.learner.replay import make_replay
-from jaxrl_vis.learner.sharding import ONE_DEVICE
+from jaxrl_vis.learner.acting.evaluate import Evaluation
+from jaxrl_vis.learner.acting.rollout import Exploration
+from jaxrl_vis.learner.acting.rollout_parts import played_spec
+from jaxrl_vis.learner.iteration import Learned
+from jaxrl_vis.learner.memory.replay import make_replay
+from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.folder import read_run_id
@@ -38,8 +42,19 @@ class FakeProgram:
     """See the module."""
 
     def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
-        self.config, self.traces, self.layout, self.parts = config, 0, ONE_DEVICE, None
-        self.env = types.SimpleNamespace(distance_unit="m", threshold=0.05, control_period=0.04, horizon=HORIZON, frame_stack=1)
+        self.config, self.traces, self.layout = config, 0, ONE_DEVICE
+        self.env = types.SimpleNamespace(
+            distance_unit="m",
+            threshold=0.05,
+            control_period=0.04,
+            horizon=HORIZON,
+            frame_stack=1,
+            observation_spec=jax.ShapeDtypeStruct((1, config.image_size, config.image_size), jnp.uint8),
+            goal_state_size=3,
+            action_size=4,
+        )
+        self.plays_any, self.part_size, self.exploration = False, config.num_envs, Exploration()
+        self.parts_spec = [played_spec(self.env, config.num_envs, config.seeds)]
         self.steps_per_iteration = config.num_envs * HORIZON
         self.updates_per_iteration = 3
         self.num_iterations = math.ceil(config.env_steps / self.steps_per_iteration)
@@ -50,16 +65,13 @@ class FakeProgram:
 
         def init_one(key):
             parameters = {"layer": {"kernel": jax.random.uniform(key, (4, 3)) - 0.5, "bias": jnp.zeros(3)}}
-            train = TrainState(
-                actor=parameters,
-                critic=parameters,
-                target_actor=parameters,
-                target_critic=parameters,
-                actor_optimizer=(jnp.zeros((), jnp.int32), parameters),
-                critic_optimizer=(),
-                normalizer=NormalizerState(jnp.zeros(()), jnp.zeros((1, size, size)), jnp.ones((1, size, size))),
-                updates=jnp.zeros((), jnp.int32),
-            )
+            agent = {
+                "actor": parameters,
+                "critic": parameters,
+                "optimizers": ((jnp.zeros((), jnp.int32), parameters), ()),
+                "updates": jnp.zeros((), jnp.int32),
+            }
+            train = TrainState(agent, NormalizerState(jnp.zeros(()), jnp.zeros((1, size, size)), jnp.ones((1, size, size))))
             replay = Episodes(
                 observations=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
                 states=jnp.zeros((episodes, HORIZON + 2, 3)),
@@ -67,29 +79,36 @@ class FakeProgram:
             )
             return LoopState(train, ReplayState(replay, jnp.zeros((), jnp.int32)), key, jnp.zeros((), jnp.int32))
 
-        def iterate_one(loop):
-            self.traces += 1
+        def noise_of(key):
             # One draw, spread out by arithmetic that compiles faster than many draws.
-            noise = jax.random.uniform(jax.random.fold_in(loop.key, loop.iteration), ())
-            old = loop.replay.episodes
+            return jax.random.uniform(key, ())
 
+        def play_one(train, key):
             def spread(like):
                 count = jnp.arange(config.num_envs * math.prod(like.shape[1:]), dtype=jnp.uint32)
-                words = (count * jnp.uint32(2654435761)) ^ (noise * 2.0**24).astype(jnp.uint32)
+                words = (count * jnp.uint32(2654435761)) ^ (noise_of(key) * 2.0**24).astype(jnp.uint32)
                 values = ((words ^ (words >> 15)) >> 8).reshape((config.num_envs, *like.shape[1:]))
-                return values.astype(jnp.uint8) if like.dtype == jnp.uint8 else values.astype(jnp.float32) / 2.0**24 - 0.5
+                return values.astype(like.dtype) if like.dtype == jnp.uint8 else values.astype(jnp.float32) / 2.0**24 - 0.5
 
-            new = jax.tree.map(spread, old)
+            episodes, outcome = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), self.parts_spec[0])
+            return jax.tree.map(spread, episodes), {name: jnp.zeros(leaf.shape) for name, leaf in outcome.items()}
+
+        def learn_one(loop, parts):
+            self.traces += 1
+            noise = noise_of(jax.random.fold_in(loop.key, loop.iteration))
+            ((new, _),) = parts
+            old = loop.replay.episodes
             start = (loop.iteration * config.num_envs) % episodes
             bad = loop.iteration == (-1 if nan_at is None else nan_at)
             if break_state:
                 new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
             replay = jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, start, 0), old, new)
             step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.observations.mean()
-            actor = {"layer": {"kernel": loop.train.actor["layer"]["kernel"] + step, "bias": loop.train.actor["layer"]["bias"]}}
+            agent = loop.train.agent
+            actor = {"layer": agent["actor"]["layer"] | {"kernel": agent["actor"]["layer"]["kernel"] + step}}
             loss = jnp.where(bad, jnp.nan, step**2)
-            critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, loop.train.critic)
-            train = loop.train.replace(actor=actor, critic=critic, updates=loop.train.updates + 3)
+            critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, agent["critic"])
+            train = loop.train.replace(agent=agent | {"actor": actor, "critic": critic, "updates": agent["updates"] + 3})
             memory = ReplayState(replay, jnp.minimum(loop.replay.size + config.num_envs, episodes))
             metrics = {
                 "train/critic_loss": loss,
@@ -98,19 +117,23 @@ class FakeProgram:
                 "train/filtered_share": jnp.float32(filtered_share),
                 "guard/nonfinite": jnp.sum(~jnp.isfinite(loss)).astype(jnp.float32),
             }
-            return LoopState(train, memory, loop.key, loop.iteration + 1), metrics
+            return Learned(LoopState(train, memory, loop.key, loop.iteration + 1), metrics)
 
         def evaluate_one(train, key):
-            score = jax.nn.sigmoid(train.updates / 9.0 - 1.0 + 0.1 * train.actor["layer"]["kernel"].sum())
+            kernel, updates = train.agent["actor"]["layer"]["kernel"], train.agent["updates"]
+            score = jax.nn.sigmoid(updates / 9.0 - 1.0 + 0.1 * kernel.sum())
             y, x = jnp.mgrid[0:size, 0:size]
             t = jnp.arange(HORIZON + 1)[:, None, None]
             ball = ((y - 3 - t) ** 2 + (x - 4 - t) ** 2 < 9) * 120
             frames = jnp.broadcast_to((200 - ball).astype(jnp.uint8)[None, :, None], (3, HORIZON + 1, 1, size, size))
             images = {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
-            return {"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}, images
+            return Evaluation({"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}, images)
 
+        play_seeds = jax.vmap(play_one)
         self.init = jax.jit(jax.vmap(init_one, out_axes=_SEED_AXES))
-        self.train_iteration = jax.jit(jax.vmap(iterate_one, in_axes=(_SEED_AXES,), out_axes=(_SEED_AXES, 0)), donate_argnums=0)
+        self.keys = jax.jit(jax.vmap(jax.random.fold_in, in_axes=(0, None)))
+        self.play = jax.jit(lambda train, keys, first, exploration: play_seeds(train, keys))
+        self.learn = jax.jit(jax.vmap(learn_one, (_SEED_AXES, 0), Learned(_SEED_AXES, 0)), donate_argnums=0)
         self.evaluate = jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))
 
 

@@ -8,6 +8,7 @@ import probe_environments as probes
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import preset
+from jaxrl_vis.learner.acting.rollout_parts import join_parts
 from jaxrl_vis.learner.train_step import make_train_step
 
 # Fields that only gradient steps and evaluations read. (`normalizer_source` can make insertion relabel, too.)
@@ -33,12 +34,30 @@ def begin(program, keys):
     return _compiled.setdefault(("init", start, of_env, program.resolved.critic_output_bias), program.init)(keys)
 
 
+def _parts(program, play, train, keys):
+    firsts = range(0, program.config.num_envs, program.part_size)
+    return [play(train, keys, jnp.int32(first), program.exploration) for first in firsts]
+
+
+def rollout(program, train, keys):
+    """Episodes [S, E, ...] and outcome of a rollout of training, with typed keys [S]."""
+    parts = _parts(program, program.play, train, keys)
+    return jax.tree.map(lambda *leaves: join_parts(leaves, program.config.num_envs, axis=1), *parts)
+
+
+def train_iteration(program, loop):
+    """What `Programs.train_iteration` does, by functions that are compiled when they are called; ``loop`` is donated."""
+    return program.learn(loop, _parts(program, program.play, loop.train, program.keys(loop.key, loop.iteration)))
+
+
 def experienced(program, key):
     """Arguments of ``program.update_many`` after one rollout, which programs share that differ in their updates only."""
     assert program.config.normalizer_source == "rollouts"
     what = type(program.env), _without(program.config, _LATER)
     loop, keys = begin(program, key[None]), key[None]
-    episodes, _ = _compiled.setdefault(("rollout", *what), program.rollout)(loop.train, keys)
+    play = _compiled.setdefault(("play", *what), program.play)
+    parts = _parts(program, play, loop.train, keys)
+    episodes, _ = jax.tree.map(lambda *leaves: join_parts(leaves, program.config.num_envs, axis=1), *parts)
     insert = _compiled.setdefault(("insert", *what), program.insert)
     return *insert(loop.train, loop.replay, episodes, keys, loop.iteration), keys, loop.iteration
 
@@ -58,10 +77,12 @@ class OneOf(probes.Probe):
 
 @functools.cache
 def iteration_of_one(several, config):
-    """(which one, LoopState) -> what ``train_iteration`` returns, in one of several probes: one program for all of them."""
+    """(which one, LoopState) -> what `train_iteration` returns, in one of several probes: one program for all of them."""
 
     def iterate(chosen, loop):
-        return make_train_step(OneOf(several, chosen), config).train_iteration.__wrapped__(loop)
+        program = make_train_step(OneOf(several, chosen), config)
+        keys = program.keys.__wrapped__(loop.key, loop.iteration)
+        return program.learn.__wrapped__(loop, _parts(program, program.play.__wrapped__, loop.train, keys))
 
     compiled = jaxrl_vis_envs.jit(iterate, donate_argnums=1)
     return lambda chosen, loop: compiled(jnp.int32(chosen), loop)

@@ -12,13 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
+from learners import train_iteration
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner.sharding import DATA, Layout, Shards, Spec
+from jaxrl_vis.learner.parallel.sharding import DATA, Layout, Shards, Spec
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.arrays import named_leaves
 from jaxrl_vis.run.checkpoint import Checkpoints
-from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.compiled.programs import Programs
 
 ENV = probes.GoWhereTold()
 CONFIG = preset(
@@ -84,13 +85,13 @@ def trained(config, layout=None, iterations=3):
     keys = jnp.stack([jax.random.key(seed) for seed in range(config.seeds)])
     loop, found = program.init(program.layout.put(keys, program.layout.by_seed)), []
     for _ in range(iterations):
-        loop, metrics = program.train_iteration(loop)
+        loop, metrics = train_iteration(program, loop)
         found.append(jax.device_get(metrics))
     key = program.layout.put(jax.random.key(9), program.layout.everywhere)
     return program, loop, [*found, jax.device_get(program.evaluate(loop.train, key)[0])]
 
 
-def trained_in_parts(config, iterations=3):
+def trained_by_run(config, iterations=3):
     """The last loop state and the metrics of all iterations, as a run computes them."""
     programs = Programs(config, make_train_step(ENV, config))
     loop, found = programs.init(programs.run_keys), []
@@ -137,7 +138,7 @@ def resumed(loop, folder, program):
     checkpoints.save_full(3, loop, {})
     restored = checkpoints.restore_for_resume(jax.eval_shape(program.init, jnp.stack([jax.random.key(0)] * CONFIG.seeds)))
     checkpoints.close()
-    after, metrics = program.train_iteration(restored.loop)
+    after, metrics = train_iteration(program, restored.loop)
     return int(after.iteration), all(np.isfinite(values).all() for values in metrics.values())
 
 
@@ -146,15 +147,17 @@ def main() -> None:
     one, alone, of_one = trained(CONFIG)
     program, loop, of_two = trained(CONFIG.replace(devices=2))
     found["seeds: metrics"], found["seeds: state"] = difference(of_one, of_two), difference(alone, loop)
-    text = program.train_iteration.lower(loop).compile().as_text()  # what has just run
+    playing = loop.train, loop.key, jnp.int32(0), program.exploration
+    programs = program.play.lower(*playing), program.learn.lower(loop, program.parts_spec)
+    text = "".join(lowered.compile().as_text() for lowered in programs)  # what has just run
     found["seeds: communication"] = [word for word in COLLECTIVES if word in text]
 
     wide = CONFIG.replace(devices=4, data_devices=2)
     program, loop, of_four = trained(wide)
     _, emulated, of_parts = trained(wide, Emulated(shards=Shards(2)))
     found["data: metrics"], found["data: state"] = difference(of_parts, of_four), difference(emulated, loop)
-    loop_of_parts, of_run = trained_in_parts(wide)
-    found["parts: metrics"], found["parts: state"] = difference(of_four[:-1], of_run), difference(loop, loop_of_parts)
+    loop_of_run, of_run = trained_by_run(wide)
+    found["run: metrics"], found["run: state"] = difference(of_four[:-1], of_run), difference(loop, loop_of_run)
     rollouts = [
         {name: metrics[name] for name in ("train/success", "train/goal_distance")} for metrics in (of_one[0], of_four[0])
     ]

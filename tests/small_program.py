@@ -8,7 +8,8 @@ import jaxrl_vis_envs
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.run.kept_programs import HOST_FIELDS
+from jaxrl_vis.learner.train_step import JIT_OPTIONS
+from jaxrl_vis.run.compiled.trace_cache import HOST_FIELDS
 from jaxrl_vis_envs.base import GoalEnv
 
 _TRACES: collections.Counter[Config] = collections.Counter()
@@ -22,14 +23,13 @@ def _trained_alike(config: Config) -> Config:
 @functools.cache
 def _program_of(config: Config) -> train_step.TrainStep:
     program = train_step.make_train_step(make_env(config), config)
-    original = program.parts.learn.__wrapped__
+    original = program.learn.__wrapped__
 
-    def learn_parts(loop, parts):  # of the same name, so that what another process has compiled is found
+    def learn(loop, parts):  # of the same name, so that what another process has compiled is found
         _TRACES[config] += 1
         return original(loop, parts)
 
-    learn = jaxrl_vis_envs.jit(learn_parts, donate_argnums=0)
-    return dataclasses.replace(program, parts=dataclasses.replace(program.parts, learn=learn))
+    return dataclasses.replace(program, learn=jaxrl_vis_envs.jit(learn, **JIT_OPTIONS["learn"]))
 
 
 def make_train_step(env: GoalEnv, config: Config) -> train_step.TrainStep:

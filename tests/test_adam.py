@@ -8,7 +8,7 @@ import probe_environments as probes
 from learners import experienced
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner import adam
+from jaxrl_vis.learner.ddpg import adam
 from jaxrl_vis.learner.train_step import make_train_step
 
 RATES = (1e-3, 3e-2)
@@ -54,6 +54,6 @@ def test_a_learner_goes_on_where_it_stopped():
         train, *given = experienced(program, jax.random.key(0))
         for _ in range(calls):
             train, _ = program.update_many(train, *given)
-        states = train.critic_optimizer, train.actor_optimizer
-        counters.append([int(each[0]) for each in (*map(adam.count, states), train.updates)])
+        states = train.agent.critic_optimizer, train.agent.actor_optimizer
+        counters.append([int(each[0]) for each in (*map(adam.count, states), train.agent.updates)])
     assert counters == [[4, 2, 4], [4, 2, 4]]

@@ -1,5 +1,6 @@
 """Auxiliary losses inside the learner: which parameters they reach, how they are weighted, and what is refused."""
 
+import dataclasses
 import functools
 
 import jax
@@ -10,15 +11,16 @@ import pytest
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
-from jaxrl_vis.learner.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.auxtasks import optical_flow
-from jaxrl_vis.learner.ddpg import make_ddpg
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.replay import Indices, Replay
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
+from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
+from jaxrl_vis.learner.memory.replay import Indices, Replay
+from jaxrl_vis.learner.memory.sampling import Choice, Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.resolved import resolve
-from jaxrl_vis.types import Episodes
+from jaxrl_vis.types import Episodes, Statistics
 from jaxrl_vis.validation import validate
 
 SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
@@ -55,12 +57,12 @@ def drawn_places():
 
 
 @functools.cache
-def stored(keeps_flow):
+def stored(with_flow):
     """The rollout as a learner stores it that does or does not learn optical flow."""
-    if not keeps_flow:
+    if not with_flow:
         return rollout()
     auxiliary = make_auxiliary(config(aux_tasks=("optical_flow",), weighting="sum"), SPEC, ACTIONS, 1, jnp.float32)
-    return jax.jit(auxiliary.with_flow)(rollout())
+    return jax.jit(auxiliary.with_stored)(rollout())
 
 
 @functools.cache
@@ -74,11 +76,12 @@ def fresh(tasks, encoders, target_encoder, filters):
 
 
 @functools.cache
-def learner(**overrides):
+def learner(way=None, **overrides):
     """The learner, one update as a compiled function, and its state and batch at the beginning."""
     chosen = config(**overrides)
     networks = Networks(chosen, SPEC, ACTIONS, 0.0)
     auxiliary = make_auxiliary(chosen, SPEC, ACTIONS, 1, networks.dtype)
+    auxiliary = auxiliary if way is None else dataclasses.replace(auxiliary, way=way)
     resolved = resolve(chosen, HORIZON)
     algorithm = make_ddpg(networks, chosen, resolved, auxiliary)
     replay = Replay(1, EPISODES, HORIZON)
@@ -96,10 +99,10 @@ def learner(**overrides):
         gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, batch), with_actor)
         return algorithm.apply(working, gradients), gradients, metrics
 
-    batch = chosen_batch(stored(auxiliary.keeps_flow), drawn_places(), jax.random.key(2))
+    batch = chosen_batch(stored("optical_flow" in auxiliary.tasks), drawn_places(), jax.random.key(2))
     start = fresh(chosen.aux_tasks, chosen.encoders, chosen.target_encoder, chosen.encoder_filters)
-    start = start.replace(weighting=auxiliary.init_state(start.critic["encoder"]))
-    return algorithm, update, algorithm.begin(start), batch
+    start = start.replace(weighting=auxiliary.init_state(start.critic))
+    return algorithm, update, algorithm.begin(start, Statistics(normalizer.init(SPEC), None)), batch
 
 
 def sizes(tree):
@@ -119,7 +122,7 @@ def test_every_auxiliary_loss_is_learned_and_reaches_both_encoders():
         working, _, last = update(working, batch)
     for name in ALL:
         assert last[f"train/loss/{name}"] < 0.9 * first[f"train/loss/{name}"], name
-    assert set(working.train.target_critic) == {"encoder", "head"}
+    assert set(working.agent.target_critic) == {"encoder", "head"}
 
 
 def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
@@ -135,11 +138,10 @@ def test_a_weighted_gradient_is_the_sum_of_the_losses_own():
     assert np.abs(both - found[()]).max() > 0.1 * np.abs(both).max()
 
 
-@pytest.mark.parametrize("way", ["one_hot", "jvp", "latents"])
-def test_all_ways_to_gradients_agree(way):
-    settings = {"aux_tasks": ("forward_dynamics", "egomotion"), "weighting": "ol_aux", "aux_gradients": "per_loss"}
-    _, update, working, batch = learner(**settings)
-    _, other_update, _, _ = learner(**settings | {"aux_gradients": way})
+def test_both_ways_to_gradients_agree():
+    settings = {"aux_tasks": ("forward_dynamics", "egomotion"), "weighting": "ol_aux"}
+    _, update, working, batch = learner("per_loss", **settings)
+    _, other_update, _, _ = learner(**settings)
     one, other = update(working, batch), other_update(working, batch)
     for left, right in zip(jax.tree.leaves(one[1:]), jax.tree.leaves(other[1:]), strict=True):
         np.testing.assert_allclose(left, right, rtol=2e-3, atol=1e-5)
@@ -204,14 +206,15 @@ def test_an_actor_that_shares_the_encoder_has_no_heads():
 
 def test_kept_flow_is_that_of_the_images():
     episodes = jax.device_get(stored(True))
-    assert episodes.flow is not None and episodes.flow.shape == (EPISODES, HORIZON, 16, 16) and episodes.flow.dtype == jnp.uint8
+    (flow,) = episodes.stored.values()
+    assert flow.shape == (EPISODES, HORIZON, 16, 16) and flow.dtype == jnp.uint8
     images = episodes.observations
     wanted = jax.jit(optical_flow.flow_strength)(images[1, 2][None], images[1, 3][None])[0]
-    np.testing.assert_allclose(optical_flow.from_bytes(episodes.flow[1, 2]), np.clip(wanted, 0.0, 255 / 16), atol=1 / 32 + 1e-4)
+    np.testing.assert_allclose(optical_flow.from_bytes(flow[1, 2]), np.clip(wanted, 0.0, 255 / 16), atol=1 / 32 + 1e-4)
     assert wanted.max() > 0.5
     _, _, _, batch = learner(aux_tasks=("optical_flow",), weighting="sum")
     place = drawn_places()[:, 3]
-    np.testing.assert_array_equal(batch.targets.flow[3], optical_flow.from_bytes(episodes.flow[place[0], place[1]]))
+    np.testing.assert_array_equal(batch.targets["optical_flow"][3], optical_flow.from_bytes(flow[place[0], place[1]]))
 
 
 @pytest.mark.parametrize(
@@ -219,10 +222,6 @@ def test_kept_flow_is_that_of_the_images():
     [
         ({"aux_tasks": ("egomotion",)}, "weighting none learns none: choose --weighting ol_aux"),
         ({"weighting": "ol_aux"}, "has no auxiliary tasks to weight: add --aux-tasks"),
-        (
-            {"weighting": "ol_aux_ablation", "aux_tasks": ("egomotion",), "aux_gradients": "jvp"},
-            "keeps whole gradients here, which --aux-gradients jvp does not find",
-        ),
         (
             {"weighting": "ol_aux", "aux_tasks": ("egomotion",), "weighting_interval": 3},
             "weighting_interval (3) must divide updates_per_iteration (10)",
@@ -262,16 +261,13 @@ def test_an_actor_learns_the_logarithm_of_value_and_penalty_together_where_asked
     np.testing.assert_allclose(metrics["train/actor_loss"], np.log(penalty), atol=0.2)
 
 
-def test_a_head_begins_alike_wherever_its_task_stands_in_the_list(monkeypatch):
+def test_a_head_begins_alike_wherever_its_task_stands_in_the_list():
     """Runs of the thesis's five tasks repeat themselves, and a task from elsewhere needs no place among them."""
     key = jax.random.key(3)
-    before = [*ALL]
-    monkeypatch.setattr(auxtasks, "NAMES", ("new_one", *reversed(before)))
-    tasks = {
-        name: auxtasks.AuxTask(name, frozenset(), lambda key: {"key": jax.random.key_data(key)}, lambda *_: 0.0, lambda *_: 0.0)
-        for name in ("new_one", *before, "another")
-    }
+    made = list(auxtasks.make([*reversed(ALL)], auxtasks.Spec(SPEC, ACTIONS, 8)).values())
+    new = [auxtasks.AuxTask(name, made[0].init, lambda *_: 0.0, lambda *_: 0.0) for name in ("new_one", "another")]
+    tasks = {task.name: task._replace(init=lambda key: {"key": jax.random.key_data(key)}) for task in (new[0], *made, new[1])}
     heads = Auxiliary(tasks, make_weighting("balance")).init_heads(key)
-    for number, name in enumerate(before):
+    for number, name in enumerate(ALL):
         np.testing.assert_array_equal(heads[name]["key"], jax.random.key_data(jax.random.fold_in(key, number)))
     assert len({tuple(head["key"].tolist()) for head in heads.values()}) == 7

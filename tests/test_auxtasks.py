@@ -9,17 +9,21 @@ import optax
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import auxtasks, decoder_kernel
+from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import autoencoder, heads, optical_flow
-from jaxrl_vis.learner.blocks import from_blocks
-from jaxrl_vis.learner.encoder_kernel_patches import to_patches
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.networks.blocks import from_blocks
+from jaxrl_vis.learner.networks.kernels import decoder as decoder_kernel
+from jaxrl_vis.learner.networks.kernels.patches import to_patches
+from jaxrl_vis.learner.weighting import make_weighting
+from jaxrl_vis.types import Batch
 
-LATENTS = ("latent_t", "latent_tp1", "latent_moved")
+LATENTS = ("latent_t", "latent_tp1", "latent_view")
 # The latents that each loss has a gradient to.
 REACHES = {
     "forward_dynamics": {"latent_t"},
     "inverse_dynamics": {"latent_t", "latent_tp1"},
-    "egomotion": {"latent_t", "latent_moved"},
+    "egomotion": {"latent_t", "latent_view"},
     "autoencoder": {"latent_t"},
     "optical_flow": {"latent_t", "latent_tp1"},
 }
@@ -29,17 +33,16 @@ def make_spec(channels, size, latent_size=8, **sizes):
     return auxtasks.Spec(jax.ShapeDtypeStruct((channels, size, size), jnp.uint8), 3, latent_size, **sizes)
 
 
-def make_view(spec, batch, motions=1):
-    """Random numbers wherever a loss may look."""
+def make_views(spec, batch):
+    """Random numbers wherever a loss may look, by task."""
     keys = iter(jax.random.split(jax.random.key(0), 7))
     latents = {name: jax.random.normal(next(keys), (batch, spec.latent_size)).astype(spec.dtype) for name in LATENTS}
-    return auxtasks.View(
-        **latents,
-        action=jax.random.uniform(next(keys), (batch, spec.action_size), minval=-1.0),
-        motion=jax.random.uniform(next(keys), (batch, motions), minval=-1.0),
-        image=jax.random.normal(next(keys), (batch, *spec.observation.shape)),
-        flow=jax.random.exponential(next(keys), (batch, *spec.observation.shape[1:])),
-    )
+    action = jax.random.uniform(next(keys), (batch, spec.action_size), minval=-1.0)
+    motion = jax.random.uniform(next(keys), (batch, 3 if spec.options.max_shift else 1), minval=-1.0)
+    image = jax.random.normal(next(keys), (batch, *spec.observation.shape))
+    flow = jax.random.exponential(next(keys), (batch, *spec.observation.shape[1:]))
+    view, targets = auxtasks.View(**latents, action=action, image=image), {"egomotion": motion, "optical_flow": flow}
+    return {name: view.replace(target=targets.get(name)) for name in auxtasks.NAMES}
 
 
 def init_all(tasks):
@@ -50,10 +53,11 @@ def test_each_task_learns_what_it_is_to_predict():
     spec = make_spec(4, 16, latent_size=24, levels=2)
     tasks, optimizer = auxtasks.make(auxtasks.NAMES, spec), optax.adam(1e-2)
     patches = jax.random.normal(jax.random.key(2), (16, 4, 4, 4))  # images have some structure, unlike noise
-    view = make_view(spec, 16).replace(image=jnp.repeat(jnp.repeat(patches, 4, axis=2), 4, axis=3))
+    image = jnp.repeat(jnp.repeat(patches, 4, axis=2), 4, axis=3)
+    views = {name: view.replace(image=image) for name, view in make_views(spec, 16).items()}
 
     def total(params):
-        found = {name: task.loss(params[name], view) for name, task in tasks.items()}
+        found = {name: task.loss(params[name], views[name]) for name, task in tasks.items()}
         return sum(found.values()), found
 
     def step(carry, _):
@@ -77,17 +81,18 @@ def test_each_task_learns_what_it_is_to_predict():
     [(4, 64, 64, jnp.float32, auxtasks.Options()), (12, 100, 96, jnp.bfloat16, auxtasks.RELEASE)],
 )
 def test_losses_reach_what_they_should(channels, size, whole, dtype, options):
-    spec = make_spec(channels, size, frame_stack=channels // 4, dtype=dtype)
-    tasks, view = auxtasks.make(auxtasks.NAMES, spec, options), make_view(spec, 2, 1 if options.max_shift == 0.0 else 3)
+    spec = make_spec(channels, size, frame_stack=channels // 4, dtype=dtype, options=options)
+    tasks, views = auxtasks.make(auxtasks.NAMES, spec), make_views(spec, 2)
 
     @jax.jit
     def run():
         params = init_all(tasks)
-        found = {name: jax.value_and_grad(task.loss, argnums=(0, 1))(params[name], view) for name, task in tasks.items()}
-        return found, {name: task.predict(params[name], view) for name, task in tasks.items()}
+        gradients = {name: jax.value_and_grad(task.loss, argnums=(0, 1)) for name, task in tasks.items()}
+        found = {name: gradient(params[name], views[name]) for name, gradient in gradients.items()}
+        return found, {name: task.predict(params[name], views[name]) for name, task in tasks.items()}
 
     found, predictions = run()
-    shapes = {"forward_dynamics": (2, 8), "inverse_dynamics": (2, 3), "egomotion": (2, view.motion.shape[1])}
+    shapes = {"forward_dynamics": (2, 8), "inverse_dynamics": (2, 3), "egomotion": views["egomotion"].target.shape}
     shapes |= {"autoencoder": (2, 1 if options.in_grey else channels, whole, whole), "optical_flow": (2, whole, whole)}
     assert {name: prediction.shape for name, prediction in predictions.items()} == shapes
     for name, (loss, (params_gradient, view_gradient)) in found.items():
@@ -97,10 +102,10 @@ def test_losses_reach_what_they_should(channels, size, whole, dtype, options):
         reached = {latent for latent in LATENTS if np.any(np.asarray(getattr(view_gradient, latent), np.float32) != 0.0)}
         not_detached = {"latent_tp1"} if name == "forward_dynamics" and not options.detach else set()
         assert reached == REACHES[name] | not_detached, name
-    flow_error = np.mean(np.square(predictions["optical_flow"] - view.flow[:, :whole, :whole]))
+    flow_error = np.mean(np.square(predictions["optical_flow"] - views["optical_flow"].target[:, :whole, :whole]))
     np.testing.assert_allclose(found["optical_flow"][0], flow_error, rtol=1e-5)
     if not options.in_grey:
-        error = np.mean(np.square(predictions["autoencoder"] - view.image[..., :whole, :whole]))
+        error = np.mean(np.square(predictions["autoencoder"] - views["autoencoder"].image[..., :whole, :whole]))
         np.testing.assert_allclose(found["autoencoder"][0], error, rtol=1e-5)
 
 
@@ -134,38 +139,47 @@ def test_bfloat16_decodes_nearly_what_float32_does():
 
     @jax.jit
     def decode_in_both_ways():
-        params, view = full.init(jax.random.key(0)), make_view(specs[0], 4)
+        params, view = full.init(jax.random.key(0)), make_views(specs[0], 4)["autoencoder"]
         return full.predict(params, view), half.predict(params, view)
 
     expected, found = decode_in_both_ways()
     assert 1e-4 < np.linalg.norm(found - expected) / np.linalg.norm(expected) < 2e-2
 
 
-def test_what_a_task_does_not_need_may_be_left_out():
+def declared(task):
+    """The optional fields of a view that a task declares."""
+    own = {"latent_view": task.view, "target": task.view or task.target}
+    return {*task.needs, *(field for field, maker in own.items() if maker is not None)}
+
+
+def test_what_a_task_does_not_declare_may_be_left_out():
     spec = make_spec(4, 16, levels=2)
-    everything = jax.eval_shape(lambda: make_view(spec, 2))
-    for task in auxtasks.make(auxtasks.NAMES, spec).values():
+    everything = jax.eval_shape(lambda: make_views(spec, 2))
+    for name, task in auxtasks.make(auxtasks.NAMES, spec).items():
         params = jax.eval_shape(task.init, jax.random.key(0))
-        fields = {field: getattr(everything, field) for field in task.needs}
-        bare = auxtasks.View(everything.latent_t, everything.action)
+        fields = {field: getattr(everything[name], field) for field in declared(task)}
+        bare = auxtasks.View(everything[name].latent_t, everything[name].action)
         assert jax.eval_shape(task.loss, params, bare.replace(**fields)).shape == ()
-        for field in task.needs:
+        for field in fields:
             with pytest.raises(ValueError, match=f"needs View.{field}"):
                 jax.eval_shape(task.loss, params, bare.replace(**{**fields, field: None}))
 
 
-def test_only_the_targets_that_are_needed_are_made():
-    images = jnp.zeros((2, 4, 16, 16), jnp.uint8)
+def test_only_what_is_declared_is_made():
     spec = make_spec(4, 16, levels=2)
-    for names, needed in (
-        (("forward_dynamics", "autoencoder"), set()),
-        (("egomotion",), {"images_moved", "motion"}),
-        (("optical_flow", "inverse_dynamics"), {"flow"}),
+    images = jnp.zeros((3, 2, 4, 16, 16), jnp.uint8)
+    batch = Batch(images, jnp.zeros((2, 3)), jnp.zeros((2, 1)), jnp.zeros((2, 1)))
+    for names, views, targets, stored in (
+        (("forward_dynamics", "autoencoder"), set(), set(), set()),
+        (("egomotion",), {"egomotion"}, {"egomotion"}, set()),
+        (("optical_flow", "inverse_dynamics"), set(), {"optical_flow"}, {"optical_flow"}),
     ):
-        needs = auxtasks.needs_of(auxtasks.make(names, spec))
-        make_targets = functools.partial(auxtasks.make_targets, needs=needs)
-        targets = jax.eval_shape(make_targets, jax.random.key(0), images, images)
-        assert {name for name, value in vars(targets).items() if value is not None} == needed
+        auxiliary = Auxiliary(auxtasks.make(names, spec), make_weighting("sum"))
+        specs = auxiliary.stored_spec(spec.observation, 5)
+        assert set(specs) == stored and all(kept.shape == (5, 16, 16) for kept in specs.values())
+        of_steps = {name: jax.ShapeDtypeStruct((2, *kept.shape[1:]), kept.dtype) for name, kept in specs.items()}
+        made = jax.eval_shape(auxiliary.with_targets, jax.random.key(0), batch, of_steps)
+        assert (set(made.views), set(made.targets)) == (views, targets)
 
 
 @pytest.mark.parametrize(
@@ -192,11 +206,12 @@ def test_tasks_that_show_states_have_no_auxiliary_tasks():
 def decoder_gradients(channels, dtype, implementation):
     """Losses of both decoders and their gradients, by ``implementation``: products, kernel (interpreted) or plain; flat."""
     spec = make_spec(channels, 32, latent_size=16, dtype=dtype, levels=3)
-    tasks, view = auxtasks.make(("autoencoder", "optical_flow"), spec), make_view(spec, 4)
+    tasks, views = auxtasks.make(("autoencoder", "optical_flow"), spec), make_views(spec, 4)
+    view = views["autoencoder"]
     # What all of them can represent.
     latents = [latent.astype(jnp.bfloat16).astype(dtype) for latent in (view.latent_t, view.latent_tp1)]
-    flow = optical_flow.from_bytes(optical_flow.to_bytes(view.flow))
-    view = view.replace(image=view.image.astype(jnp.bfloat16).astype(dtype), flow=flow)
+    flow = optical_flow.from_bytes(optical_flow.to_bytes(views["optical_flow"].target))
+    view = view.replace(image=view.image.astype(jnp.bfloat16).astype(dtype), target=flow)
     goals = jax.random.normal(jax.random.key(3), (5, channels, 32, 32)).astype(dtype)
     patches = to_patches(jnp.concatenate([view.image, goals]), spec.levels)  # the encoder reads more than one observation
 

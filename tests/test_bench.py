@@ -201,7 +201,7 @@ def test_least_cost_agrees_with_the_compiler_for_dense_layers() -> None:
 
 
 def test_encoder_products_count_every_layer() -> None:
-    from jaxrl_vis.learner.networks import Networks
+    from jaxrl_vis.learner.networks.networks import Networks
 
     config = preset("debug", encoder_filters=(8, 16), latent_size=32)
     networks = Networks(config, jax.ShapeDtypeStruct((3, 16, 16), jnp.uint8), 4, 0.0)
@@ -221,7 +221,7 @@ def test_peaks_take_the_longest_name() -> None:
 
 def test_noise_fills_the_whole_replay() -> None:
     from jaxrl_vis.bench.update import fill_replay
-    from jaxrl_vis.learner.replay import make_replay
+    from jaxrl_vis.learner.memory.replay import make_replay
 
     replay = make_replay(transitions=40, num_envs=2, horizon=5)
     empty = replay.init(jax.ShapeDtypeStruct((1, 4, 4), jnp.uint8), goal_state_size=3, action_size=2)

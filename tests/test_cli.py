@@ -101,7 +101,6 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["bench"], ["render", "train"]),
         (["bench", "physics", "--scene", "finger"], ["bench render"]),
         (["bench", "render", "--peer", "warp"], ["unknown option --peer"]),
-        (["bench", "update", "--aux-gradients", "jvp"], ["--weighting and --aux-tasks"]),
         (["bench", "env", "--seeds", "2"], ["bench update", "bench train"]),
         (["bench", "env", "--batch-size", "8"], ["--batch-size", "bench update", "bench train"]),
         (["bench", "physics", "--envs", "0"], ["--envs", "at least 1"]),

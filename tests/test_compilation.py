@@ -14,9 +14,9 @@ from nvidia import lowered_for_nvidia
 from small_scene import small_scene
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner import encoder_kernel_passes
-from jaxrl_vis.learner.sharding import ONE_DEVICE
-from jaxrl_vis.run.programs import Programs, rarely_collecting_garbage
+from jaxrl_vis.learner.networks.kernels import passes as encoder_kernel_passes
+from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE
+from jaxrl_vis.run.compiled.programs import Programs, rarely_collecting_garbage
 from jaxrl_vis_envs.compiling import compilation, gpu_kernels
 from jaxrl_vis_envs.compiling.compilation import (
     dispatch_by_platform,
@@ -116,7 +116,9 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
 
 def run_of(function) -> Programs:
     """A run of which ``init`` is a function of keys, and nothing else is there."""
-    programs = Programs(preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, parts=None, init=jax.jit(function)))
+    programs = Programs(
+        preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, part_size=1, plays_any=False, init=jax.jit(function))
+    )
     programs.shapes = SimpleNamespace(train=None)  # type: ignore[assignment]
     return programs
 

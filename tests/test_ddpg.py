@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
-from learners import begin, experienced, iteration_of_one
+from learners import begin, experienced, iteration_of_one, train_iteration
 
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner import rollout
+from jaxrl_vis.learner.acting import rollout
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.programs import Programs
+from jaxrl_vis.run.compiled.programs import Programs
 
 DISCOUNT = 0.75  # 1 - 1/horizon of the probes
 # Probes that are learned with the same settings.
@@ -34,7 +34,7 @@ def trained(env, iterations=12, **overrides):
         "relabel_probability": 0.0,
     }
     program = make_train_step(env, preset("debug", **{**settings, **overrides}))
-    iterate = program.train_iteration
+    iterate = functools.partial(train_iteration, program)
     if env in ALIKE and not overrides:
         iterate = functools.partial(iteration_of_one(ALIKE, program.config), ALIKE.index(env))
     loop = begin(program, jax.random.key(7)[None])
@@ -50,7 +50,7 @@ def values(program, train, observations, goals, action=0.0):
     @jax.jit
     def value(train, points, goals):
         latents = jnp.stack([networks.prepare(networks.scaling(train.normalizer), each) for each in (points, goals)])
-        return networks.value(train.critic, latents, jnp.full((points.shape[0], 1), action))
+        return networks.value(train.agent.critic, latents, jnp.full((points.shape[0], 1), action))
 
     return np.asarray(value(train, *(np.array(each, np.float32)[:, None] for each in (observations, goals))))
 
@@ -95,11 +95,11 @@ def test_seeds_side_by_side_learn_what_they_learn_alone():
     keys = jax.random.split(jax.random.key(1), 3)
     together = program.init(keys)
     for _ in range(2):
-        together, _ = program.train_iteration(together)
+        together, _ = train_iteration(program, together)
     for seed in range(3):
         alone = program.init(keys[seed][None])
         for _ in range(2):
-            alone, _ = program.train_iteration(alone)
+            alone, _ = train_iteration(program, alone)
         for left, right in zip(jax.tree.leaves(alone.train), jax.tree.leaves(together.train), strict=True):
             np.testing.assert_allclose(left[0], right[seed], rtol=1e-4, atol=1e-5)
 
@@ -117,7 +117,7 @@ def test_one_trace_and_a_new_episode_every_time():
     loop = begin(program, KEYS)
     goals = []
     for _ in range(3):
-        loop, _ = program.train_iteration(loop)
+        loop, _ = train_iteration(program, loop)
         written = (int(loop.iteration) - 1) % program.replay.num_rollouts * program.config.num_envs
         goals.append(np.asarray(loop.replay.episodes.states)[0, written, -1, 0])
     assert traces == 1
@@ -135,7 +135,7 @@ def filtering(positive=None, negative=None):
 def test_a_fresh_filter_drops_nothing(rewards):
     """At initialisation no negative is dropped, under +1/-1 and under 0/-1 (there the critic must start below the band)."""
     program = filtering(*rewards)
-    _, metrics = program.train_iteration(begin(program, KEYS))
+    _, metrics = train_iteration(program, begin(program, KEYS))
     assert metrics["train/filtered_share"][0] == 0.0
     assert metrics["train/positive_share"][0] > 0.3
 
@@ -144,11 +144,13 @@ def test_the_filter_drops_negatives_that_the_critic_values_like_positives():
     """Place 0 is its own goal, seen with noise in one byte, so most of its indicator rewards are false negatives."""
     program = filtering()
     loop = begin(program, KEYS)
-    head = loop.train.critic["head"]
+    agent = loop.train.agent
+    head = agent.critic["head"]
     last = sorted(head)[-1]
     confident = {**head, last: {**head[last], "bias": head[last]["bias"] + 1e3}}
-    loop = loop.replace(train=loop.train.replace(critic={**loop.train.critic, "head": confident}))
-    _, metrics = program.train_iteration(loop)
+    agent = agent.replace(critic={**agent.critic, "head": confident})
+    loop = loop.replace(train=loop.train.replace(agent=agent))
+    _, metrics = train_iteration(program, loop)
     assert metrics["train/filtered_share"][0] == 1.0
 
 
@@ -161,16 +163,15 @@ def test_share_of_positives_is_the_one_derived(method, expected):
     program = make_train_step(
         probes.PointImage(), preset("debug", method=method, num_envs=256, updates_per_iteration=40, batch_size=512)
     )
-    _, metrics = program.train_iteration(begin(program, jax.random.key(3)[None]))
+    _, metrics = train_iteration(program, begin(program, jax.random.key(3)[None]))
     assert abs(float(metrics["train/positive_share"][0]) - expected) < 0.012
 
 
-@pytest.mark.parametrize("name", ["train_iteration", "learn"])
-def test_replay_is_written_in_place(name):
+def test_replay_is_written_in_place():
     """The compiled iteration holds no second copy of the replay: it is aliased, and temporaries stay far below it."""
     config = preset("debug", replay_transitions=200_000, seeds=2)
     programs = Programs(config, make_train_step(probes.PointImage(), config))
-    memory = programs.lower(name).compile().memory_analysis()
+    memory = programs.lower("learn").compile().memory_analysis()
     replay = 2 * programs.program.replay_bytes
     assert replay > 10e6
     assert memory.alias_size_in_bytes >= replay
@@ -182,8 +183,8 @@ def test_targets_follow_once_an_interval(interval, updates):
     """After U updates in one iteration, targets have moved floor(U / interval) times: by each step's own online networks."""
     config = preset("debug", num_envs=4, batch_size=8, target_update_interval=interval, target_decay=0.9)
     program = make_train_step(probes.GoWhereTold(), config.replace(updates_per_iteration=updates))
-    first = jax.device_get(begin(program, KEYS).train)
-    train = jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0])
+    first = jax.device_get(begin(program, KEYS).train.agent)
+    train = jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0]).agent
     moved = jax.tree.map(lambda new, old: bool(np.any(new != old)), train.target_critic, first.target_critic)
     assert any(jax.tree.leaves(moved)) == (updates >= interval)
     if interval == 1:  # and by how much: a tenth of the way to where the online network is
@@ -200,8 +201,10 @@ def test_exploration_has_its_shares_and_spread():
     def actions(exploration):
         @jax.jit
         def act(key, train):
-            latents = rollout.encode(program.networks, train, train.normalizer, observations)
-            return rollout.choose_actions(program.networks, train, latents, exploration, key, observations)
+            algorithm = program.algorithm
+            policy = algorithm.policy_params(train.agent, train.statistics)
+            action = algorithm.act(policy, observations, algorithm.aim(policy, observations))
+            return rollout.explore(action, exploration, key)
 
         return np.asarray(act(jax.random.key(5), train))[:, 0]
 
@@ -248,7 +251,7 @@ def test_goals_can_have_statistics_of_their_own(source):
 
     def statistics(normalizers):
         program = make_train_step(env, preset("debug", normalizers=normalizers, **settings))
-        loop, metrics = program.train_iteration(begin(program, KEYS))
+        loop, metrics = train_iteration(program, begin(program, KEYS))
         assert metrics["guard/nonfinite"][0] == 0
         outcome, _ = program.evaluate(loop.train, jax.random.key(1))
         assert np.isfinite(outcome["eval/goal_distance"]).all()
@@ -275,8 +278,8 @@ def test_policy_learns_from_images_with_fewer_encoders(options):
     settings = {"encoder_filters": (8, 8), "relabel_probability": 0.9, "normalizer_floor": 1.0}
     settings["iterations"] = 20 if "actor_interval" in options else 12  # an actor that steps half as often needs longer
     program, train, _ = trained(probes.SeenGoWhereTold(), **settings, **options)
-    assert ("encoder" in train.actor) == (options.get("encoders") != "shared")
-    assert ("encoder" in train.target_critic) == options.get("target_encoder", True)
+    assert ("encoder" in train.agent.actor) == (options.get("encoders") != "shared")
+    assert ("encoder" in train.agent.target_critic) == options.get("target_encoder", True)
     outcome, _ = program.evaluate(jax.tree.map(lambda leaf: leaf[None], train), jax.random.key(11))
     assert outcome["eval/success"][0] >= 0.9
 
@@ -287,7 +290,7 @@ def test_a_shared_encoder_learns_nothing_from_the_actor():
     def critic_after(learning_rate):
         config = preset("debug", encoders="shared", actor_learning_rate=learning_rate, batch_size=8, updates_per_iteration=1)
         program = make_train_step(probes.SeenGoWhereTold(), config)
-        return jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0])
+        return jax.device_get(program.update_many(*experienced(program, KEYS[0]))[0]).agent
 
     slow, fast = critic_after(1e-5), critic_after(1e-1)
     jax.tree.map(np.testing.assert_array_equal, slow.critic, fast.critic)
@@ -300,7 +303,9 @@ def test_the_actor_steps_once_an_interval():
     for interval in (1, 3):
         program = make_train_step(probes.GoWhereTold(), config.replace(actor_interval=interval))
         train, metrics = program.update_many(*experienced(program, KEYS[0]))
-        counts[interval] = tuple(int(moments[0].count[0]) for moments in (train.actor_optimizer, train.critic_optimizer))
+        counts[interval] = tuple(
+            int(moments[0].count[0]) for moments in (train.agent.actor_optimizer, train.agent.critic_optimizer)
+        )
         assert np.isfinite(metrics["train/actor_loss"]).all()
     assert counts == {1: (6, 6), 3: (2, 6)}
 

@@ -12,7 +12,7 @@ import pytest
 from fake_program import make_fake_trainer, small_config
 
 from jaxrl_vis import cli, devices
-from jaxrl_vis.run.memory import show_bytes
+from jaxrl_vis.run.compiled.memory import show_bytes
 
 _PROGRAM = """
 import contextlib, io, json, sys

@@ -196,56 +196,11 @@ def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
                     check_env(options.env)
 
 
-def test_recipes_apply_and_work(tmp_path: Path) -> None:
-    """The diffs of docs/extending.md, in a copy of the package, and what the page says comes of them."""
-    page = DOCS / "extending.md"
-    shutil.copytree(ROOT / "jaxrl_vis", tmp_path / "jaxrl_vis", ignore=shutil.ignore_patterns("__pycache__"))
-    for block in blocks(page):
-        if block.language == "diff":
-            doc_blocks.apply_diff(block.text, tmp_path)
-    (tmp_path / "runs").mkdir()
-    lines = [words for block in blocks(page) if block.mark.startswith("after ") for words in doc_blocks.commands(block)]
-    code = f"""
-import dataclasses, importlib, pkgutil
-import jax, jax.numpy as jnp
+def test_every_module_and_figure_works_without_runs(tmp_path: Path) -> None:
+    code = """
+import importlib, pkgutil
 import jaxrl_vis
 from jaxrl_vis import cli
-from jaxrl_vis.cli.parsing import parse
-from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import preset
-from jaxrl_vis.resolved import resolve
-from jaxrl_vis.learner import ddpg
-from jaxrl_vis.learner.auxtasks import Targets
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.sampling import Sampler
-from jaxrl_vis.methods import METHODS
-from jaxrl_vis.types import Batch
-from jaxrl_vis.validation import validate
-
-for words in {lines!r}:
-    config = validate(training_config(parse(Train, words[2:])))
-resolved = resolve(config, 50)
-assert config.method == "indicator_balance" and resolved.balance_probability == 0.5
-
-images = jnp.zeros((3, 2, 1, 20, 20), jnp.uint8).at[2, :, 0, 0, 0].set(jnp.array([1, 0], jnp.uint8)).at[2, 1].set(9)
-batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)))
-METHODS["indicator_balance"] = dataclasses.replace(METHODS["indicator_balance"], reward="nearly_equal")
-assert Sampler(config, resolved, None, 0.1).reward(batch, images[2]).tolist() == [1.0, -1.0]
-
-config = preset("debug", compute_dtype="float32", aux_tasks=("latent_size",), weighting="balance")
-networks = Networks(config, jax.ShapeDtypeStruct((1, 16, 16), jnp.uint8), 2, 0.0)
-algorithm = ddpg.make_ddpg(networks, config, resolved)
-def one_step(key):
-    images = jnp.zeros((3, 2, 1, 16, 16), jnp.uint8)
-    batch = Batch(images, jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros((2, 2)), jnp.zeros(2), targets=Targets())
-    working = algorithm.begin(algorithm.init(key))
-    gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, batch), True)
-    assert metrics["train/loss/latent_size"].shape == ()
-    return gradients
-
-
-jax.eval_shape(one_step, jax.random.key(0))
-
 for module in pkgutil.walk_packages(jaxrl_vis.__path__, "jaxrl_vis."):
     if not module.name.endswith("__main__"):
         try:
@@ -255,7 +210,8 @@ for module in pkgutil.walk_packages(jaxrl_vis.__path__, "jaxrl_vis."):
 for figure in ("5.1", "5.4"):  # of no runs: status 3
     assert cli.main(["figure", figure, "--quick", "--draw-only", "--runs", "runs"]) == 3
 """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT / "envs")))}
+    (tmp_path / "runs").mkdir()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(ROOT / "envs")))}
     done = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

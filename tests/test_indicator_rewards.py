@@ -5,16 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
 import pytest
-from learners import begin
+from learners import begin, rollout, train_iteration
 from test_ddpg import DISCOUNT, trained
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import diagnostics, normalizer, reward_errors
-from jaxrl_vis.learner.latent_reward import cosine_reward, make_latent_reward
-from jaxrl_vis.learner.replay import Replay
-from jaxrl_vis.learner.rollout import add_noise
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.acting.rollout import add_noise
+from jaxrl_vis.learner.ddpg import diagnostics
+from jaxrl_vis.learner.ddpg.latent_reward import cosine_reward, make_latent_reward
+from jaxrl_vis.learner.memory import reward_errors
+from jaxrl_vis.learner.memory.replay import Replay
+from jaxrl_vis.learner.memory.sampling import Choice, Sampler
+from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.run.metrics import with_precision
@@ -56,9 +58,9 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
     def values_and_rewards(train, goals):
         images = [jax.vmap(probes.SeenGoWhereTold().see)(each) for each in (points, goals)]
         inputs = [networks.prepare(networks.scaling(train.normalizer), each) for each in images]
-        latents = jnp.stack([networks.encode(train.critic, each) for each in inputs])
-        rewards = cosine_reward(*(networks.encode(train.autoencoder.params, each) for each in inputs))
-        return networks.value(train.critic, latents, jnp.zeros((8, 1))), rewards
+        latents = jnp.stack([networks.encode(train.agent.critic, each) for each in inputs])
+        rewards = cosine_reward(*(networks.encode(train.agent.autoencoder.params, each) for each in inputs))
+        return networks.value(train.agent.critic, latents, jnp.zeros((8, 1))), rewards
 
     values, rewards = values_and_rewards(train, points)
     np.testing.assert_allclose(rewards, 1.0, atol=1e-5)
@@ -72,9 +74,9 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
 
 def test_an_autoencoder_learns_to_reconstruct(with_autoencoder):
     program, train, late = with_autoencoder
-    _, early = program.train_iteration(begin(program, jax.random.key(7)[None]))
+    _, early = train_iteration(program, begin(program, jax.random.key(7)[None]))
     assert late["train/autoencoder_loss"][0] < 0.5 * early["train/autoencoder_loss"][0]
-    assert set(train.autoencoder.params) == {"encoder", "decoder"}
+    assert set(train.agent.autoencoder.params) == {"encoder", "decoder"}
 
 
 def test_likeness_is_a_cosine_that_is_cut_off_at_a_right_angle():
@@ -98,7 +100,7 @@ def test_stacked_images_are_compared_as_goals():
     env, size = Stacked(), 3
     program = make_train_step(env, preset("debug", method="autoencoder"))
     networks, resolved = program.networks, program.resolved
-    latent_reward = make_latent_reward(networks, program.config, resolved, env.frame_stack)
+    latent_reward = make_latent_reward(networks, program.config, resolved)
     assert latent_reward is not None
     train = jax.tree.map(lambda leaf: leaf[0], begin(program, jax.random.key(0)[None]).train)
     moving = jax.random.bits(jax.random.key(1), (size, 2, 8, 8), jnp.uint8)
@@ -108,8 +110,10 @@ def test_stacked_images_are_compared_as_goals():
     @jax.jit
     def rewards(train, batch):
         train = train.replace(normalizer=normalizer.update(train.normalizer, batch.observations))
-        inputs = networks.prepare_batch(networks.batch_scaling(train), batch)
-        return [latent_reward.of_batch(train, inputs, each).reward for each in (batch.replace(reached=reached), batch)]
+        scaling = networks.batch_scaling(train.statistics)
+        inputs = networks.prepare_batch(scaling, batch)
+        both = batch.replace(reached=reached), batch
+        return [latent_reward.of_batch(train.agent.autoencoder, scaling.observations, inputs, each).reward for each in both]
 
     of_reached, of_moving = rewards(train, batch)
     np.testing.assert_allclose(of_reached, 1.0, atol=1e-5)
@@ -118,7 +122,7 @@ def test_stacked_images_are_compared_as_goals():
 
 def test_other_methods_carry_no_autoencoder():
     loop = jax.eval_shape(make_train_step(StaysPut(), preset("debug")).init, jax.random.key(0)[None])
-    assert loop.train.autoencoder is None
+    assert loop.train.agent.autoencoder is None
 
 
 @pytest.mark.parametrize(
@@ -248,7 +252,7 @@ def test_errors_of_the_estimator_show_in_the_diagnostics():
     options = {"reward_false_positives": 0.1, "reward_false_negatives": 0.2, "reward_clutter": 0.5, "relabel_probability": 0.9}
     config = preset("debug", num_envs=256, updates_per_iteration=20, batch_size=512, **options)
     program = make_train_step(probes.GoWhereTold(), config)
-    _, metrics = program.train_iteration(begin(program, jax.random.key(3)[None]))
+    _, metrics = train_iteration(program, begin(program, jax.random.key(3)[None]))
     assert abs(metrics["train/false_positive_share"][0] - 0.1) < 0.03
     true_share = metrics["train/positive_share"][0]  # of what is there, about a fifth is not paid
     assert 0.0 < metrics["train/false_negative_share"][0] < 0.25 * true_share / (1.0 - true_share)
@@ -273,7 +277,7 @@ def test_noisy_frames_equal_themselves_and_no_others(noise):
     config = preset("debug", method="indicator", num_envs=4, batch_size=4 * env.horizon, observation_noise=noise)
     program = make_train_step(env, config)
     loop = begin(program, jax.random.key(0)[None])
-    episodes, _ = program.rollout(loop.train, jax.random.key(1)[None])
+    episodes, _ = rollout(program, loop.train, jax.random.key(1)[None])
     assert episodes.observations.dtype == jnp.uint8
     frames = np.asarray(episodes.observations[0]).reshape(-1, 64)
     assert len(np.unique(frames, axis=0)) == (1 if noise == 0.0 else len(frames))

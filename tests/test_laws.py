@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_replay import ENVS, HORIZON, encoded_rollout
 
-from jaxrl_vis.learner.relabel import choose_goal_slots
-from jaxrl_vis.learner.replay import make_replay
+from jaxrl_vis.learner.memory.relabel import choose_goal_slots
+from jaxrl_vis.learner.memory.replay import make_replay
 from jaxrl_vis.learner.weighting import MAIN, make_weighting
 from jaxrl_vis_envs.physics import quaternions
 from jaxrl_vis_envs.render import Scene

@@ -10,10 +10,12 @@ import pytest
 
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import encoder_kernel, losses, normalizer, tangents
-from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.learner.ddpg import losses
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.networks import forward_mode, normalizer
+from jaxrl_vis.learner.networks.blocks import from_blocks, to_blocks
+from jaxrl_vis.learner.networks.kernels import encoder as encoder_kernel
+from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.train_step import make_train_step
 
 
@@ -133,7 +135,7 @@ def test_encoders_are_differentiated_forwards_where_tangents_are_wanted(implemen
         return jnp.sum(latent.astype(jnp.float32) * case.probe)
 
     def with_rules(params):
-        with tangents.with_tangents():
+        with forward_mode.with_tangents():
             return loss(params)
 
     tangent = jax.jit(lambda params: jax.jvp(with_rules, (params,), (along,))[1])(case.params)

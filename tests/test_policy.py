@@ -14,7 +14,7 @@ import pytest
 
 import jaxrl_vis
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.rollout import play
+from jaxrl_vis.learner.acting.rollout import play
 from jaxrl_vis.run.checkpoint import LIGHT
 from jaxrl_vis.run.trained import load, open_run
 from jaxrl_vis_envs import registry
@@ -78,7 +78,7 @@ def played(run: Path) -> Any:
     trainer = open_run(run)
     train = load(trainer, run).train
     keys = jnp.stack([jax.random.key(0)] * len(trainer.seeds))
-    return jax.jit(lambda train: play(trainer.env, trainer.program.networks, train, keys, 5).episodes)(train)
+    return jax.jit(lambda train: play(trainer.program.acting, train, keys, 5).episodes)(train)
 
 
 @pytest.mark.parametrize(("name", "seeds"), [("VisualTold", (3, 4)), ("Told", (0,))])

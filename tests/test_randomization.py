@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import point_mass
 import pytest
+from learners import train_iteration
 from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
@@ -295,7 +296,7 @@ def test_a_learner_trains_in_environments_that_vary() -> None:
     def train() -> tuple[Any, list[Any]]:
         loop, rows = program.init(keys()[:1]), []
         for _ in range(2):
-            loop, metrics = program.train_iteration(loop)
+            loop, metrics = train_iteration(program, loop)
             rows.append(jax.device_get(metrics))
         return loop, rows
 
@@ -304,7 +305,7 @@ def test_a_learner_trains_in_environments_that_vary() -> None:
     np.testing.assert_array_equal(loop.replay.episodes.states[0, :, 0], 0.0)
     assert len({start.tobytes() for start in starts}) == len(starts) == 8
     assert all(np.isfinite(value).all() and row["guard/nonfinite"] == 0 for row in rows for value in row.values())
-    assert int(loop.train.updates[0]) == 4
+    assert int(loop.train.agent.updates[0]) == 4
     assert jax.tree.all(jax.tree.map(np.array_equal, rows, again))
     outcome, recording = program.evaluate(loop.train, jax.random.key(1))
     assert np.isfinite(outcome["eval/goal_distance"]).all()

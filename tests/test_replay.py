@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis.learner.relabel import choose_goal_slots
-from jaxrl_vis.learner.replay import make_replay, num_bytes, pack, unpack
+from jaxrl_vis.learner.memory.relabel import choose_goal_slots
+from jaxrl_vis.learner.memory.replay import make_replay, num_bytes, pack, unpack
 from jaxrl_vis.types import Episodes
 
 HORIZON, ENVS = 5, 3

@@ -14,9 +14,9 @@ from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.run import folder as folders
 from jaxrl_vis.run import metrics, trained, trainer
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.folder import RunFolder, read_run_id
 from jaxrl_vis.run.lock import FolderGoneError
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.saving import Saver
 from jaxrl_vis.run.sums import write_sums
 

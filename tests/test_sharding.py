@@ -17,16 +17,17 @@ import pytest
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import normalizer, reward_errors
-from jaxrl_vis.learner.auxiliary import make_auxiliary
-from jaxrl_vis.learner.ddpg import Algorithm, make_ddpg
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.replay import Replay
-from jaxrl_vis.learner.sampling import Sampler
-from jaxrl_vis.learner.sharding import make_layout
-from jaxrl_vis.learner.shards import DATA, Shards
+from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
+from jaxrl_vis.learner.ddpg.ddpg import GradientSteps, make_ddpg
+from jaxrl_vis.learner.memory import reward_errors
+from jaxrl_vis.learner.memory.replay import Replay
+from jaxrl_vis.learner.memory.sampling import Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.learner.parallel.sharding import make_layout
+from jaxrl_vis.learner.parallel.shards import DATA, Shards
 from jaxrl_vis.resolved import resolve
-from jaxrl_vis.run import memory
+from jaxrl_vis.run.compiled import memory
 from jaxrl_vis.types import Batch, Episodes, ReplayState, TrainState
 from jaxrl_vis.validation import validate
 
@@ -57,9 +58,9 @@ def test_a_learner_in_two_parts_learns_on_two_devices_what_it_learns_on_one(foun
     assert found["data: state"] < 1e-4  # sums of squares of many grey levels
 
 
-def test_a_run_learns_in_parts_what_one_program_does(found: dict[str, Any]) -> None:
-    assert found["parts: metrics"] < 1e-5
-    assert found["parts: state"] < 1e-4
+def test_a_run_learns_what_its_programs_do_by_themselves(found: dict[str, Any]) -> None:
+    assert found["run: metrics"] < 1e-5
+    assert found["run: state"] < 1e-4
 
 
 def test_environments_start_and_explore_alike_on_however_many_devices(found: dict[str, Any]) -> None:
@@ -186,7 +187,7 @@ SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 SIZE = 16
 
 
-def make_algorithm(config: Config, shards: Shards) -> Algorithm:
+def make_steps(config: Config, shards: Shards) -> GradientSteps:
     networks = Networks(config, SPEC, 2, 0.0)
     auxiliary = make_auxiliary(config, SPEC, 2, 1, networks.dtype)
     return make_ddpg(networks, config, resolve(config, 6), auxiliary, shards)
@@ -194,20 +195,20 @@ def make_algorithm(config: Config, shards: Shards) -> Algorithm:
 
 def make_learner(config: Config) -> TrainState:
     """A fresh one that has seen a few images."""
-    train = make_algorithm(config, Shards()).init(jax.random.key(1))
-    train = train.replace(normalizer=normalizer.update(train.normalizer, jnp.arange(1024.0).reshape(2, 1, 2, 16, 16) % 200))
+    agent = make_steps(config, Shards()).init(jax.random.key(1))
+    statistics = normalizer.update(normalizer.init(SPEC), jnp.arange(1024.0).reshape(2, 1, 2, 16, 16) % 200)
     # As high as the filter's threshold, so that it drops some transitions and keeps others.
     threshold = resolve(config, 6).filter_threshold
     is_output = {True: 0.0 if math.isinf(threshold) else threshold, False: 0.0}
-    critic = jax.tree.map_with_path(lambda path, leaf: leaf + is_output["output" in str(path) and leaf.ndim == 1], train.critic)
-    return train.replace(critic=critic)
+    critic = jax.tree.map_with_path(lambda path, leaf: leaf + is_output["output" in str(path) and leaf.ndim == 1], agent.critic)
+    return TrainState(agent.replace(critic=critic), statistics)
 
 
 def gradients(config: Config, shards: Shards, train: TrainState, batch: Batch) -> Any:
     """Gradients and metrics."""
-    algorithm = make_algorithm(config, shards)
-    working = algorithm.begin(train)
-    return algorithm.gradients(working, algorithm.prepare(working, batch), True)
+    steps = make_steps(config, shards)
+    working = steps.begin(train.agent, train.statistics)
+    return steps.gradients(working, steps.prepare(working, batch), True)
 
 
 def make_batch(config: Config) -> Batch:
@@ -220,7 +221,7 @@ def make_batch(config: Config) -> Batch:
     if not config.aux_tasks:
         return batch
     auxiliary = make_auxiliary(config, SPEC, 2, 1, jnp.float32)
-    return batch.replace(targets=auxiliary.targets(jax.random.key(0), batch, None))
+    return auxiliary.with_targets(jax.random.key(0), batch, {})
 
 
 @pytest.mark.parametrize(

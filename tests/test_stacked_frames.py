@@ -6,15 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from learners import rollout, train_iteration
 from probe_environments import Probe
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner import train_step
-from jaxrl_vis.learner.ddpg import make_ddpg
+from jaxrl_vis.learner.ddpg import ddpg
+from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.learner.replay import Indices, make_replay
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.memory.replay import Indices, make_replay
+from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.resolved import resolve
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.types import Episodes
@@ -33,10 +35,10 @@ def test_relabelled_goals_repeat_the_achieved_image():
     before[:, -1] = newest[:, -1]  # the goal that was given stands still
     frames = np.broadcast_to(np.stack([newest, before], axis=2)[..., None, None], (ENVS, horizon + 2, 2, 4, 4))
     replay = make_replay(ENVS * horizon, ENVS, horizon, frame_stack=2)
-    rollout = Episodes(
+    collected = Episodes(
         jnp.asarray(frames, jnp.uint8), jnp.zeros((ENVS, horizon + 2, 2)), jnp.zeros((ENVS, horizon, env.action_size))
     )
-    state = replay.insert(replay.init(env.observation_spec, 2, env.action_size), rollout, jnp.int32(0))
+    state = replay.insert(replay.init(env.observation_spec, 2, env.action_size), collected, jnp.int32(0))
     episode, time, goal_slot = (jnp.array(values) for values in ([0, 1, 0, 1], [0, 1, 2, 4], [1, 4, 6, 5]))
     config = preset("debug", method="indicator")
     sampler = Sampler(config, resolve(config, horizon), replay, env.threshold, env.as_goal)
@@ -59,7 +61,7 @@ def test_stacked_images_from_replay_equal_rendered_ones():
     """Episodes render the preceding images again, from joint positions; the replay uses its stored ones. They are equal."""
     config = preset("debug", env="VisualReacher", frame_stack=3, pixels="rgbd", **SETTINGS | {"image_size": 16})
     made = train_step.make_train_step(make_env(config), config)
-    episodes, _ = made.rollout(made.init(jax.random.key(0)[None]).train, jax.random.key(1)[None])
+    episodes, _ = rollout(made, made.init(jax.random.key(0)[None]).train, jax.random.key(1)[None])
     episodes = jax.tree.map(lambda leaf: leaf[0], episodes)
     seen = np.asarray(episodes.observations)
     assert seen.shape == (ENVS, made.env.horizon + 2, 12, 16, 16)
@@ -110,17 +112,17 @@ def program(frame_stack: int = 2):
         }  # fmt: skip
 
     def make_looking(*arguments):
-        algorithm = make_ddpg(*arguments)
-        return algorithm._replace(gradients=functools.partial(look, algorithm.gradients))
+        steps = make_ddpg(*arguments)
+        return steps._replace(gradients=functools.partial(look, steps.gradients))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train_step, "make_ddpg", make_looking)
+        patch.setattr(ddpg, "make_ddpg", make_looking)
         return train_step.make_train_step(env, config)
 
 
 def test_training_samples_goals_that_stand_still():
     made = program()
-    _, metrics = made.train_iteration(made.init(jax.random.key(0)[None]))
+    _, metrics = train_iteration(made, made.init(jax.random.key(0)[None]))
     seen = {name: float(value[0]) for name, value in metrics.items()}
     assert seen["goals_that_stand_still"] == 1.0
     assert seen["observations_that_move"] > 0.5
@@ -148,4 +150,4 @@ def test_a_single_image_is_left_alone():
             raise AssertionError("a single image is a goal already")
 
     made = train_step.make_train_step(Rigid(1), preset("debug", method="indicator_balance_filter", **SETTINGS))
-    jax.eval_shape(made.train_iteration, jax.eval_shape(made.init, jax.random.key(0)[None]))
+    jax.eval_shape(made.learn, jax.eval_shape(made.init, jax.random.key(0)[None]), made.parts_spec)

@@ -17,10 +17,11 @@ from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import loop as run_loop
-from jaxrl_vis.run import memory, metrics, trained, trainer
+from jaxrl_vis.run import metrics, trained, trainer
 from jaxrl_vis.run.checkpoint import Checkpoints
+from jaxrl_vis.run.compiled import memory
+from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
-from jaxrl_vis.run.nonfinite import dump, made_by_simulation
 
 
 def test_a_run_reports_logs_and_draws(straight, capsys):
@@ -85,9 +86,9 @@ def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkey
     """Scratch memory of the evaluation, which depends on --eval-episodes, is asked for before anything is allocated."""
     compiled = straight[1].programs.compile()
     memory.check_compiled(compiled, already_there=False)
-    state = compiled["train_iteration"].memory_analysis().argument_size_in_bytes
+    state = compiled["learn"].memory_analysis().argument_size_in_bytes
     monkeypatch.setattr(memory, "available_bytes", lambda: state + 100)
-    with pytest.raises(RequestError, match="(evaluate|train_iteration|broken_leaves) needs .* --eval-episodes") as refused:
+    with pytest.raises(RequestError, match="(evaluate|learn|play|broken_leaves) needs .* --eval-episodes") as refused:
         memory.check_compiled(compiled, already_there=False)
     assert "\n" not in str(refused.value)
     monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
@@ -106,8 +107,8 @@ def test_a_non_finite_number_stops_the_run(tmp_path, break_state, capsys):
     (file,) = (path / "nonfinite").iterdir()
     assert str(file) in text
     dumped = np.load(file)
-    assert "critic.layer.kernel" in dumped["nonfinite_leaves"] and np.isnan(dumped["metrics.train/critic_loss"]).all()
-    assert np.isnan(dumped["train.critic.layer.bias"]).all() and dumped["key"].shape[0] == 2
+    assert "agent.critic.layer.kernel" in dumped["nonfinite_leaves"] and np.isnan(dumped["metrics.train/critic_loss"]).all()
+    assert np.isnan(dumped["train.agent.critic.layer.bias"]).all() and dumped["key"].shape[0] == 2
     assert dumped["episodes.states"].shape[0] == (4 if break_state else 0)
     shapes = make_fake_trainer(small_config(), None).shapes
     restored = Checkpoints(path / "checkpoints", read_only=True).restore_for_resume(shapes)

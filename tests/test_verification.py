@@ -264,7 +264,7 @@ def test_what_is_wrong_with_recent_states_is_found(killed, verified, run_trainer
     assert any("goodput of the run is unknown" in line for line in report.notes)
     checkpoints = Checkpoints(killed / "checkpoints", run_id=read_run_id(killed))
     loop, progress = checkpoints.recent.restore(5, run_trainer(small_config()).programs.shapes)
-    loop = loop.replace(train=loop.train.replace(updates=loop.train.updates + 1))
+    loop = loop.replace(train=loop.train.replace(agent=loop.train.agent | {"updates": loop.train.agent["updates"] + 1}))
     for run_id, problem in (("other", "recent/5 is another run's (other)"), (read_run_id(killed), "recent/5 differs from")):
         checkpoints.run_id = run_id
         checkpoints.recent.save(5, loop, 2, progress)

@@ -15,7 +15,7 @@ import probe_environments as probes
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
-from jaxrl_vis.learner.rollout import play
+from jaxrl_vis.learner.acting.rollout import play
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.report import viewer
 from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
@@ -103,8 +103,8 @@ def test_the_page_shows_the_episodes_that_the_video_shows(tmp_path):
     program = make_train_step(env, preset("debug", **settings))
     trains = program.init(jax.random.key(0)[None]).train
     key = jax.random.key(5)
-    posed = jax.jit(lambda trains: viewer.play_poses(env, program.networks, trains, key, 3))(trains)
-    played = jax.jit(lambda trains: play(env, program.networks, trains, key[None], 3).episodes)(trains)
+    posed = jax.jit(lambda trains: viewer.play_poses(program.acting, trains, key, 3))(trains)
+    played = jax.jit(lambda trains: play(program.acting, trains, key[None], 3).episodes)(trains)
     episodes = jax.tree.map(lambda leaf: leaf[0], played)
     np.testing.assert_allclose(posed.positions[..., 0, :1], episodes.states[:, :-1], atol=1e-6)
     np.testing.assert_allclose(posed.goal_positions[:, 0, :1], episodes.states[:, -1], atol=1e-6)

@@ -17,6 +17,7 @@ from weighting_problem import (
     OPTIONS,
     WAYS,
     assert_close,
+    begin,
     encode,
     encoder_of,
     gradient_by,
@@ -96,7 +97,7 @@ def test_a_reversed_gradient_drives_its_weight_to_zero_and_back() -> None:
     compared = gradients | {"near": gradients[MAIN]}
     turned = compared | {"near": jax.tree.map(jnp.negative, compared["near"])}
     state = weighting.init(NAMES)
-    update = jax.jit(lambda gradients, state: weighting.update(losses, measure(weighting, losses, gradients, state), state)[1])
+    update = jax.jit(lambda gradients, state: weighting.update(losses, measure(weighting, losses, gradients), state)[1])
     history = []
     for gradients_now in (compared, turned, compared):
         for _ in range(30 if gradients_now is turned else 4):
@@ -109,8 +110,8 @@ def test_a_reversed_gradient_drives_its_weight_to_zero_and_back() -> None:
 def test_total_compares_with_everything_that_is_learned() -> None:
     weighting = make_weighting("ol_aux", main_grad="total", learning_rate=0.1)
     losses, gradients = raw_gradients(2)
-    state = weighting.init(NAMES).replace(weights=in_float32({MAIN: 1.0, "near": 0.5, "far": 2.0}))
-    metrics = jax.jit(lambda: weighting.update(losses, measure(weighting, losses, gradients, state), state)[2])()
+    state = weighting.init(NAMES, gradients[MAIN]).replace(weights=in_float32({MAIN: 1.0, "near": 0.5, "far": 2.0}))
+    metrics = jax.jit(lambda: weighting.update(losses, measure(weighting, losses, gradients), state)[2])()
     flat = {name: np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(tree)]) for name, tree in gradients.items()}
     learned = {name: flat[name] / (losses[name] + (1e-8 if name == MAIN else 0.02)) for name in NAMES}
     total = learned[MAIN] + 0.5 * learned["near"] + 2.0 * learned["far"]
@@ -140,21 +141,19 @@ def test_the_ablation_is_the_one_step_rule_on_n_times_the_data() -> None:
     params, batch = in_float32(problem(4, size=36))
     minibatches = [jax.tree.map(lambda leaf, k=k: leaf[12 * k : 12 * (k + 1)], batch) for k in range(3)]
     ablation = make_weighting("ol_aux_ablation", interval=3, learning_rate=0.01)
-    assert ablation.held and ablation.interval == 3
+    assert ablation.interval == 3
     gradient = jax.jit(weighted_grad(losses_of, ablation, encoder_of))
-    state, now = ablation.init(NAMES, encoder_of(params)), params
+    state, now = ablation.init(NAMES, encoder_of(params), params), params
     for minibatch in minibatches:  # parameters move on, what is compared does not
-        found = gradient(now, state, minibatch, held=params)
+        found = gradient(now, state, minibatch)
         now = jax.tree.map(lambda leaf, change: leaf - np.float32(0.1) * change, now, found.gradient)
         state = found.state
     whole = make_weighting("ol_aux", interval=1, beta=15.0, learning_rate=0.01)
     expected = jax.jit(weighted_grad(losses_of, whole, encoder_of))(params, whole.init(NAMES), batch).state.weights
     assert_close(state.weights, expected)
     assert abs(expected["near"] - 1) > 0.001
-    with pytest.raises(RequestError, match="needs held="):
-        gradient(params, state, minibatches[0])
-    with pytest.raises(RequestError, match="leave out held"):
-        weighted_grad(losses_of, whole)(params, whole.init(NAMES), batch, held=params)
+    with pytest.raises(RequestError, match="give init all of them"):
+        ablation.init(NAMES, encoder_of(params))
 
 
 # -- Other weightings
@@ -207,12 +206,12 @@ def test_finite_at_zero_and_negative_losses(case: str) -> None:
 
     @jax.jit
     def update(losses: Any, state: Any) -> Any:
-        weights, state, metrics = weighting.update(losses, measure(weighting, losses, gradients, state), state)
+        weights, state, metrics = weighting.update(losses, measure(weighting, losses, gradients), state)
         return state, (weights, metrics, weighting.coefficients(weights, losses), weighting.objective(weights, losses))
 
     for value in (0.0, -0.5, -1e4):
         losses = in_float32({MAIN: max(value, 0.0), "near": value, "far": value})
-        state = weighting.init(NAMES, gradients[MAIN])
+        state = begin(weighting, gradients[MAIN])
         for _ in range(5):
             state, found = update(losses, state)
             for number in jax.tree.leaves((state, found)):
@@ -232,10 +231,10 @@ def test_seeds_side_by_side_are_seeds_one_by_one(case: str) -> None:
         turned = compared | {"near": jax.tree.map(lambda leaf: scale * leaf, compared["near"])}
 
         def step(state: Any, _: None) -> Any:
-            weights, state, metrics = weighting.update(losses, measure(weighting, losses, turned, state), state)
+            weights, state, metrics = weighting.update(losses, measure(weighting, losses, turned), state)
             return state, (weights, metrics)
 
-        return jax.lax.scan(step, weighting.init(NAMES, compared[MAIN]), length=7)
+        return jax.lax.scan(step, begin(weighting, compared[MAIN]), length=7)
 
     scales = jnp.array([-1.0, 0.5, 2.0])
     together = jax.jit(jax.vmap(run))(scales)
@@ -250,13 +249,13 @@ def test_states_survive_a_checkpoint(case: str, tmp_path: Path) -> None:
     shared = jnp.zeros(3)
     losses = dict.fromkeys(NAMES, jnp.ones(()))
     gradients = {name: jnp.full(3, 0.5 - (name == "far")) for name in NAMES}
-    state = weighting.init(NAMES, shared)
+    state = begin(weighting, shared)
     for _ in range(3):
-        state = weighting.update(losses, measure(weighting, losses, gradients, state), state)[1]
+        state = weighting.update(losses, measure(weighting, losses, gradients), state)[1]
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(tmp_path / "state", state)
         checkpointer.wait_until_finished()
-        restored = checkpointer.restore(tmp_path / "state", jax.eval_shape(lambda: weighting.init(NAMES, shared)))
+        restored = checkpointer.restore(tmp_path / "state", jax.eval_shape(lambda: begin(weighting, shared)))
     assert_close(restored, state, tolerance=0)
 
 
@@ -342,7 +341,7 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("ol_aux").init((MAIN,)), ["no auxiliary loss", "none_log"]),
         (lambda: make_weighting("sum").init(("near", "far")), ["no loss is called 'main'"]),
         (lambda: make_weighting("sum").init((MAIN, "near", "near")), ["two losses are called 'near'"]),
-        (lambda: weighted_grad(losses_of, make_weighting("sum"), way="onehot"), ["'onehot'", "did you mean one_hot"]),
+        (lambda: weighted_grad(losses_of, make_weighting("sum"), way="per_los"), ["'per_los'", "did you mean per_loss"]),
         (lambda: weighted_grad(losses_of, make_weighting("sum"), way="latents"), ["give encode"]),
         (
             lambda: jax.jit(weighted_grad(losses_of, make_weighting("sum")))(

@@ -44,7 +44,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
         f"scaling/{kind}": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER, "benchmarks/scaling.py")
         for kind in ("seeds", "weak", "strong", "processes_seeds", "processes_weak")
     },
-    "scaling/all_reduce": ("jaxrl_vis/learner/shards.py", "benchmarks/scaling.py"),
+    "scaling/all_reduce": ("jaxrl_vis/learner/parallel/shards.py", "benchmarks/scaling.py"),
     "adapters/success": (*_PHYSICS, *_TASK, f"{_ENVS}/adapters", f"{_PEERS}/agents.py"),
     "learning": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER),
 }
@@ -54,7 +54,7 @@ MEASURED: dict[str, tuple[str, ...]] = {
 _NEVER = (f"{_ENVS}/render/reference.py",)
 # Prefixes of the code of the other kind of device.
 _ON_CPU = (f"{_ENVS}/render/cpu",)
-_ON_GPU = (f"{_ENVS}/render/gpu", "jaxrl_vis/learner/encoder_kernel")
+_ON_GPU = (f"{_ENVS}/render/gpu", "jaxrl_vis/learner/networks/kernels")
 # Folders of the definitions at a revision.
 _SOURCES = ("jaxrl_vis", "envs", "benchmarks")
 _SHOWN = 4  # number of changed files in a message

@@ -28,7 +28,7 @@ from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
-from jaxrl_vis.run.programs import rarely_collecting_garbage
+from jaxrl_vis.run.compiled.programs import rarely_collecting_garbage
 
 PARTS = ("update", "rollout", "insert")
 
@@ -86,10 +86,11 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
     hlo: Path | None = asked.hlo
     loop, keys = start(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)
-    rolled = jax.eval_shape(program.rollout, train, keys)[0]
+    playing = train, keys, jnp.int32(0), program.exploration
+    rolled = jax.eval_shape(program.play, *playing)[0]
     arguments = {
         "update": (program.update_many, (train, replay, keys, iteration), program.updates_per_iteration, "a gradient step"),
-        "rollout": (program.rollout, (train, keys), program.env.horizon, "a control step, with its share of the reset"),
+        "rollout": (program.play, playing, program.env.horizon, "a control step, with its share of the reset"),
         "insert": (program.insert, (train, replay, rolled, keys, iteration), 1, "an insertion"),
     }
     del loop
@@ -108,12 +109,12 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
         if part == "update":
             train, done = compiled[part](train, replay, keys, iteration)
         elif part == "rollout":
-            done = compiled[part](train, keys)
+            done = compiled[part](*playing)
         else:
             train, replay = done = compiled[part](train, replay, episodes, keys, iteration)
         jax.block_until_ready(done)
 
-    episodes = compiled["rollout"](train, keys)[0] if "insert" in parts else None
+    episodes = compiled["rollout"](*playing)[0] if "insert" in parts else None
     for part in parts:
         _, _, turns, what = arguments[part]
         report(f"{what} of {program.config.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order)

@@ -1,12 +1,12 @@
 """Cost of learning the weights of auxiliary losses, for several numbers of losses.
 
-    python -m benchmarks.profiling.weighting_cost [--losses 5 10] [--ways jvp latents] [--image-size 64] [--batch-size 512]
+    python -m benchmarks.profiling.weighting_cost [--losses 5 10] [--ways latents] [--image-size 64] [--batch-size 512]
         [--json FILE]
 
 An encoder of the preset `paper` reads RGB-D images before and after an action. The main loss is a value of three hidden layers;
 every auxiliary loss is a linear head on both latents with its own targets. For every number of auxiliary losses and every
 method of their gradients, gradient steps are timed with fixed weights and with OL-AUX-5. The difference is the cost of the
-weighting itself. With one `jax.jvp` along the main gradient it hardly grows with the number of losses.
+weighting itself.
 """
 
 import argparse
@@ -25,9 +25,9 @@ from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import preset
 from jaxrl_vis.devices import check_devices
-from jaxrl_vis.learner import tangents
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.normalizer import Scaling
+from jaxrl_vis.learner.networks import forward_mode
+from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.learner.networks.normalizer import Scaling
 from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
 from jaxrl_vis.learner.weighting.gradients import Way
 
@@ -97,7 +97,7 @@ class Problem:
             weighting,
             lambda params: params["critic"]["encoder"],
             way,
-            forwards=tangents.with_tangents,
+            forwards=forward_mode.with_tangents,
             encode=self.encode,
         )
 
@@ -135,7 +135,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--losses", type=int, nargs="+", default=[5, 10], help="numbers of auxiliary losses")
     parser.add_argument(
-        "--ways", nargs="+", choices=get_args(Way), default=["jvp", "latents"], help="ways to gradients, of weighted_grad"
+        "--ways", nargs="+", choices=get_args(Way), default=["latents"], help="ways to gradients, of weighted_grad"
     )
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--batch-size", type=int, default=512)

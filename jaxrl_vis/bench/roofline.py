@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from jaxrl_vis.bench.peaks import device_peak
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.networks.networks import Networks
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,8 +24,7 @@ class Settings:
         devices: Number of devices.
         data_devices: Number of devices that share each learner; see `Config`.
         repeats: Maximum number of timed repeats; see `timing.measure`.
-        aux_tasks, weighting, aux_gradients: Auxiliary losses of the gradient steps, their weighting, and the method of their
-            gradients.
+        aux_tasks, weighting: Auxiliary losses of the gradient steps, and their weighting.
         scene: Scene of `scenes.models`, or path of an MJCF file, to draw instead of an environment.
         on_accelerator: True if JAX runs on an accelerator; set by `for_this_device`.
     """
@@ -42,7 +41,6 @@ class Settings:
     repeats: int = 5
     aux_tasks: tuple[str, ...] = ()
     weighting: str = "none"
-    aux_gradients: str = "auto"
     scene: str | None = None
     on_accelerator: bool = False
 
@@ -101,5 +99,4 @@ class Settings:
         """Entries of a record for auxiliary losses; empty without them."""
         if self.weighting == "none":
             return {}
-        losses = {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)}
-        return losses if self.aux_gradients == "auto" else {**losses, "aux_gradients": self.aux_gradients}
+        return {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)}

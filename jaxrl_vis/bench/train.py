@@ -10,7 +10,6 @@
 An iteration that takes longer than the promise loses time between its parts, to the policy in the rollout, or to the replay.
 """
 
-import functools
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -25,9 +24,10 @@ from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
 from jaxrl_vis.config import Config, data_devices_of
+from jaxrl_vis.learner.acting.rollout_parts import join_parts
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
-from jaxrl_vis.run.programs import Programs
-from jaxrl_vis.types import LoopState
+from jaxrl_vis.run.compiled.programs import Programs
+from jaxrl_vis.types import Episodes, LoopState, Metrics
 from jaxrl_vis_envs.base import GoalEnv
 
 _BUDGET_S = 40.0
@@ -93,8 +93,11 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     program, iteration = programs.program, loop.iteration
     keys, key = seed_keys(program, 3), jax.random.key(4)
     evaluation = measure_time(_settled(program, lambda: programs.evaluate(loop.train, key)), repeats)
-    assert programs.side_by_side is not None
-    play = functools.partial(programs.side_by_side.rollout, loop.train, keys)
+    num_envs = programs.config.num_envs
+
+    def play() -> tuple[Episodes, Metrics]:
+        return jax.tree.map(lambda *leaves: join_parts(leaves, num_envs, axis=1), *programs.play(loop.train, keys))
+
     rollout = measure_time(_settled(program, play), repeats)
     episodes, _ = play()
     insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)

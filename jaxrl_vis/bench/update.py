@@ -26,7 +26,6 @@ def training_config(settings: Settings, **overrides: Any) -> Config:
         overrides["batch_size"] = settings.batch_size
     overrides |= {"devices": settings.devices, "data_devices": settings.data_devices}
     overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
-    overrides["aux_gradients"] = settings.aux_gradients
     own = "fast" if settings.on_accelerator else "cpu"
     return preset(settings.preset or own, env=settings.env, **overrides)
 
@@ -69,7 +68,7 @@ def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Tim
     keys = seed_keys(program, 2)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
     train = loop.train
-    before = jax.device_get(train.actor)
+    before = jax.device_get(train.agent.actor)
 
     def call() -> Any:
         nonlocal train
@@ -77,7 +76,7 @@ def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Tim
         return train, metrics
 
     timing = measure_time(call, repeats)
-    after = jax.device_get(train.actor)
+    after = jax.device_get(train.agent.actor)
     if all((old == new).all() for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)):
         raise AssertionError("the parameters did not move: no gradient step was taken")
     return timing, compile_s
@@ -135,7 +134,7 @@ def _costs(program: TrainStep, seconds: float) -> dict[str, Any]:
     arguments = shapes.train, shapes.replay, seed_keys(single, 2), shapes.iteration
     counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile(), config.actor_interval)
     params = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.actor, shapes.train.critic)
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.agent.actor, shapes.train.agent.critic)
     )
     dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
     costs = {}

@@ -8,6 +8,7 @@ reader of the output has exited.
 """
 
 import errno
+import functools
 import inspect
 import os
 import sys
@@ -89,7 +90,7 @@ def main(words: Sequence[str] | None = None, give_up: Callable[[int], None] | No
 
 def _run_with_status(words: Sequence[str], ending: Ending) -> int:
     try:
-        return _run(words)
+        return _command(words)()
     except tuple(_STATUS) as error:
         if ending.signal is not None:  # which probably went to child processes as well
             return _ended_by(ending.signal)
@@ -178,19 +179,24 @@ def _next_words(group: str, table: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(name.removeprefix(group).split()[0] for name in table if name.startswith(group)))
 
 
-def _run(words: Sequence[str]) -> int:
+def _command(words: Sequence[str]) -> Callable[[], int]:
+    """Read a command line, and return the command with its options; what is left to do after help is nothing."""
     if not words:
         first = ", ".join(_next_words("", all_commands()))
         raise RequestError(f"no command given; choose one of {first} (or see {PROGRAM} --help)")
     if words[0] in ("-h", "--help", "--version"):
         print(jaxrl_vis.__version__ if words[0] == "--version" else overview())
-        return 0
+        return _nothing
     if words[-1] in ("-h", "--help") and words[0] not in COMMANDS:
         group = " ".join(words[:-1])
         names = all_commands()
         if group not in names and any(name.startswith(f"{group} ") for name in names):
             print(overview(f"{group} "))
-            return 0
+            return _nothing
     name, rest = split_command(words)
     command, run = (COMMANDS if name in COMMANDS else all_commands())[name]
-    return run(parse(command, rest, name))
+    return functools.partial(run, parse(command, rest, name))
+
+
+def _nothing() -> int:
+    return 0

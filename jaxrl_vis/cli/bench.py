@@ -49,8 +49,6 @@ class Bench:
     """Auxiliary tasks in the gradient steps (update, train)."""
     weighting: WeightingName = "none"
     """Weighting of their losses (update, train)."""
-    aux_gradients: Literal["auto", "per_loss", "one_hot", "jvp", "latents"] = "auto"
-    """Method of the gradients of losses (update, train)."""
     scene: str | None = None
     """finger, fetch_reach, primitives or the path of an MJCF file: draw this instead of an environment (render)."""
     json: Path | None = None
@@ -69,8 +67,6 @@ def run(options: Bench) -> int:
         raise RequestError("--seeds goes with `bench update` and `bench train` only")
     if (options.weighting != "none" or options.aux_tasks) and options.benchmark not in ("update", "train"):
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only")
-    if options.aux_gradients != "auto" and options.weighting == "none":
-        raise RequestError("--aux-gradients goes with --weighting and --aux-tasks, whose gradients it compares")
     for option in ("preset", "batch_size"):
         if getattr(options, option) is not None and options.benchmark not in ("update", "train"):
             raise RequestError(f"--{option.replace('_', '-')} goes with `bench update` and `bench train` only")

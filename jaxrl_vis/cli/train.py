@@ -12,6 +12,7 @@ from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
 from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.plugins import own_names
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run import loggers
 from jaxrl_vis.run.folder import check_there, default_folder, read_config
@@ -106,6 +107,10 @@ def training_config(options: Train) -> Config:
     return preset(name, **changes)
 
 
+def _words(value: Any) -> tuple[Any, ...]:
+    return value if isinstance(value, tuple) else (value,)
+
+
 def run(options: Train) -> int:
     """Trains; reports are shown and saved by the trainer."""
     check_counts(start_timeout=options.start_timeout)
@@ -124,8 +129,10 @@ def run(options: Train) -> int:
     config = validate(training_config(options))
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)
-    if options.resume and options.env is None and "env_folder" not in options.changes and (run_dir / "config.json").exists():
-        may_run_code(run_dir, options.trust)  # the task and its folder are named only by the run
+    if options.resume and "env_folder" not in options.changes and (run_dir / "config.json").exists():
+        named = {options.env, *(word for value in options.changes.values() for word in _words(value))}
+        if set(own_names(config).values()) - named:
+            may_run_code(run_dir, options.trust)  # its user named neither such a part nor where it lies: the run does
     check_env(config.env, config.env_folder)
     from jaxrl_vis.run import trainer
 

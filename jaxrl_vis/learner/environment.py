@@ -4,13 +4,14 @@ import dataclasses
 from typing import Any
 
 import jaxrl_vis_envs
-from jaxrl_vis import fields
+from jaxrl_vis import fields, plugins
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.randomization import typical
 from jaxrl_vis_envs.registry import config_class, load
+from jaxrl_vis_envs.task_modules import import_folder
 
 # Options of an environment that `Config` has fields of its own for.
 _OWN_FIELDS = {
@@ -22,16 +23,24 @@ _OWN_FIELDS = {
 
 
 def locate_env(config: Config) -> Config:
-    """``config`` with the folder that its environment, where that is ``module:Name``, was imported from.
+    """Return ``config`` with the folder that its environment, and whatever else is ``module:Name``, was imported from.
 
     Raises:
-        RequestError: There is no such environment, or what holds it cannot be imported.
+        RequestError: There is no such environment, what holds it cannot be imported, or modules lie in several folders.
     """
     validate(config)
     try:
-        return config.replace(env_folder=load(config.env, config.env_folder))
+        folders = {config.env: load(config.env, config.env_folder)}
     except ValueError as error:
         raise RequestError(str(error)) from error
+    for kind, name in plugins.own_names(config).items():
+        if kind != "task":
+            folders[name] = import_folder(plugins.load(name, config.env_folder)[0])
+    places = {folder: name for name, folder in folders.items() if folder is not None}
+    if len(places) > 1:
+        where = " and ".join(f"{name} in {folder}" for folder, name in places.items())
+        raise RequestError(f"modules of a run must lie in one folder, or be installed; here are {where}")
+    return config.replace(env_folder=next(iter(places), None))
 
 
 def make_env(config: Config) -> GoalEnv:

@@ -8,8 +8,7 @@ import numpy as np
 
 import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.networks import Networks
-from jaxrl_vis.learner.rollout import play, split_keys
+from jaxrl_vis.learner.acting.rollout import Acting, play, split_keys
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.types import TrainState
 
@@ -45,19 +44,18 @@ class PosedEpisodes(NamedTuple):
     goal_rotations: jax.Array
 
 
-def play_poses(env: Any, networks: Networks, train: TrainState, key: jax.Array, num_envs: int) -> PosedEpisodes:
+def play_poses(acting: Acting, train: TrainState, key: jax.Array, num_envs: int) -> PosedEpisodes:
     """Plays an episode of the first learner in each of E environments, without exploration.
 
     Args:
-        env: A MuJoCo environment.
-        networks: Networks of the parameters.
+        acting: A MuJoCo environment, and the algorithm.
         train: The learners, [S, ...].
         key: [] a typed key, which determines the episodes, as in `rollout.play`.
         num_envs: E.
     """
     first = jax.tree.map(lambda leaf: leaf[:1], train)
-    played = play(env, networks, first, key[None], num_envs, record=lambda state: (state.data.xpos, state.data.xquat))
-    goal = jax.vmap(env.sample_goal)(split_keys(key[None], num_envs)[0])
+    played = play(acting, first, key[None], num_envs, record=lambda state: (state.data.xpos, state.data.xquat))
+    goal = jax.vmap(acting.env.sample_goal)(split_keys(key[None], num_envs)[0])
     positions, rotations = (poses[0] for poses in played.record)
     return PosedEpisodes(positions, rotations, goal.xpos, goal.xquat)
 
@@ -75,7 +73,7 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     from jaxrl_vis_envs.adapters.brax_viewer import Poses, viewer_page
 
     env = program.env
-    play_all = jaxrl_vis_envs.jit(lambda train, key: play_poses(env, program.networks, train, key, episodes))
+    play_all = jaxrl_vis_envs.jit(lambda train, key: play_poses(program.acting, train, key, episodes))
     played = jax.tree.map(np.asarray, play_all(train, key))
     # The last step of each episode is repeated, so that its end is visible.
     hold = max(1, round(_HOLD / env.control_period))

@@ -15,7 +15,7 @@ from jax.experimental import multihost_utils
 
 from jaxrl_vis import processes
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.sharding import put_array
+from jaxrl_vis.learner.parallel.sharding import put_array
 
 Arrays = dict[str, np.ndarray]
 

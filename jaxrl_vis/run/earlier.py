@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.folder import RunFolder, read_run_id
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState
 

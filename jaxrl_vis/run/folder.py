@@ -50,7 +50,7 @@ evaluations and checkpoints. All other fields affect learning."""
 
 _OF_WEIGHTINGS = (
     *(field.name for field in dataclasses.fields(Config) if field.name.startswith("weighting_")),
-    *("aux_gradients", "aux_form", "actor_log"),
+    *("aux_form", "actor_log"),
 )
 """Exceptions, which are unused if losses are neither weighted nor logarithmic."""
 

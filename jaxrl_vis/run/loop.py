@@ -17,7 +17,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +28,16 @@ from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError
 from jaxrl_vis.run import earlier, metrics, trust
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
+from jaxrl_vis.run.compiled.memory import check_compiled, check_memory, fit_together
+from jaxrl_vis.run.compiled.pending import Pending
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.folder import RunFolder, read_record, read_run_id
 from jaxrl_vis.run.goodput import Goodput
 from jaxrl_vis.run.lock import FolderGoneError, Held
 from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.run.memory import check_compiled, check_memory, fit_together
 from jaxrl_vis.run.metrics import PerSeed
 from jaxrl_vis.run.pace import Pace
-from jaxrl_vis.run.pending import Pending
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.results import Results, describe
 from jaxrl_vis.run.saving import Saver, import_saving_libraries
@@ -52,7 +52,7 @@ GUARD = "guard/"
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What the host knows about one iteration.
+    """Record of one iteration on the host.
 
     Attributes:
         iteration: Iterations done since the run began, this one included.
@@ -71,12 +71,20 @@ class RunLoop:
     """One call of `Trainer.run`.
 
     Args:
-        programs: What to run.
-        folder: Where its files go.
+        programs: Programs of the run.
+        folder: Folder of its files.
         log: Names of the loggers that are told, see `loggers`.
+        on_begun: Called when the folder is this run's.
     """
 
-    def __init__(self, programs: Programs, folder: RunFolder, log: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        programs: Programs,
+        folder: RunFolder,
+        log: tuple[str, ...] = (),
+        on_begun: Callable[[], None] = lambda: None,
+    ):
+        self._on_begun = on_begun
         self._programs, self._folder = programs, folder
         self._config, self._program = programs.config, programs.program
         self._writes = processes.is_first()
@@ -156,7 +164,7 @@ class RunLoop:
                 self._rescue()
                 raise
             finally:
-                # What is being written becomes whole, unless somebody is in a hurry; and no error on the way hides the first.
+                # Finish pending writes unless interrupted twice; never mask the original error.
                 if not interruption.is_urgent and not self._is_left_alone:
                     with contextlib.suppress(StorageError):
                         self._checkpoints.close()
@@ -227,6 +235,7 @@ class RunLoop:
         processes.meet("opened")
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
+        self._on_begun()
         with self._saver.writing():
             foreign = self._checkpoints.set_foreign_aside()
             damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
@@ -258,7 +267,7 @@ class RunLoop:
         """Cuts the metrics back to the iteration that the run goes on from, and opens the loggers.
 
         Args:
-            goes_on: Whether it does.
+            goes_on: True if it does.
             damaged: Checkpoints that were set aside.
             foreign: Those of other runs.
         """

@@ -9,10 +9,11 @@ import numpy as np
 
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.auxiliary import Auxiliary
+from jaxrl_vis.learner.acting.rollout_parts import join_parts
 from jaxrl_vis.learner.auxtasks import View
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.report import auxiliary_video, videos
 from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.trained import load, open_run
@@ -51,16 +52,19 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     # Uses a training rollout without exploration.
     trainer = open_run(run_dir, trust=trust, num_envs=episodes, random_action_probability=0.0, action_noise=0.0)
     env, config, networks = trainer.env, trainer.config, trainer.program.networks
-    train = jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), load(trainer, run_dir).train)
+    if networks is None:
+        raise RequestError(f"--aux shows what networks of ddpg predict, and the run in {run_dir} has {config.algorithm}")
+    train = load(trainer, run_dir).train
     enable_compilation_cache()
-    played, outcome = trainer.program.rollout(train, trainer.programs.evaluation_key[None])
+    parts = trainer.programs.play(train, jnp.stack([trainer.programs.evaluation_key] * config.seeds))
+    played, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, episodes, axis=1), *parts)
     auxiliary = trainer.program.auxiliary
 
     def predict(train: TrainState, episodes: Episodes, key: jax.Array) -> dict[str, jax.Array]:
         return _predict(networks, auxiliary, train, episodes, key)
 
     first, played = jax.tree.map(lambda leaf: leaf[0], (train, played))
-    played = jax.jit(auxiliary.with_flow)(played)
+    played = jax.jit(auxiliary.with_stored)(played)
     keys = jax.random.split(jax.random.key(config.seed), episodes)
     per_episode = jax.jit(predict)
     predictions = [
@@ -94,22 +98,24 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     goals = jnp.broadcast_to(observations[-1], before.shape)
     nothing = jnp.zeros((count, 0))  # true states are not used here
     batch = Batch(jnp.stack([before, goals, after]), actions, nothing, nothing)
-    batch = batch.replace(targets=auxiliary.targets(key, batch, episode.flow))
-    names = ("before", "after", *(name for name in auxiliary.others if name != "after"))
-    inputs = networks.prepare_batch(networks.batch_scaling(train), batch)
-    latents = networks.encode_pieces(train.critic, inputs.pieces(*names))
-    latent_t, latent_tp1, *moved = latents.reshape(len(names), count, networks.config.latent_size)
-    image = networks.normalize(networks.scaling(train.normalizer), before) if "image" in auxiliary.needs else None
-    view = View(latent_t, actions, latent_tp1, *moved, image=image)
-    predicted = auxiliary.predictions(train.critic["heads"], view, batch)
+    batch = auxiliary.with_targets(key, batch, episode.stored)
+    names = ("before", "after", *batch.views)
+    inputs = networks.prepare_batch(networks.batch_scaling(train.statistics), batch)
+    latents = networks.encode_pieces(train.agent.critic, inputs.pieces(*names))
+    latent_t, latent_tp1, *view_latents = latents.reshape(len(names), count, networks.config.latent_size)
+    image = networks.normalize(networks.scaling(train.normalizer), before) if auxiliary.needs_image else None
+    view = View(latent_t, actions, latent_tp1, image)
+    predicted = auxiliary.predictions(
+        train.agent.critic["heads"], view, dict(zip(batch.views, view_latents, strict=True)), batch
+    )
     fields: dict[str, Any] = {}
     if "autoencoder" in predicted:
         fields["reconstruction"] = _as_image(networks, train, predicted["autoencoder"])
     if "optical_flow" in predicted:
-        fields |= {"flow": batch.targets.flow, "flow_predicted": predicted["optical_flow"]}
+        fields |= {"flow": batch.targets["optical_flow"], "flow_predicted": predicted["optical_flow"]}
     if "egomotion" in predicted:
         degrees = jnp.degrees(MAX_ANGLE)
-        fields |= {"rotated": batch.targets.images_moved, "angle": degrees * batch.targets.motion[:, 0]}
+        fields |= {"rotated": batch.views["egomotion"], "angle": degrees * batch.targets["egomotion"][:, 0]}
         fields["angle_predicted"] = degrees * predicted["egomotion"][:, 0]
     return fields
 

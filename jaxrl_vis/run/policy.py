@@ -17,12 +17,9 @@ import numpy as np
 from jaxrl_vis.config import Config
 from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.networks import Networks
+from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
 from jaxrl_vis.run.trained import load, open_run
-from jaxrl_vis.types import NormalizerState, Params
 from jaxrl_vis_envs.base import GoalEnv
-
-_Parameters = tuple[Params, NormalizerState, NormalizerState]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,15 +31,15 @@ class Policy:
         config: The configuration of the run.
         seed: Seed of the run that trained it.
         iteration: Iteration of its checkpoint.
-        parameters: The actor's parameters, and the statistics that normalise observations and goals.
+        parameters: Parameters of the policy, from `Algorithm.policy_params`.
     """
 
     env: GoalEnv
     config: Config
     seed: int
     iteration: int
-    parameters: _Parameters = dataclasses.field(repr=False)
-    _networks: Networks = dataclasses.field(repr=False)
+    parameters: PolicyParams = dataclasses.field(repr=False)
+    _algorithm: Algorithm = dataclasses.field(repr=False)
 
     @property
     def env_name(self) -> str:
@@ -78,16 +75,11 @@ class Policy:
 
     @functools.cached_property
     def _act(self) -> Any:
-        networks = self._networks
+        algorithm = self._algorithm
 
-        def act(parameters: _Parameters, observation: jax.Array, goal: jax.Array) -> jax.Array:
-            actor, *statistics = parameters
-            dtype = self.observation_spec.dtype
-            latents = [
-                networks.encode(actor, networks.prepare(networks.scaling(state), jnp.asarray(value, dtype)[None]))
-                for state, value in zip(statistics, (observation, goal), strict=True)
-            ]
-            return networks.act(actor, jnp.stack(latents))[0]
+        def act(parameters: PolicyParams, observation: jax.Array, goal: jax.Array) -> jax.Array:
+            observations, goals = (jnp.asarray(array, self.observation_spec.dtype)[None] for array in (observation, goal))
+            return algorithm.act(parameters, observations, algorithm.aim(parameters, goals))[0]
 
         return jax.jit(act)
 
@@ -132,8 +124,7 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | 
         raise RequestError(f"the run in {run_dir} has trained no seed {seed}, only {trained}")
     restored = load(trainer, run_dir, checkpoint)
     enable_compilation_cache()
-    train, networks = restored.train, trainer.program.networks
-    parameters = (networks.with_encoder(train.actor, train.critic), train.normalizer, train.goal_statistics)
-    index = trainer.seeds.index(seed)
-    of_seed = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), parameters)
-    return Policy(trainer.env, trainer.config, seed, restored.iteration, of_seed, networks)
+    index, algorithm = trainer.seeds.index(seed), trainer.program.algorithm
+    train = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), restored.train)
+    parameters = algorithm.policy_params(train.agent, train.statistics)
+    return Policy(trainer.env, trainer.config, seed, restored.iteration, parameters, algorithm)

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.learner.replay import num_bytes
+from jaxrl_vis.learner.memory.replay import num_bytes
 from jaxrl_vis.run.arrays import Arrays, check_structure, describe, host_specs, is_intact, rebuild, to_host
 from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.types import LoopState, ReplayState

@@ -9,11 +9,11 @@ from typing import Any
 from jaxrl_vis.run import metrics
 from jaxrl_vis.run.arrays import is_intact, to_host
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, state_without_learner
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.inspection import Expected, Findings, listed
 from jaxrl_vis.run.loop import GUARD
 from jaxrl_vis.run.manifest import progress_in
 from jaxrl_vis.run.metrics import RUN_ID, PerSeed
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.types import LoopState
 

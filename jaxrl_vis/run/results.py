@@ -5,10 +5,10 @@ from typing import Any
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.report import videos
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.console import show_seconds
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 
 

@@ -20,10 +20,10 @@ import numpy as np
 from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.folder import RunFolder
 from jaxrl_vis.run.metrics import PerSeed
-from jaxrl_vis.run.nonfinite import dump, made_by_simulation
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.recent import is_cheap
 from jaxrl_vis.run.signals import Interruption

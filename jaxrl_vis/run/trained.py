@@ -6,11 +6,11 @@ import jax
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.evaluate import num_recorded
+from jaxrl_vis.learner.acting.evaluate import num_recorded
 from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.compiled.memory import check_compiled
 from jaxrl_vis.run.folder import read_config, read_run_id
-from jaxrl_vis.run.memory import check_compiled
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
 

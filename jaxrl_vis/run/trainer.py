@@ -20,10 +20,11 @@ from jaxrl_vis.devices import check_devices, enable_compilation_cache, hush_cach
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
+from jaxrl_vis.plugins import own_names
 from jaxrl_vis.run import loggers
+from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.run.loop import Report, RunLoop
-from jaxrl_vis.run.programs import Programs
 from jaxrl_vis.run.signals import shielded_children
 from jaxrl_vis.streams import safe_streams
 from jaxrl_vis.types import LoopState, Metrics, TrainState
@@ -37,12 +38,12 @@ class Trainer:
 
     Args:
         config: The run.
-        program: What `jaxrl_vis.learner.train_step.make_train_step` returns, or anything with the same attributes.
-        run_dir: Where `run` puts its files; None: `jaxrl_vis.run.folder.default_folder`.
+        program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
+        run_dir: Folder of the files of `run`; None: `jaxrl_vis.run.folder.default_folder`.
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
-        keep_programs: Trace nothing that an earlier process has traced (`jaxrl_vis.run.kept_programs`).
+        keep_programs: Trace nothing that an earlier process has traced (`jaxrl_vis.run.compiled.trace_cache`).
 
     Attributes:
         config: The run.
@@ -121,7 +122,7 @@ class Trainer:
         """``eval/success``, ``eval/goal_distance`` and its median, [S] float32, of the policy without noise.
 
         Args:
-            loop: What was trained.
+            loop: The learner.
             key: A typed key that draws the episodes; None: always the same ones.
 
         Raises:
@@ -149,12 +150,12 @@ class Trainer:
             Terminated: A signal other than Ctrl-C, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
-        loop = RunLoop(self.programs, self.folder, self._log)
-        try:
-            yield from loop.reports(self._resume, self._overwrite)
-        finally:
-            if loop.has_begun:  # asked again, it goes on; a finished run says that there is nothing left to do
-                self._resume, self._overwrite = True, False
+        loop = RunLoop(self.programs, self.folder, self._log, self._go_on_next_time)
+        return loop.reports(self._resume, self._overwrite)
+
+    def _go_on_next_time(self) -> None:
+        """Resume where `run` is called again; a finished run says that there is nothing left to do."""
+        self._resume, self._overwrite = True, False
 
 
 def _check_key(function: str, key: Any) -> None:
@@ -174,12 +175,12 @@ def make_trainer(
 
     Args:
         config: The run.
-        run_dir: Where `Trainer.run` puts its files; None: below ``runs/``, named after the configuration.
+        run_dir: Folder of the files of `Trainer.run`; None: below ``runs/``, named after the configuration.
         resume: Go on with the run in that folder; in an empty one it starts at the beginning, and says so.
         overwrite: Delete the run in that folder and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
         keep_programs: Trace nothing that an earlier process has traced. For processes that have replaced nothing in this
-            package's modules, which would not be seen (`jaxrl_vis.run.kept_programs`).
+            package's modules, which would not be seen (`jaxrl_vis.run.compiled.trace_cache`).
 
     Raises:
         RequestError: The configuration asks for something that cannot be, or contradicts the saved run.
@@ -193,7 +194,7 @@ def make_trainer(
         hush_cache()
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
             start_devices()
-            if is_built_in(config.env):
+            if is_built_in(config.env) and not own_names(config):
                 locate_env(config)  # imports MuJoCo, meanwhile
             check_devices()
         config = locate_env(config)

@@ -1,8 +1,9 @@
 """Trust in the code named by a run folder.
 
-A run on a custom task, ``module:Name``, names that module and the folder to import it from: using the run executes that code.
-Nothing else in a run folder is code. So a run is used only by a user who trained it here, or who declared its code trusted;
-both are stored in the user's own cache, for the folder, the run's id, the task and the file:
+A run with custom code, ``module:Name`` (a task, an algorithm, a method, an auxiliary task or a weighting), names the module and
+the folder to import it from: using the run executes that code. Nothing else in a run folder is code. So a run is used only by a
+user who trained it here, or who declared its code trusted; both are stored in the user's own cache, for the folder, the run's
+id, the parts and their files:
 
     ~/.cache/jaxrl-vis/trusted/<digest>      description of what was trusted; `is_trusted` uses the name only
 """
@@ -16,6 +17,7 @@ from pathlib import Path
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.files import make_private, read_private, replacing, stranger_to, user_cache
+from jaxrl_vis.plugins import own_names
 from jaxrl_vis.run.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
@@ -24,21 +26,22 @@ _trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 
 def is_own(config: Config) -> bool:
-    """Returns True if the task of a configuration is custom code."""
-    return task_modules.is_own(config.env)
+    """Returns True if a part of a configuration is custom code."""
+    return bool(own_names(config))
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
-    """Returns True if a run's task code was trusted before and is, as far as can be told, unchanged; or if it has none.
+    """Returns True if a run's code was trusted before and is, as far as can be told, unchanged; or if it has none.
 
     Raises:
-        RequestError: There is no run in ``run_dir``, or its task is not of the form ``module:Name``.
+        RequestError: There is no run in ``run_dir``, or a part of it is not written ``module:Name``.
     """
-    return _file(config) is None or any(name in _trusted_here or _is_stored(name) for name in _names(run_dir, config))
+    has_code = any(_files(config).values())
+    return not has_code or any(name in _trusted_here or _is_stored(name) for name in _names(run_dir, config))
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
-    """Stores that a run's task may be imported.
+    """Stores that the custom parts of a run may be imported.
 
     Args:
         run_dir: The run folder.
@@ -46,9 +49,10 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
         was_trained_here: Allow later changes of the file, which a user who trains also edits; not if it lies in the run folder.
     """
     changing, as_it_is = _names(run_dir, config)
-    name = changing if was_trained_here and not _is_inside(run_dir, _file(config)) else as_it_is
+    is_inside = any(_is_inside(run_dir, file) for file in _files(config).values())
+    name = changing if was_trained_here and not is_inside else as_it_is
     _trusted_here.add(name)
-    about = {"run": str(run_dir.resolve()), "task": config.env, "file": str(_file(config))}
+    about = {"run": str(run_dir.resolve()), "files": {name: str(file) for name, file in _files(config).items()}}
     with contextlib.suppress(OSError):
         make_private(_folder())
         with replacing(_folder() / name, durable=False, mode=0o600) as file:
@@ -58,7 +62,7 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
 
 
 def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True") -> None:
-    """Checks that the code of a run's task may be imported; permission by ``may`` is stored.
+    """Checks that the code of a run may be imported; permission by ``may`` is stored.
 
     Args:
         run_dir: The run folder.
@@ -78,7 +82,9 @@ def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True
 
 def question(run_dir: Path, config: Config) -> str:
     """Returns the question about trust, for messages."""
-    return f"the run in {run_dir} runs code that is not of this project: its task {config.env} is imported from {_file(config)}"
+    files = _files(config)
+    parts = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]
+    return f"the run in {run_dir} runs code that is not of this project: {', '.join(parts)}"
 
 
 def _folder() -> Path:
@@ -92,21 +98,25 @@ def _is_stored(name: str) -> bool:
         return False
 
 
-def _file(config: Config) -> Path | None:
-    """Locates a task's module without importing anything; None if there is none."""
-    try:
-        module, _ = task_modules.split(config.env)
-        return task_modules.find(module, config.env_folder)
-    except (ValueError, OSError) as error:  # not of this form, or an invalid folder
-        raise RequestError(f"the task {config.env!r} cannot be found: {error}") from error
+def _files(config: Config) -> dict[str, Path | None]:
+    """Locates the modules of a run's custom parts, by name, without importing anything; None if there is none."""
+    files = {}
+    for kind, name in own_names(config).items():
+        try:
+            files[name] = task_modules.find(task_modules.split(name)[0], config.env_folder)
+        except (ValueError, OSError) as error:  # not of this form, or an invalid folder
+            raise RequestError(f"the {kind} {name!r} cannot be found: {error}") from error
+    return files
 
 
 def _names(run_dir: Path, config: Config) -> tuple[str, str]:
-    """Computes digests of a run and its task: without, and with the current contents of the module's file."""
-    file = _file(config)
-    about = [str(run_dir.resolve()), read_run_id(run_dir), config.env, str(file)]
-    files = _modules_in(run_dir) if _is_inside(run_dir, file) else [file] if file is not None else []
-    contents = [[str(path), hashlib.sha256(path.read_bytes()).hexdigest()] for path in files if path.is_file()]
+    """Computes digests of a run and its custom parts: without, and with the current contents of their files."""
+    files = _files(config)
+    about = [str(run_dir.resolve()), read_run_id(run_dir), *(word for pair in files.items() for word in map(str, pair))]
+    paths = {file for file in files.values() if file is not None and not _is_inside(run_dir, file)}
+    if any(_is_inside(run_dir, file) for file in files.values()):
+        paths |= set(_modules_in(run_dir))
+    contents = [[str(path), hashlib.sha256(path.read_bytes()).hexdigest()] for path in sorted(paths) if path.is_file()]
     return _digest(about), _digest([*about, contents])
 
 

@@ -19,6 +19,7 @@ from jaxrl_vis import provenance
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.run.compiled.memory import check_compiled, check_memory
 from jaxrl_vis.run.folder import RunFolder, read_record
 from jaxrl_vis.run.inspection import (
     LOST,
@@ -30,7 +31,6 @@ from jaxrl_vis.run.inspection import (
     read_file,
 )
 from jaxrl_vis.run.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.memory import check_compiled, check_memory
 from jaxrl_vis.run.metrics import RUN_ID
 from jaxrl_vis.run.progress import Progress
 from jaxrl_vis.run.recent import Unusable

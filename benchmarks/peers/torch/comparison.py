@@ -23,9 +23,9 @@ from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner import normalizer
-from jaxrl_vis.learner.ddpg import make_ddpg
-from jaxrl_vis.learner.sampling import Choice, Sampler
+from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
+from jaxrl_vis.learner.memory.sampling import Choice, Sampler
+from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.train_step import TrainStep
 from jaxrl_vis.types import ReplayState, TrainState
 
@@ -87,9 +87,10 @@ def distinguishable(train: TrainState, program: TrainStep, replay: ReplayState) 
     networks, target_key = program.networks, jax.random.key(7)
     fresh = {"actor": networks.init_actor(target_key), "critic": networks.init_critic(target_key)}
     images = program.replay.stacked(jax.tree.map(lambda leaf: leaf[:4] if leaf.ndim else leaf, replay))
-    changes: dict[str, Any] = {
-        f"target_{name}": {part: tree[part] for part in getattr(train, f"target_{name}")} for name, tree in fresh.items()
+    targets = {
+        f"target_{name}": {part: tree[part] for part in getattr(train.agent, f"target_{name}")} for name, tree in fresh.items()
     }
+    changes: dict[str, Any] = {"agent": train.agent.replace(**targets)}
     changes["normalizer"] = normalizer.update(train.normalizer, images)
     if train.goal_normalizer is not None:
         changes["goal_normalizer"] = normalizer.update(train.goal_normalizer, images[:, -1:])
@@ -117,17 +118,17 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
         train = distinguishable(train, program, replay)
         pairs = [
             (moments.mean, normalizer.scale(moments, config.normalizer_floor))
-            for moments in (train.normalizer, train.goal_statistics)
+            for moments in (train.statistics.observations, train.statistics.goals)
         ]
         return train, jax.vmap(choose)(jax.random.split(jax.random.key(11), STEPS)), pairs
 
     def step(with_actor: bool, train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
-        working = algorithm.begin(train)
+        working = algorithm.begin(train.agent, train.statistics)
         # The actor's gradient is compared in every step, and applied only in the actor's turns.
         gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, sampler.batch(replay, choice)), True)
         losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
         taken = gradients if with_actor else gradients._replace(actor=None)
-        return algorithm.end(algorithm.apply(working, taken)), losses, gradients
+        return train.replace(agent=algorithm.end(algorithm.apply(working, taken))), losses, gradients
 
     train, choices, statistics = jax.device_get(jaxrl_vis_envs.jit(begin, runs_once=True)(train, replay))
     now = train
@@ -142,7 +143,7 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
             gradients.append(step_gradients)
     names = ("actor", "critic", "target_actor", "target_critic")
     return Reference(
-        parameters={name: by_name(getattr(train, name)) for name in names},
+        parameters={name: by_name(getattr(train.agent, name)) for name in names},
         statistics=tuple(statistics),
         choices=np.stack([np.asarray(part, np.int64) for part in (*choices.indices, choices.goal_slot)], axis=1),
         losses=np.stack(losses),
@@ -183,8 +184,8 @@ def _rules(learner: Any, program: TrainStep, train: TrainState, encoder: str, dt
         "dtype": dtype,
         "levels": len(config.encoder_filters),
         "hidden": len(config.hidden_sizes),
-        "shared_encoder": "encoder" not in train.actor,
-        "target_encoder": "encoder" in train.target_critic,
+        "shared_encoder": "encoder" not in train.agent.actor,
+        "target_encoder": "encoder" in train.agent.target_critic,
         "actor_interval": numbers.get("actor_interval", 1),
         "frame_stack": program.env.frame_stack,
     }

@@ -5,18 +5,17 @@ import jax
 from jaxrl_vis.learner.auxtasks import heads
 from jaxrl_vis.learner.auxtasks.images import grey
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
-from jaxrl_vis.learner.blocks import from_blocks, to_blocks
+from jaxrl_vis.learner.networks.blocks import from_blocks, to_blocks
 from jaxrl_vis.types import Params
 
 
-def make(spec: Spec, in_grey: bool = False) -> AuxTask:
-    """The task.
+def make(spec: Spec) -> AuxTask:
+    """Make the task.
 
-    Args:
-        spec: Sizes.
-        in_grey: Whether one grey channel of the newest image is reconstructed, as in the authors' release, rather than all
-            channels of the observation. Here it is the luminance of the normalised channels; the release normalises again.
+    As in the authors' release (``spec.options.in_grey``), one grey channel of the newest image is reconstructed rather than all
+    channels of the observation. Here it is the luminance of the normalised channels; the release normalises again.
     """
+    in_grey = spec.options.in_grey
     channels, height, width = spec.observation.shape
     shape = (1 if in_grey else channels, height, width)
     whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
@@ -39,4 +38,5 @@ def make(spec: Spec, in_grey: bool = False) -> AuxTask:
         init=lambda key: heads.init_decoder(key, spec.latent_size, shape, spec.levels),
         predict=lambda params, view: from_blocks(decode(params, view), *whole),
         loss=loss,
+        number=3,
     )

@@ -1,41 +1,33 @@
 """Egomotion: how an image was rotated, from its latent and the new one, by a linear layer (thesis, 5.2.3.1)."""
 
 import math
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.learner.auxtasks import heads
 from jaxrl_vis.learner.auxtasks.images import from_words, read_words_between, to_words
-from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
+from jaxrl_vis.learner.auxtasks.task import AuxTask, Border, Spec, View, mean_squared_error, read
 from jaxrl_vis.types import Params
 
 MAX_ANGLE = math.radians(30.0)
-RELEASE_SHIFT = 0.1  # 10 of 100 pixels
-
-Border = Literal["clip", "zero"]
-"""What becomes of the corners that a rotation leaves empty. ``clip``: the image is clipped to the largest rectangle of its own
-proportions that has none, and scaled to its old size, as in the thesis. ``zero``: they are 0, as in the authors' release."""
 
 
-def make(spec: Spec, max_shift: float = 0.0) -> AuxTask:
-    """The task.
-
-    Args:
-        spec: Sizes.
-        max_shift: As of `egomotion_pair`; with one, three numbers are predicted rather than the angle alone.
-    """
+def make(spec: Spec) -> AuxTask:
+    """Make the task. With ``spec.options.max_shift``, three numbers are predicted rather than the angle alone."""
+    options = spec.options
 
     def predict(params: Params, view: View) -> jax.Array:
-        return heads.linear(params, view.latent_t, read(view, "latent_moved"))
+        return heads.linear(params, view.latent_t, read(view, "latent_view"))
 
     return AuxTask(
         name="egomotion",
-        needs=frozenset({"latent_moved", "motion"}),
-        init=lambda key: heads.init_linear(key, 2 * spec.latent_size, 3 if max_shift else 1),
+        init=lambda key: heads.init_linear(key, 2 * spec.latent_size, 3 if options.max_shift else 1),
         predict=predict,
-        loss=lambda params, view: mean_squared_error(predict(params, view), read(view, "motion")),
+        loss=lambda params, view: mean_squared_error(predict(params, view), read(view, "target")),
+        view=lambda key, batch: egomotion_pair(key, batch.images_t, options.border, options.max_shift),
+        number=2,
+        draws_unfolded=True,
     )
 
 
@@ -47,7 +39,7 @@ def egomotion_pair(
     Args:
         key: [] a typed key.
         images: [B, C, H, W] uint8.
-        border: What becomes of empty corners.
+        border: Treatment of empty corners.
         max_shift: Farthest shift each way, as a share of the image's size; in the release 0.1, in the thesis none.
 
     Returns:
@@ -67,7 +59,7 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
         images: [B, C, H, W] uint8.
         angle: [B] float32 in radians, counter-clockwise as one sees it.
         shift: [B, 2] float32 in pixels, to the right and down.
-        border: What becomes of empty corners.
+        border: Treatment of empty corners.
     """
     height, width = images.shape[-2:]
     last_x, last_y = width - 1.0, height - 1.0

@@ -35,7 +35,7 @@ _BORDER_WEIGHTS = (0.14, 0.14, 0.4472, 0.4472, 0.4472)  # of the outermost pixel
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What OpenCV calls pyr_scale, levels, winsize, iterations, poly_n and poly_sigma; by default as in the authors' release.
+    """Settings that OpenCV calls pyr_scale, levels, winsize, iterations, poly_n and poly_sigma; by default the release's.
 
     Attributes:
         scale: Size of a level of the pyramid over that of the next finer one.

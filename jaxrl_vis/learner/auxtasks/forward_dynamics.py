@@ -7,14 +7,13 @@ from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_er
 from jaxrl_vis.types import Params
 
 
-def make(spec: Spec, detach: bool = True) -> AuxTask:
-    """The task.
+def make(spec: Spec) -> AuxTask:
+    """Make the task.
 
-    Args:
-        spec: Sizes.
-        detach: Whether the next latent is a target only. The authors' release lets gradients into it, so that the encoder can
-            lower the loss by making all latents alike.
+    With ``spec.options.detach`` the next latent is a target only. The authors' release lets gradients into it, so that the
+    encoder can lower the loss by making all latents alike.
     """
+    detach = spec.options.detach
 
     def predict(params: Params, view: View) -> jax.Array:
         return heads.linear(params, view.latent_t, view.action)
@@ -29,4 +28,5 @@ def make(spec: Spec, detach: bool = True) -> AuxTask:
         init=lambda key: heads.init_linear(key, spec.latent_size + spec.action_size, spec.latent_size),
         predict=predict,
         loss=loss,
+        number=0,
     )

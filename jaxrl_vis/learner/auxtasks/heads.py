@@ -10,9 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner import decoder_kernel, encoder_kernel_patches
-from jaxrl_vis.learner.encoder_kernel_passes import LEAST_ROWS
-from jaxrl_vis.learner.products import product
+from jaxrl_vis.learner.networks.kernels import decoder as decoder_kernel
+from jaxrl_vis.learner.networks.kernels import patches as encoder_kernel_patches
+from jaxrl_vis.learner.networks.kernels.passes import LEAST_ROWS
+from jaxrl_vis.learner.networks.matmul import product
 from jaxrl_vis.types import Params
 
 _glorot = jax.nn.initializers.glorot_uniform()
@@ -59,7 +60,7 @@ def decode(params: Params, values: jax.Array, dtype: Any) -> jax.Array:
     Args:
         params: From `init_decoder`.
         values: [B, inputs].
-        dtype: What is computed in.
+        dtype: Dtype of the computation.
     """
     layers = _layers(params)
     pixels = _through(layers, values, dtype) + layers[-1]["bias"].astype(dtype)
@@ -73,8 +74,8 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
     Args:
         params: From `init_decoder`; see `has_kernel`.
         values: [B, inputs].
-        patches: [at least B, patches, 64 C'], what is to be decoded, as `encoder_kernel_patches.to_patches` orders it.
-        dtype: What is computed in.
+        patches: [at least B, patches, 64 C'], what is to be decoded, as `kernels.patches.to_patches` orders it.
+        dtype: Dtype of the computation.
     """
     *coarser, before, finer, finest = _layers(params)
     cells = _through([*coarser, before], values, dtype)
@@ -84,7 +85,7 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
 
 
 def has_kernel(batch: int, shape: tuple[int, int, int], levels: int) -> bool:
-    """Whether `decoding_error` can decode ``batch`` images of shape C, H, W by a decoder of so many levels."""
+    """Return True if `decoding_error` supports ``batch`` images of shape C, H, W and a decoder of so many levels."""
     channels, height, width = shape
     cells = batch * (height >> levels) * (width >> levels) * 4 ** (levels - 2)
     is_whole = levels >= encoder_kernel_patches.LEVELS and cells % LEAST_ROWS == 0
@@ -97,7 +98,7 @@ def _layers(params: Params) -> list[Params]:
 
 
 def _through(layers: list[Params], values: jax.Array, dtype: Any) -> jax.Array:
-    """What the last layer makes before its bias is added: [.., outputs of a pixel], in ``dtype``."""
+    """Return the output of the last layer before its bias is added: [.., outputs of a pixel], in ``dtype``."""
     for number, layer in enumerate(layers):
         if number > 0:
             biased = values + layers[number - 1]["bias"].astype(dtype)

@@ -41,7 +41,7 @@ def read_planes_between(planes: Sequence[jax.Array], x: jax.Array, y: jax.Array)
 
 
 def _neighbours(height: int, width: int, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Which pixel is the upper left one of the four around each place, and how far right and down of it the place is."""
+    """Return the index of the upper left one of the four pixels around each place, and the distances right and down of it."""
     x, y = jnp.clip(x, 0.0, width - 1.0), jnp.clip(y, 0.0, height - 1.0)
     left, top = jnp.clip(jnp.floor(x), 0, width - 2), jnp.clip(jnp.floor(y), 0, height - 2)
     return (top * width + left).astype(jnp.int32), x - left, y - top

@@ -8,11 +8,7 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """The task.
-
-    Args:
-        spec: Sizes.
-    """
+    """Make the task."""
 
     def predict(params: Params, view: View) -> jax.Array:
         return heads.linear(params, view.latent_t, read(view, "latent_tp1"))
@@ -23,4 +19,5 @@ def make(spec: Spec) -> AuxTask:
         init=lambda key: heads.init_linear(key, 2 * spec.latent_size, spec.action_size),
         predict=predict,
         loss=lambda params, view: mean_squared_error(predict(params, view), view.action),
+        number=1,
     )

@@ -6,17 +6,14 @@ import jax.numpy as jnp
 from jaxrl_vis.learner.auxtasks import farneback, heads
 from jaxrl_vis.learner.auxtasks.images import grey
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
-from jaxrl_vis.learner.blocks import from_blocks, to_blocks
-from jaxrl_vis.learner.encoder_kernel_patches import to_patches
+from jaxrl_vis.learner.networks.blocks import from_blocks, shifted, to_blocks
+from jaxrl_vis.learner.networks.kernels.patches import to_patches
 from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """The task.
-
-    Args:
-        spec: Sizes.
-    """
+    """Make the task. The flow is computed once an episode: that takes longer than all the rest of a gradient step."""
+    stretch = spec.options.stretch
     _, height, width = spec.observation.shape
     whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
 
@@ -28,16 +25,20 @@ def make(spec: Spec) -> AuxTask:
 
     def loss(params: Params, view: View) -> jax.Array:
         if view.patches is not None and heads.has_kernel(view.latent_t.shape[0], (1, height, width), spec.levels):
-            patches = to_patches(read(view, "flow")[:, None].astype(spec.dtype), spec.levels)
+            patches = to_patches(read(view, "target")[:, None].astype(spec.dtype), spec.levels)
             return heads.decoding_error(params, both(view), patches, spec.dtype)
-        return mean_squared_error(decode(params, view), to_blocks(read(view, "flow")[:, None], spec.levels))
+        return mean_squared_error(decode(params, view), to_blocks(read(view, "target")[:, None], spec.levels))
 
     return AuxTask(
         name="optical_flow",
-        needs=frozenset({"latent_tp1", "flow"}),
+        needs=frozenset({"latent_tp1"}),
         init=lambda key: heads.init_decoder(key, 2 * spec.latent_size, (1, height, width), spec.levels),
         predict=lambda params, view: from_blocks(decode(params, view), *whole)[:, 0],
         loss=loss,
+        episode=lambda images: to_bytes(flow_strength_along(images, spec.frame_stack, stretch), stretch),
+        target=lambda batch: from_bytes(batch.stored, stretch),
+        shift=lambda flow, pixels: shifted(flow[:, None], pixels)[:, 0],
+        number=4,
     )
 
 

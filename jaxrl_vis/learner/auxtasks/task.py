@@ -1,18 +1,55 @@
-"""What every auxiliary task is made from, and what it is."""
+"""The interface of an auxiliary task, and the records that it reads.
+
+A task is a head on the latents of an encoder and a loss. It declares what it wants beyond the latents of an observation:
+
+    needs      latents and images that other tasks may need, too                                  `View`
+    episode    arrays that are computed once an episode, and lie beside it in the replay          [T, ...] for its T steps
+    view       images of its own that are encoded, made anew for each batch, and what belongs to them: its target
+    target     a target that follows from a batch and from what ``episode`` has computed
+"""
 
 import dataclasses
+import zlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.types import Params, Replaceable
 
+Border = Literal["clip", "zero"]
+"""Treatment of the corners that a rotation leaves empty. ``clip``: the image is clipped to the largest rectangle of its own
+proportions that has none, and scaled to its old size, as in the thesis. ``zero``: they are 0, as in the authors' release."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Differences between the thesis and the authors' release; the defaults are the thesis's, `RELEASE` the others.
+
+    Attributes:
+        detach: Whether the loss of forward dynamics leaves the next latent alone. The thesis does not say; in the release, it
+            does not.
+        border: Treatment of the corners that a rotation leaves empty.
+        max_shift: Farthest shift that comes with a rotation, as a share of the image's size.
+        in_grey: Whether the autoencoder reconstructs one grey channel rather than the observation.
+        stretch: Whether each mask of optical flow is stretched to [0, 1], rather than being in pixels.
+    """
+
+    detach: bool = True
+    border: Border = "clip"
+    max_shift: float = 0.0
+    in_grey: bool = False
+    stretch: bool = False
+
+
+RELEASE = Options(detach=False, border="zero", max_shift=0.1, in_grey=True, stretch=True)
+"""The authors' release. A shift of 0.1 is 10 of its 100 pixels."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Spec:
-    """Sizes that the heads of auxiliary tasks adapt to.
+    """Sizes and options that auxiliary tasks are made for.
 
     Attributes:
         observation: Shape [C, H, W] and dtype uint8 of one observation.
@@ -20,7 +57,8 @@ class Spec:
         latent_size: L, of an encoded observation.
         frame_stack: Images that an observation stacks along C, the newest first.
         levels: Strided layers of the encoder; decoders have as many.
-        dtype: What decoders compute in. Their last step, linear heads and losses are float32.
+        dtype: Dtype that decoders compute in. Their last step, linear heads and losses are float32.
+        options: Differences between the thesis and the release.
     """
 
     observation: jax.ShapeDtypeStruct
@@ -29,32 +67,47 @@ class Spec:
     frame_stack: int = 1
     levels: int = 4
     dtype: Any = jnp.float32
+    options: Options = Options()
+
+
+class Transitions(NamedTuple):
+    """B transitions as they were sampled, before images are shifted or normalised.
+
+    Attributes:
+        images_t: [B, C, H, W] uint8, before the action.
+        images_tp1: The same after it.
+        action: [B, A] float32 in [-1, 1], as executed.
+        stored: [B, ...] what `AuxTask.episode` has computed for these steps; None where the task has none.
+    """
+
+    images_t: jax.Array
+    images_tp1: jax.Array
+    action: jax.Array
+    stored: jax.Array | None = None
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class View(Replaceable):
-    """What losses of auxiliary tasks can read of B transitions; what no task `needs` may be left out.
+    """Inputs of an auxiliary task's loss, of B transitions; what a task does not declare may be left out.
 
     Attributes:
         latent_t: [B, L] any float dtype, of the observations before the action.
         action: [B, A] float32 in [-1, 1], as executed.
         latent_tp1: [B, L] of the observations after the action.
-        latent_moved: [B, L] of the observations before, rotated (`egomotion.egomotion_pair`).
-        motion: [B, 1 or 3] float32 in [-1, 1], how they were rotated (and shifted).
         image: [B, C, H, W] any float dtype, the observations before, normalised as for the encoder.
-        flow: [B, H, W] float32, strength of the optical flow (`optical_flow.flow_strength`).
-        patches: [at least B, patches, 64 C'], ``image`` and others as `encoder_kernel.prepare` orders them, where the encoder
-            reads them so: decoders, too, are kernels then (`decoder_kernel`).
+        latent_view: [B, L] of the images that the task's own ``view`` has made.
+        target: Result of the task's own ``view`` or ``target``.
+        patches: [at least B, patches, 64 C'], ``image`` and others as `kernels.encoder.prepare` orders them, where the encoder
+            reads them so: decoders, too, are kernels then (`kernels.decoder`).
     """
 
     latent_t: jax.Array
     action: jax.Array
     latent_tp1: jax.Array | None = None
-    latent_moved: jax.Array | None = None
-    motion: jax.Array | None = None
     image: jax.Array | None = None
-    flow: jax.Array | None = None
+    latent_view: jax.Array | None = None
+    target: Any = None
     patches: jax.Array | None = None
 
 
@@ -62,23 +115,42 @@ class AuxTask(NamedTuple):
     """An auxiliary task: a head on the latents of an encoder, and its loss. Pure.
 
     Attributes:
-        name: One of `auxtasks.NAMES`.
-        needs: The optional fields of `View` that it reads.
+        name: Unique among the tasks of a run; names its head, its metrics and its weight.
         init: key -> parameters of its head, a nested dictionary of float32.
-        predict: (parameters, View) -> what the head predicts, float32: a latent [B, L], an action [B, A], a motion [B, 1 or 3],
+        predict: (parameters, View) -> prediction of the head, float32: a latent [B, L], an action [B, A], a motion [B, 1 or 3],
             an image [B, C, H, W] or a flow strength [B, H, W]. Images end where the encoder's last whole block does.
-        loss: (parameters, View) -> [] float32, the mean squared error of that prediction.
+        loss: (parameters, View) -> [] float32, such as the mean squared error of that prediction.
+        needs: Of ``latent_tp1`` and ``image``, the fields of `View` that it reads.
+        episode: [T + 1, C, H, W] uint8, images of an episode -> [T, ...] uint8 or float32. Computed once, when an episode is
+            collected: a transition is sampled 5 to 20 times.
+        view: (key, Transitions) -> (images [B, C, H, W] uint8 to be encoded, target). They are shifted as the batch is.
+        target: Transitions -> target, for tasks without ``view``.
+        shift: (target, [B, 2] int32 pixels) -> target where a batch's images are shifted so far down and to the right; None:
+            the same target.
+        number: uint32, folded into keys for what the task draws, so that it draws alike whichever other tasks there are; None:
+            a digest of the name.
+        draws_unfolded: Whether ``view`` draws with the batch's own key, which only one task may do.
     """
 
     name: str
-    needs: frozenset[str]
     init: Callable[[jax.Array], Params]
     predict: Callable[[Params, View], jax.Array]
     loss: Callable[[Params, View], jax.Array]
+    needs: frozenset[str] = frozenset()
+    episode: Callable[[jax.Array], jax.Array] | None = None
+    view: Callable[[jax.Array, Transitions], tuple[jax.Array, Any]] | None = None
+    target: Callable[[Transitions], Any] | None = None
+    shift: Callable[[Any, jax.Array], Any] | None = None
+    number: int | None = None
+    draws_unfolded: bool = False
+
+    def fold(self, key: jax.Array) -> jax.Array:
+        """Return the task's own key."""
+        return jax.random.fold_in(key, zlib.crc32(self.name.encode()) if self.number is None else self.number)
 
 
 def read(view: View, field: str) -> jax.Array:
-    """An optional field of a view.
+    """Return an optional field of a view.
 
     Raises:
         ValueError: It was left out.
@@ -90,6 +162,6 @@ def read(view: View, field: str) -> jax.Array:
 
 
 def mean_squared_error(prediction: jax.Array, target: jax.Array) -> jax.Array:
-    """[] float32, over all elements of two arrays of the same shape."""
+    """Return the mean squared error of all elements of two arrays of the same shape, [] float32."""
     assert prediction.shape == target.shape, (prediction.shape, target.shape)
     return jnp.mean(jnp.square(prediction.astype(jnp.float32) - target.astype(jnp.float32)))

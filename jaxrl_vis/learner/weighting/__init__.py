@@ -1,15 +1,15 @@
-"""How much auxiliary losses count beside the main one. A leaf: knows neither DDPG nor environments.
+"""Weightings of auxiliary losses beside the main one. A leaf: knows neither DDPG nor environments.
 
 base        the interface, `Weighting`, and the logarithm of a loss
-members     weights that are given, or follow from one step
-ol_aux      weights that learn
-table       all of them by name
+constant    weights that are given, or follow from one step
+ol_aux      weights that learn; `ol_aux_variants`: as in the authors' release, and the ablation of figure 5.7
+registry    all of them by name
 gradients   `weighted_grad`: anybody's losses and parameters, differentiated, weighted and added up
 """
 
 from jaxrl_vis.learner.weighting.base import MAIN, Weighting, WeightingState, weighted_sum
 from jaxrl_vis.learner.weighting.gradients import Way, Weighted, loss_gradients, measure, weighted_grad
-from jaxrl_vis.learner.weighting.table import WEIGHTINGS, make_weighting
+from jaxrl_vis.learner.weighting.registry import WEIGHTINGS, make_weighting
 
 __all__ = [
     "MAIN",

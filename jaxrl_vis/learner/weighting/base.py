@@ -1,10 +1,10 @@
-"""What a weighting is: how much each auxiliary loss counts beside the main one, and what it has to be told to decide that.
+"""The interface of a weighting, which decides how much each auxiliary loss counts beside the main one.
 
 One gradient step with losses L_i, shared parameters theta and a weighting:
 
     c_i = w_i s_i,  s_i = 1, or d log(L_i + eps) / d L_i where the weighting takes logarithms     `Weighting.coefficients`
     gradient = sum over i of c_i grad L_i, over all parameters; the optimiser takes it
-    statistics = what the weighting needs to know about the gradients with respect to theta alone
+    statistics = what the weighting needs of the gradients with respect to theta alone
 
 Losses, dots and gradients cross this interface as they are, without logarithms; the weighting multiplies them by s_i itself.
 So they can be averaged over devices or minibatches first, which would be wrong for logarithms.
@@ -25,7 +25,6 @@ MAIN = "main"
 """Name of the loss that the others are to help. Its weight is always 1."""
 
 Needs = Literal["losses", "dots", "gradients"]
-MainGradient = Literal["main", "total"]
 Losses = Mapping[str, jax.Array]  # [] floats by name, `MAIN` among them
 Weights = dict[str, jax.Array]
 
@@ -33,46 +32,47 @@ Weights = dict[str, jax.Array]
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class WeightingState(Replaceable):
-    """What a weighting remembers. All shapes are fixed, so it can be scanned, mapped, sharded and saved like parameters.
+    """State of a weighting. All shapes are fixed, so it can be scanned, mapped, sharded and saved like parameters.
 
     Attributes:
-        weights: [] float32 by name, for all losses; `MAIN` is 1. What the next gradients are combined with, unless the
+        weights: [] float32 by name, for all losses; `MAIN` is 1. The next gradients are combined with them, unless the
             weighting decides by these gradients (`cosine`).
         updates: [] int32, calls of `Weighting.update` so far.
         sums: Sums over the calls since the weights last moved; None where nothing is summed up.
         window: The latest gradients by name, [window, ...] each; None without a moving average.
+        params: Parameters at which losses and gradients are compared; None: those of each step.
     """
 
     weights: Weights
     updates: jax.Array
     sums: Any = None
     window: Any = None
+    params: Params = None
 
 
 class Weighting(NamedTuple):
-    """A way to weight losses. Pure; apart from ``init`` and ``update``, all fields are static.
+    """Rule for the weights of losses. Pure; apart from ``init``, ``update`` and ``hold``, all fields are static.
 
     Attributes:
         name: As in `make_weighting`.
         init: (names of all losses, `MAIN` among them; shared parameters or their shapes, which are read where ``needs`` is
-            gradients) -> WeightingState. Raises RequestError where names are missing or too many.
+            gradients; where there is ``hold``, also all parameters or their shapes) -> WeightingState. Raises RequestError
+            where names are missing or too many.
         update: (losses, statistics, state) -> (weights of this step by name, state, metrics of [] float32). ``statistics`` is
 
             - for ``needs`` losses: not read, None will do;
-            - dots: [] float32 for each auxiliary loss, <d, grad L_i>, where d is grad L_main, or with ``main_grad`` total the
-              combined gradient, sum over j of c_j grad L_j with the weights of the state;
+            - dots: [] float32 for each auxiliary loss, <grad L_main, grad L_i>;
             - gradients: for every loss, grad L_i.
 
             Gradients are those of the losses as they are, with respect to the shared parameters alone.
-        needs: What ``statistics`` must hold.
-        auxiliary: Whether auxiliary losses are learned at all; if not, they weigh 0 and need not be computed.
-        log: Whether logarithms of the losses are learned.
+        needs: Kind of ``statistics``.
+        auxiliary: True if auxiliary losses are learned at all; if not, they weigh 0 and need not be computed.
+        log: True if logarithms of the losses are learned.
         eps: Added to auxiliary losses before their logarithm is taken.
         main_eps: Added to the main loss likewise.
-        main_grad: Whose gradient the others are compared with.
         interval: N, calls of ``update`` from one change of the weights to the next.
-        held: Losses and statistics of the N calls of an interval must all belong to the parameters that the interval began
-            with, whatever the optimiser does in between.
+        hold: (parameters of this step, WeightingState) -> WeightingState with the ``params`` that losses and statistics of
+            this step must belong to; None: they are those of the step.
     """
 
     name: str
@@ -83,9 +83,8 @@ class Weighting(NamedTuple):
     log: bool = False
     eps: float = 0.02
     main_eps: float = 1e-8
-    main_grad: MainGradient = "main"
     interval: int = 1
-    held: bool = False
+    hold: Callable[[Params, WeightingState], WeightingState] | None = None
 
     def slopes(self, losses: Losses) -> dict[str, jax.Array]:
         """s_i: the derivative of what is learned by the loss itself, [] float32 by name. All 1 without logarithms."""
@@ -96,7 +95,7 @@ class Weighting(NamedTuple):
         return {name: weights[name] * slope for name, slope in self.slopes(losses).items()}
 
     def objective(self, weights: Weights, losses: Losses) -> jax.Array:
-        """What is learned: the weighted sum of the losses or of their logarithms, [] float32.
+        """Return the objective: the weighted sum of the losses or of their logarithms, [] float32.
 
         Its gradient, weights being constant, is the sum of c_i grad L_i.
         """
@@ -121,6 +120,40 @@ def log_loss(loss: jax.Array, eps: float) -> jax.Array:
 def log_slope(loss: jax.Array, eps: float) -> jax.Array:
     """The derivative of `log_loss`: 1 / (max(L, 0) + eps), without gradient."""
     return 1.0 / (jnp.maximum(jax.lax.stop_gradient(loss), 0.0) + eps)
+
+
+def to_float32(leaf: jax.Array) -> jax.Array:
+    """Return an array in float32, or as it is where its dtype is finer."""
+    return leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
+
+
+def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
+    """Split the result of a function of losses, or its shapes, into the losses and what is beside them, or None.
+
+    Raises:
+        RequestError: It is not that, or a loss is not a single number.
+    """
+    is_pair = isinstance(result, tuple) and len(result) == 2
+    losses, extra = result if has_aux and is_pair else (result, None)
+    if not isinstance(losses, Mapping) or (has_aux and not is_pair):
+        wanted = "losses by name, and what is beside them" if has_aux else "a dictionary of losses by name"
+        mend = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
+        raise RequestError(f"losses_fn must return {wanted}, not a {type(result).__name__}{mend}")
+    for name, loss in losses.items():
+        if shape := getattr(loss, "shape", ()):
+            raise RequestError(f"loss {name!r} has shape {shape} and must be one number, such as its mean")
+    return losses, extra
+
+
+def check_names(losses: Losses, state: WeightingState) -> None:
+    """Check that the losses are those that a state began with.
+
+    Raises:
+        RequestError: They are not.
+    """
+    if set(losses) != set(state.weights):
+        known, expected = (", ".join(sorted(names)) for names in (losses, state.weights))
+        raise RequestError(f"losses are {known}, but the weighting began with {expected}; give init the names of all losses")
 
 
 def dot(one: Params, other: Params) -> jax.Array:
@@ -160,8 +193,8 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
 
     Args:
         weighting: Its name, for the message.
-        names: Of all losses.
-        needed: Whether there must be some.
+        names: Names of all losses.
+        needed: True if there must be some.
 
     Raises:
         RequestError: `MAIN` is missing, a name is there twice, or there are no others.
@@ -194,8 +227,8 @@ def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> We
     """A state at its beginning.
 
     Args:
-        names: Of the auxiliary losses.
-        weights: Of these.
+        names: Names of the auxiliary losses.
+        weights: Their weights.
         more: Other fields.
     """
     filled = {MAIN: jnp.ones(())} | {name: jnp.asarray(weights[name], jnp.ones(()).dtype) for name in names}

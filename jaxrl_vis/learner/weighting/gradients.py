@@ -1,25 +1,21 @@
 """Gradients of several losses, what weightings need to know about them, and their weighted sum.
 
-`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of four ways, which
+`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of two ways, which
 agree up to rounding:
 
     per_loss   one `jax.grad` for each loss: the reference, and the default                    losses, dots, gradients
-    one_hot    one `jax.vjp` of all losses, mapped over one-hot cotangents                     losses, dots, gradients
-    jvp        one backward pass for the direction d that losses are compared with, one
-               `jax.jvp` of all losses along d (its tangents are all dots), and one backward
-               pass for the weighted sum; with weightings that need losses, the last alone     losses, dots
-    latents    likewise, where losses read the shared parameters through latents z alone:
-               each loss is differentiated down to z, g_i, and only d and the weighted sum
-               farther; <d, grad L_i> = <J d, g_i>, where J d is the tangent of z (`latents`)  losses, dots
+    latents    where losses read the shared parameters through latents z alone: each loss is
+               differentiated down to z, g_i, and only the main loss and the weighted sum
+               farther; <grad L_main, grad L_i> = <J grad L_main, g_i>, where J grad L_main
+               is the tangent of z (`latents`)                                                 losses, dots
 
-On the right are the `Weighting.needs` that each can serve. The last two pass through the shared parameters as often for ten
-losses as for two; latents, which differentiates no head forwards, is the faster one. What is differentiated forwards must have
-tangent rules, which operations of `jax.custom_vjp` lack: ``forwards`` may be a context in which it is traced without those.
+The `Weighting.needs` that each can serve are on the right. The second passes through the shared parameters as often for ten
+losses as for two, and differentiates no head forwards. What is differentiated forwards must have tangent rules, which
+operations of `jax.custom_vjp` lack: ``forwards`` may be a context in which it is traced without those.
 """
 
 import contextlib
-import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -27,26 +23,36 @@ import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.learner.weighting import latents
-from jaxrl_vis.learner.weighting.base import MAIN, Losses, Weighting, WeightingState, Weights, dot, weighted_sum
+from jaxrl_vis.learner.weighting.base import (
+    MAIN,
+    Losses,
+    Weighting,
+    WeightingState,
+    Weights,
+    check_names,
+    dot,
+    split_result,
+    to_float32,
+    weighted_sum,
+)
 from jaxrl_vis.types import Metrics, Params
 
-Way = Literal["per_loss", "one_hot", "jvp", "latents"]
+Way = Literal["per_loss", "latents"]
 LossesFunction = Callable[..., Any]
 Encode = Callable[..., Any] | Mapping[str, Callable[..., Any]]
 Selector = Callable[[Params], Params]
-_FORWARD_WAYS = ("jvp", "latents")
 
 
 class Weighted(NamedTuple):
-    """What `weighted_grad` finds.
+    """Result of `weighted_grad`.
 
     Attributes:
         gradient: For the optimiser: the weighted sum of all gradients, shaped like the parameters, float32.
-        state: Of the weighting, after this step.
+        state: State of the weighting after this step.
         losses: [] float32 by name.
         metrics: [] float32 by name.
-        weights: What each loss weighed in ``gradient``, [] float32 by name.
-        extra: What the losses' function returned beside them; None without ``has_aux``.
+        weights: Weight of each loss in ``gradient``, [] float32 by name.
+        extra: Further result of the losses' function; None without ``has_aux``.
     """
 
     gradient: Params
@@ -58,57 +64,50 @@ class Weighted(NamedTuple):
 
 
 def everything(params: Params) -> Params:
-    """Selects all parameters as shared."""
+    """Select all parameters as shared."""
     return params
 
 
 def loss_gradients(
-    losses_fn: LossesFunction, params: Params, *args: Any, way: Way = "per_loss", has_aux: bool = False
+    losses_fn: LossesFunction, params: Params, *args: Any, has_aux: bool = False
 ) -> tuple[dict[str, jax.Array], dict[str, Params], Any]:
-    """Each loss, and its gradient by itself.
+    """Compute each loss, and its gradient by itself.
 
     Args:
         losses_fn: (params, *args) -> [] floats by name; with ``has_aux``, and anything else beside these.
-        params: What is differentiated.
+        params: The parameters to differentiate by.
         args: More arguments.
-        way: per_loss or one_hot.
         has_aux: See ``losses_fn``.
 
     Returns:
         Losses, [] float32 by name; gradients by name, each shaped like the parameters, float32; what else there was.
 
     Raises:
-        RequestError: What ``losses_fn`` returns is no dictionary of numbers.
+        RequestError: ``losses_fn`` does not return a dictionary of numbers.
     """
-    whole = _in_float32(losses_fn, has_aux)
-    if way == "one_hot":
-        losses, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
-        rows = dict(zip(losses, jnp.eye(len(losses), dtype=jnp.result_type(*losses.values())).T))
-        (stacked,) = jax.vmap(pullback)(rows)
-        gradients = {name: jax.tree.map(lambda leaf, row=row: leaf[row], stacked) for row, name in enumerate(losses)}
-    else:
-        losses, extra = whole(params, *args)
-        gradients = {name: jax.grad(lambda params, name=name: whole(params, *args)[0][name])(params) for name in losses}
-    return losses, jax.tree.map(_to_float32, gradients), extra
+
+    def compute(params: Params) -> tuple[dict[str, jax.Array], Any]:
+        losses, extra = split_result(losses_fn(params, *args), has_aux)
+        return {name: to_float32(jnp.asarray(loss)) for name, loss in losses.items()}, extra
+
+    losses, extra = compute(params)
+    gradients = {name: jax.grad(lambda params, name=name: compute(params)[0][name])(params) for name in losses}
+    return losses, jax.tree.map(to_float32, gradients), extra
 
 
-def measure(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params], state: WeightingState) -> Any:
-    """The ``statistics`` that `Weighting.update` takes, from each loss's own gradient.
+def measure(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> Any:
+    """Compute the ``statistics`` that `Weighting.update` takes, from each loss's own gradient.
 
     Args:
-        weighting: What needs them.
+        weighting: Reads them.
         losses: [] float32 by name.
-        gradients: Of these, with respect to the shared parameters alone.
-        state: Of the weighting, before the update.
+        gradients: Their gradients with respect to the shared parameters alone.
     """
     if weighting.needs == "losses":
         return None
     if weighting.needs == "gradients":
         return dict(gradients)
-    direction = gradients[MAIN]
-    if weighting.main_grad == "total":
-        direction = weighted_sum(gradients, weighting.coefficients(state.weights, losses))
-    return {name: dot(direction, gradient) for name, gradient in gradients.items() if name != MAIN}
+    return {name: dot(gradients[MAIN], gradient) for name, gradient in gradients.items() if name != MAIN}
 
 
 def weighted_grad(
@@ -121,7 +120,7 @@ def weighted_grad(
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
     encode: Encode | None = None,
 ) -> Callable[..., Weighted]:
-    """The gradient of a dictionary of losses, weighted.
+    """Make the function that computes the weighted gradient of a dictionary of losses.
 
     Args:
         losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, and anything else
@@ -130,177 +129,80 @@ def weighted_grad(
         weighting: From `make_weighting`.
         shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
             may only pick: what it returns must be parts of its argument.
-        way: How gradients are found, see above.
+        way: Method of the gradients, see above.
         has_aux: See ``losses_fn``.
-        reduce: Applied to losses, gradients and dots before the weighting sees them, where each device has its own part of the
-            data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
+        reduce: Applied to losses, gradients and dots before the weighting reads them, where each device has its own part of
+            the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
         forwards: Makes the context in which what is differentiated forwards is traced.
         encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
-            through these alone. Way latents needs it; the others take it, too. Or a dictionary of such functions, where latents
+            through these alone. Way latents needs it; the other takes it, too. Or a dictionary of such functions, where latents
             are a dictionary of the same names: gradients then pass only through those that a loss reads.
 
     Returns:
-        (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``. A weighting with
-        ``held`` takes one more argument by name, ``held``: the parameters that its interval began with, at which gradients are
-        compared.
+        (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``.
 
     Raises:
         RequestError: There is no such way, or it does not find what the weighting needs; from the function returned: what
-            ``losses_fn`` returns is no dictionary of numbers, the losses are not those that the state began with, ``held`` is
-            missing, or given without need.
+            ``losses_fn`` returns is no dictionary of numbers, or the losses are not those that the state began with.
     """
-    _check_way(way, weighting, encode is not None)
-    return _Finder(losses_fn, weighting, shared, way, has_aux, reduce, forwards, encode).find
-
-
-@dataclasses.dataclass(frozen=True)
-class _Finder:
-    """What `weighted_grad` was given, and each way as a method."""
-
-    losses_fn: LossesFunction
-    weighting: Weighting
-    shared: Selector
-    way: Way
-    has_aux: bool
-    reduce: Selector
-    forwards: Callable[[], contextlib.AbstractContextManager]
-    encode: Encode | None
-
-    def find(self, params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
-        if self.weighting.held and held is None:
-            raise RequestError(f"weighting {self.weighting.name} needs held=, the parameters that its interval began with")
-        if not self.weighting.held and held is not None:
-            raise RequestError(f"weighting {self.weighting.name} holds no parameters; leave out held")
-        if self.way in _FORWARD_WAYS:
-            return (self._by_jvp if self.way == "jvp" else self._by_latents)(params, state, *args)
-        return self._by_gradients(params, state, *args, held=held)
-
-    def _losses_of(self, params: Params, *args: Any) -> Any:
-        if self.encode is None:
-            return self.losses_fn(params, *args)
-        picked = self.shared(params)
-        if isinstance(self.encode, Mapping):
-            return self.losses_fn(params, {name: encode(picked, *args) for name, encode in self.encode.items()}, *args)
-        return self.losses_fn(params, self.encode(picked, *args), *args)
-
-    def _by_gradients(self, params: Params, state: WeightingState, *args: Any, held: Params = None) -> Weighted:
-        losses, gradients, extra = loss_gradients(self._losses_of, params, *args, way=self.way, has_aux=self.has_aux)
-        _check_names(losses, state)
-        losses, gradients = self.reduce((losses, gradients))
-        seen, compared = losses, gradients
-        if self.weighting.held:
-            seen, compared = self.reduce(loss_gradients(self._losses_of, held, *args, way=self.way, has_aux=self.has_aux)[:2])
-        statistics = measure(self.weighting, seen, {name: self.shared(tree) for name, tree in compared.items()}, state)
-        weights, state, metrics = self.weighting.update(seen, statistics, state)
-        combined = weighted_sum(gradients, self.weighting.coefficients(weights, losses))
-        return Weighted(combined, state, losses, metrics, weights, extra)
-
-    def _by_jvp(self, params: Params, state: WeightingState, *args: Any) -> Weighted:
-        whole = _in_float32(self._losses_of, self.has_aux)
-        local, pullback, extra = jax.vjp(lambda params: whole(params, *args), params, has_aux=True)
-        _check_names(local, state)
-        losses = self.reduce(local)
-
-        def backward(coefficients: Mapping[str, jax.Array]) -> Params:
-            (gradient,) = pullback({name: coefficients[name].astype(loss.dtype) for name, loss in local.items()})
-            return self.reduce(jax.tree.map(_to_float32, gradient))
-
-        combined = statistics = None
-        if self.weighting.needs == "dots":
-            if self.weighting.main_grad == "total":
-                direction = combined = backward(self.weighting.coefficients(state.weights, losses))
-            else:
-                direction = backward({name: jnp.full_like(loss, name == MAIN) for name, loss in losses.items()})
-            along = latents.like(_embed(self.shared, params, self.shared(direction)), params)
-            with self.forwards():
-                _, tangents = jax.jvp(lambda params: whole(params, *args)[0], (params,), (along,))
-            statistics = self.reduce({name: tangent for name, tangent in tangents.items() if name != MAIN})
-        weights, state, metrics = self.weighting.update(losses, statistics, state)
-        if combined is None:
-            combined = backward(self.weighting.coefficients(weights, losses))
-        return Weighted(combined, state, losses, metrics, weights, extra)
-
-    def _by_latents(self, params: Params, state: WeightingState, *args: Any) -> Weighted:
-        assert self.encode is not None
-        whole = _in_float32(self.losses_fn, self.has_aux)
-        through = latents.encode(self.encode, self.shared(params), *args)
-        found = latents.differentiate(whole, through, params, *args)
-        _check_names(found.losses, state)
-        losses = self.reduce(found.losses)
-        statistics = of_shared = None
-        if self.weighting.needs == "dots":
-            is_total = self.weighting.main_grad == "total"
-            first = self.weighting.coefficients(state.weights, losses) if is_total else {MAIN: jnp.ones(())}
-            of_first = through.backward(found.at_latents, first)
-            with self.forwards():
-                dots = through.dots(self.reduce(of_first), found.at_latents)
-            statistics = self.reduce(dots)
-            of_shared = None if is_total else of_first
-        weights, state, metrics = self.weighting.update(losses, statistics, state)
-        coefficients = self.weighting.coefficients(weights, losses)
-        rest = coefficients if of_shared is None else {name: each for name, each in coefficients.items() if name != MAIN}
-        added = through.backward(found.at_latents, rest)
-        if of_shared is not None:  # the main loss's own has been found already, and gradients add up
-            added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_shared, added)
-        combined = jax.tree.map(jnp.add, found.combined(params, coefficients), _embed(self.shared, params, added))
-        return Weighted(self.reduce(combined), state, losses, metrics, weights, found.extra)
-
-
-def _check_way(way: str, weighting: Weighting, has_latents: bool) -> None:
     if way not in get_args(Way):
         raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
-    if way in _FORWARD_WAYS and weighting.needs == "gradients":
-        raise RequestError(
-            f"weighting {weighting.name} needs whole gradients, which {way} does not find; use one_hot or per_loss"
-        )
-    if way == "latents" and not has_latents:
-        raise RequestError("way latents needs to know what the latents are: give encode, or use jvp")
+    if way == "latents" and weighting.needs == "gradients":
+        raise RequestError(f"weighting {weighting.name} needs whole gradients, which latents does not find; use per_loss")
+    if way == "latents" and encode is None:
+        raise RequestError("way latents needs to know what the latents are: give encode")
 
+    def losses_of(params: Params, *args: Any) -> Any:
+        if encode is None:
+            return losses_fn(params, *args)
+        picked = shared(params)
+        if isinstance(encode, Mapping):
+            return losses_fn(params, {name: one(picked, *args) for name, one in encode.items()}, *args)
+        return losses_fn(params, encode(picked, *args), *args)
 
-def _check_names(losses: Losses, state: WeightingState) -> None:
-    if set(losses) != set(state.weights):
-        _raise_names(losses, state.weights)
+    def find_per_loss(params: Params, state: WeightingState, *args: Any) -> Weighted:
+        losses, gradients, extra = loss_gradients(losses_of, params, *args, has_aux=has_aux)
+        check_names(losses, state)
+        losses, gradients = reduce((losses, gradients))
+        compared_losses, compared = losses, gradients
+        if weighting.hold is not None:
+            state = weighting.hold(params, state)
+            compared_losses, compared = reduce(loss_gradients(losses_of, state.params, *args, has_aux=has_aux)[:2])
+        statistics = measure(weighting, compared_losses, {name: shared(tree) for name, tree in compared.items()})
+        weights, state, metrics = weighting.update(compared_losses, statistics, state)
+        combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
+        return Weighted(combined, state, losses, metrics, weights, extra)
 
+    def find_by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
+        assert encode is not None
+        through = latents.encode(encode, shared(params), *args)
+        # The losses are traced here, to see which latents and parameters each of them reads.
+        program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
+        found = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
+        check_names(found.losses, state)
+        losses = reduce(found.losses)
+        statistics = of_main = None
+        if weighting.needs == "dots":
+            of_main = through.backward(found.at_latents, {MAIN: jnp.ones(())})
+            with forwards():
+                dots = through.dots(reduce(of_main), found.at_latents)
+            statistics = reduce(dots)
+        weights, state, metrics = weighting.update(losses, statistics, state)
+        coefficients = weighting.coefficients(weights, losses)
+        rest = coefficients
+        if of_main is not None:
+            rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
+        added = through.backward(found.at_latents, rest)
+        if of_main is not None:  # the main loss's own is known already, and gradients add up
+            added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
+        combined = jax.tree.map(jnp.add, found.combined(params, coefficients), _embed(shared, params, added))
+        return Weighted(reduce(combined), state, losses, metrics, weights, found.extra)
 
-def _raise_names(there: Iterable[str], known: Iterable[str]) -> None:
-    there, known = (", ".join(sorted(names)) for names in (there, known))
-    raise RequestError(f"losses are {there}, but the weighting began with {known}; give init the names of all losses")
-
-
-def _to_float32(leaf: jax.Array) -> jax.Array:
-    return leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
-
-
-def _in_float32(losses_fn: LossesFunction, has_aux: bool) -> Callable[..., tuple[dict[str, jax.Array], Any]]:
-    """The same losses, at least float32, and what comes beside them, or None."""
-
-    def whole(params: Params, *args: Any) -> tuple[dict[str, jax.Array], Any]:
-        losses, extra = _parts(losses_fn(params, *args), has_aux)
-        return {name: _to_float32(jnp.asarray(loss)) for name, loss in losses.items()}, extra
-
-    return whole
-
-
-def _parts(returned: Any, has_aux: bool) -> tuple[Losses, Any]:
-    """What a function of losses returned: the losses, and what is beside them, or None.
-
-    Raises:
-        RequestError: It is not that, or a loss is not a single number.
-    """
-    is_pair = isinstance(returned, tuple) and len(returned) == 2
-    losses, extra = returned if has_aux and is_pair else (returned, None)
-    if not isinstance(losses, Mapping) or (has_aux and not is_pair):
-        wanted = "losses by name, and what is beside them" if has_aux else "a dictionary of losses by name"
-        mend = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
-        raise RequestError(f"losses_fn must return {wanted}, not a {type(returned).__name__}{mend}")
-    for name, loss in losses.items():
-        if jnp.shape(loss):
-            raise RequestError(f"loss {name!r} has shape {jnp.shape(loss)} and must be one number, such as its mean")
-    return losses, extra
+    return find_per_loss if way == "per_loss" else find_by_latents
 
 
 def _embed(shared: Selector, params: Params, part: Params) -> Params:
-    """``part`` in the shared parameters and zero in all others, in the dtypes of ``part`` or float32."""
+    """Place ``part`` in the shared parameters and zero in all others, in the dtypes of ``part`` or float32."""
     dtype = jnp.result_type(jnp.float32, *jax.tree.leaves(part))
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype), params)
     part = jax.tree.map(lambda leaf: leaf.astype(dtype), part)

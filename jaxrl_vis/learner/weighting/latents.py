@@ -8,14 +8,14 @@ groups of latents that it is not zero in, and a head's gradient is not added to 
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
-from jaxrl_vis.learner.weighting.base import MAIN, dot, weighted_sum
+from jaxrl_vis.learner.weighting.base import MAIN, dot, split_result, to_float32, weighted_sum
 from jaxrl_vis.types import Params
 
 _ALL = "all"  # the group of latents that were not given names
@@ -38,7 +38,7 @@ class Through:
         pullbacks: By group: of a gradient there, the gradient in the shared parameters.
         functions: By group: the shared parameters -> its latents.
         picked: The shared parameters.
-        has_names: Whether losses take a dictionary of groups rather than the one that there is.
+        has_names: True if losses take a dictionary of groups rather than a single one.
     """
 
     latents: dict[str, Any]
@@ -46,6 +46,11 @@ class Through:
     functions: Mapping[str, Callable[[Params], Any]]
     picked: Params
     has_names: bool
+
+    @property
+    def read(self) -> Any:
+        """Latents as losses take them."""
+        return self.latents if self.has_names else self.latents[_ALL]
 
     def backward(self, at_latents: AtLatents, coefficients: Mapping[str, jax.Array]) -> Params:
         """The gradient in the shared parameters of a sum of some losses, float32."""
@@ -88,7 +93,7 @@ class Differentiated:
         losses: [] float32 by name.
         of_params: Loss -> place among the parameters' leaves -> gradient.
         at_latents: See `AtLatents`.
-        extra: What the main loss's function returned beside the losses.
+        extra: Further result of the main loss's function.
     """
 
     losses: dict[str, jax.Array]
@@ -108,28 +113,30 @@ class Differentiated:
         return jax.tree.unflatten(structure, [total(place, leaf) for place, leaf in enumerate(leaves)])
 
 
-def differentiate(whole: Callable[..., Any], through: Through, params: Params, *args: Any) -> Differentiated:
-    """Each loss, and its gradients with respect to the parameters and the latents that it reads.
+def differentiate(
+    losses_fn: Callable[..., Any], has_aux: bool, through: Through, traced: tuple[Any, Any], params: Params, *args: Any
+) -> Differentiated:
+    """Compute each loss, and its gradients with respect to the parameters and the latents that it reads.
 
     Args:
-        whole: (params, latents, *args) -> (losses, [] floats by name; anything else).
+        losses_fn: (params, latents, *args) -> [] floats by name; with ``has_aux``, and anything else beside these.
+        has_aux: See ``losses_fn``.
         through: From `encode`.
+        traced: `jax.make_jaxpr` of ``losses_fn``, with the shapes of what it returns.
         params: The parameters.
         args: More arguments.
     """
     leaves, structure = jax.tree.flatten(params)
-
-    def of_leaves(leaves: Sequence[Any], latents: Mapping[str, Any]) -> Any:
-        read = latents if through.has_names else latents[_ALL]
-        return whole(jax.tree.unflatten(structure, leaves), read, *args)
-
+    program, results = traced
     losses, of_params, at_latents, extra = {}, {}, {}, None
-    for name, (places, groups) in _find_reads(of_leaves, leaves, through.latents).items():
+    for name, (places, groups) in _find_reads(program, split_result(results, has_aux)[0], len(leaves), through).items():
 
         def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
             now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
-            found, extra = of_leaves(now, through.latents | latents)
-            return found[name], extra
+            given = through.latents | latents
+            read = given if through.has_names else given[_ALL]
+            found, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
+            return to_float32(jnp.asarray(found[name])), extra
 
         # Each by itself, so that a compiler finds what the others compute in it to be of no use.
         chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
@@ -139,18 +146,17 @@ def differentiate(whole: Callable[..., Any], through: Through, params: Params, *
     return Differentiated(losses, of_params, at_latents, extra)
 
 
-def _find_reads(of_leaves: Callable[..., Any], leaves: list[jax.Array], latents: dict[str, Any]) -> dict[str, Any]:
-    """Loss -> (places of leaves, groups of latents) that its gradient can be other than zero in.
+def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, through: Through) -> dict[str, Any]:
+    """Find what the gradient of each loss can be other than zero in: places of parameters' leaves, and groups of latents.
 
     Within a nested program every result counts as reading every argument: so rather too much is found than too little.
     """
-    program, shapes = jax.make_jaxpr(lambda *given: of_leaves(*given)[0], return_shape=True)(leaves, latents)
     variables = program.jaxpr.invars
-    of_leaf, rest = variables[: len(leaves)], iter(variables[len(leaves) :])
+    of_leaf, rest = variables[:num_leaves], iter(variables[num_leaves:])
     # Leaves of a dictionary come in the order of its sorted keys.
-    of_group = {group: [next(rest) for _ in jax.tree.leaves(latents[group])] for group in sorted(latents)}
+    of_group = {group: [next(rest) for _ in jax.tree.leaves(through.latents[group])] for group in sorted(through.latents)}
     found = {}
-    for name, result in zip(sorted(shapes), program.jaxpr.outvars, strict=True):
+    for name, result in zip(sorted(losses), program.jaxpr.outvars):  # followed by what comes beside the losses
         needed = set() if isinstance(result, Literal) else {result}
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):

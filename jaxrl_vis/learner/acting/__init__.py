@@ -1,0 +1,1 @@
+"""Acting: rollouts, in parts or whole, and evaluations."""

@@ -1,0 +1,195 @@
+"""Plays whole episodes with the current policy, all environments in step.
+
+reset S x E environments (each draws its goal image once)
+scan over T:  act -> advance -> observe        observations [T, S, E, ...], each kept once
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.acting.rollout_parts import RolloutPart
+from jaxrl_vis.learner.algorithm import Algorithm
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.types import Episodes, Metrics, TrainState
+from jaxrl_vis_envs.base import GoalEnv, State
+
+Draws = Shards | RolloutPart
+"""Source of the random numbers of the environments that are played: all of a learner's, those of one device, or a few."""
+
+# Folded into keys for noise on observations, so that it changes nothing else.
+_FIRST_NOISE, _GOAL_NOISE, _STEP_NOISE = 0x6E6F30, 0x6E6F31, 0x6E6F32
+
+
+class Exploration(NamedTuple):
+    """Noise of actions; none by default.
+
+    Attributes:
+        random_action_probability: Share of actions replaced by uniformly random ones, whole vectors at a time.
+        action_noise: Standard deviation of the Gaussian noise on the others.
+    """
+
+    random_action_probability: float | jax.Array = 0.0
+    action_noise: float | jax.Array = 0.0
+
+    @property
+    def is_none(self) -> bool:
+        """True if actions are known to be the policy's own; not so of numbers that a compiled program is given."""
+        return all(isinstance(value, float | int) and value == 0 for value in self)
+
+
+NO_EXPLORATION = Exploration()
+
+
+class Acting(NamedTuple):
+    """An environment, and the algorithm whose agents act in it.
+
+    Attributes:
+        env: The environment.
+        algorithm: Algorithm of the agents.
+        observation_noise: Standard deviation of the camera's noise, in the observation's unit.
+    """
+
+    env: GoalEnv
+    algorithm: Algorithm
+    observation_noise: float = 0.0
+
+
+def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: Draws = ONE) -> jax.Array:
+    """Return actions [E, A] float32 in [-1, 1] with noise where it is asked for.
+
+    Args:
+        action: [E, A] float32 in [-1, 1], the policy's own.
+        exploration: The noise.
+        key: [] typed; draws the noise.
+        draws: Random numbers of these environments.
+    """
+    if exploration.is_none:
+        return action
+    noise_key, random_key = jax.random.split(key)
+    noise = draws.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
+    action = jnp.clip(action + exploration.action_noise * noise, -1.0, 1.0)
+    # One draw says whether an action is random, and which.
+    drawn = draws.draw(lambda shape: jax.random.uniform(random_key, shape), (*action.shape[:-1], 1 + action.shape[-1]))
+    is_random = drawn[..., :1] < exploration.random_action_probability
+    return jnp.where(is_random, 2.0 * drawn[..., 1:] - 1.0, action)
+
+
+def split_keys(keys: jax.Array, num_envs: int, draws: Draws = ONE) -> tuple[jax.Array, jax.Array]:
+    """Keys of a rollout: [S] typed keys -> those of all S x E resets, seed after seed, and those of the policies, [S]."""
+    reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    return jax.vmap(lambda key: draws.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
+
+
+def add_noise(key: jax.Array, observations: jax.Array, deviation: float, draws: Draws = ONE) -> jax.Array:
+    """Observations [E, ...] as a noisy camera shows them: same shape and dtype; bytes are rounded and clipped.
+
+    Args:
+        key: [] a typed key.
+        observations: uint8 images or float32 state vectors.
+        deviation: Standard deviation of the noise, in the observation's unit.
+        draws: Random numbers of these environments.
+    """
+    noisy = observations + deviation * draws.noise(key, observations.shape)
+    if observations.dtype == jnp.uint8:
+        noisy = jnp.clip(jnp.round(noisy), 0.0, 255.0)
+    return noisy.astype(observations.dtype)
+
+
+class Rollout(NamedTuple):
+    """Result of `play`.
+
+    Attributes:
+        episodes: The kept episodes, [S, K, ...].
+        outcome: ``success`` and ``goal_distance`` of all episodes at their last step, [S, E].
+        record: Result of ``record`` for the kept episodes' states after 0, 1, ... T steps, [S, K, T+1, ...]; or None.
+    """
+
+    episodes: Episodes
+    outcome: Metrics
+    record: Any
+
+
+def _episode_major(*parts: jax.Array) -> jax.Array:
+    """Steps [T, S, K, ...] one after the other, as episodes: [S, K, T, ...]."""
+    return jnp.moveaxis(jnp.concatenate(parts), 0, 2)
+
+
+def play(
+    acting: Acting,
+    train: TrainState,
+    keys: jax.Array,
+    num_envs: int,
+    exploration: Exploration = NO_EXPLORATION,
+    num_kept: int | None = None,
+    record: Callable[[State], Any] | None = None,
+    draws: Draws = ONE,
+) -> Rollout:
+    """Plays one episode in each of E environments, for each of S learners side by side.
+
+    To the environments learners are nothing but more environments: one `jax.vmap` less means half as much to trace.
+
+    Args:
+        acting: The environment and the algorithm.
+        train: The learners, [S, ...].
+        keys: [S] typed keys of this rollout.
+        num_envs: E, environments of each learner that are played here.
+        exploration: The noise.
+        num_kept: K, how many of the episodes to keep (the first ones); None: all.
+        record: Makes a pytree, to be kept, of the state of one environment after reset and after each step.
+        draws: Random numbers of these environments.
+    """
+    env, algorithm, deviation = acting
+    num_seeds = keys.shape[0]
+
+    def by_seed(leaf: jax.Array) -> jax.Array:
+        return leaf.reshape(num_seeds, num_envs, *leaf.shape[1:])
+
+    def kept(leaf: jax.Array) -> jax.Array:
+        return by_seed(leaf)[:, :num_kept]
+
+    def seen(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
+        # Noise belongs to a frame: it is drawn here, once, and stored with the frame, which therefore equals itself as a goal.
+        if not deviation:
+            return observations
+        noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
+        noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, draws))(noise_keys, by_seed(observations))
+        return noisy.reshape(observations.shape)
+
+    def recorded(state: State) -> Any:
+        return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
+
+    reset_keys, policy_keys = split_keys(keys, num_envs, draws)
+    state = jax.vmap(env.reset)(reset_keys)
+    assert state.obs is not None
+    first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)
+    goal = seen(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
+    first_state, first_record = state.achieved_state, recorded(state)
+    policies = jax.vmap(algorithm.policy_params)(train.agent, train.statistics)
+    aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
+
+    def act(policy: Any, aim: Any, key: jax.Array, observations: jax.Array) -> jax.Array:
+        return explore(algorithm.act(policy, observations, aim), exploration, key, draws)
+
+    def step(carry, step_keys):
+        state, observation = carry
+        action = jax.vmap(act)(policies, aims, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
+        state = jax.vmap(env.advance)(state, action)
+        observation = seen(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
+        step_results = tuple(kept(leaf) for leaf in (observation, state.achieved_state, action))
+        return (state, observation), (step_results, recorded(state))
+
+    carry = (state.replace(obs=None), first_observation)
+    step_keys = jax.vmap(lambda key: jax.random.split(key, env.horizon), out_axes=1)(policy_keys)
+    (state, _), ((observations, states, actions), records) = jax.lax.scan(step, carry, step_keys)
+    outcome = {name: by_seed(state.metrics[name]) for name in ("success", "goal_distance")}
+
+    episodes = Episodes(
+        observations=_episode_major(kept(first_observation)[None], observations, kept(goal)[None]),
+        states=_episode_major(kept(first_state)[None], states, kept(state.goal_state)[None]),
+        actions=jnp.moveaxis(actions, 0, 2),
+    )
+    record_of_all = jax.tree.map(lambda first, rest: _episode_major(first[None], rest), first_record, records)
+    return Rollout(episodes, outcome, record_of_all)

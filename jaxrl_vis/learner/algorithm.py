@@ -1,0 +1,107 @@
+"""The interface of an algorithm. Rollouts, evaluations, checkpoints and policies know nothing else of a learner.
+
+    init            a fresh agent: a pytree of the algorithm's own
+    update          all gradient steps of an iteration, from batches that were chosen by the replay
+    policy_params   the part of an agent that acting reads: small, and all that a policy is made of
+    act             actions without exploration
+
+An algorithm is made by a function of a `Setup`, which has the configuration and the sizes of the task. DDPG is the one that is
+built in (`ddpg.make`); ``--algorithm module:Name`` names another one.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.types import Batch, Metrics, Statistics
+
+Agent = Any
+PolicyParams = Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """Configuration and sizes that an algorithm is made for.
+
+    Attributes:
+        config: The run.
+        resolved: Discount, rewards, bounds of targets.
+        observation_spec: Shape and dtype of an observation: [C, H, W] uint8 or [S] float32.
+        action_size: A; actions lie in [-1, 1].
+        auxiliary: Auxiliary tasks of the run and their weighting; an algorithm may leave them alone.
+        shards: Shards of the learner: batches are those of one shard, gradients and metrics must be those of the whole.
+    """
+
+    config: Config
+    resolved: Resolved
+    observation_spec: jax.ShapeDtypeStruct
+    action_size: int
+    auxiliary: Auxiliary
+    shards: Shards = ONE
+
+
+@dataclasses.dataclass(frozen=True)
+class Batches:
+    """Batches of an iteration, chosen at once and read one at a time.
+
+    Attributes:
+        choices: Tree of arrays [U, ...], one row for each gradient step.
+        read: One row of ``choices`` -> `Batch` with rewards (unless the method leaves them to the algorithm).
+    """
+
+    choices: Any
+    read: Callable[[Any], Batch]
+
+
+Update = Callable[[Agent, Statistics, Batches, jax.Array], tuple[Agent, Metrics]]
+
+
+class Algorithm(NamedTuple):
+    """An algorithm for one learner. Pure; mapped over seeds.
+
+    Attributes:
+        init: key -> agent.
+        act: (policy parameters, observations [E, ...], aim) -> actions [E, A] float32 in [-1, 1].
+        update: (agent, Statistics, Batches, key) -> (agent after a gradient step on every batch, means of metrics, [] float32
+            by name).
+        policy_params: (agent, Statistics) -> the parameters that ``act`` and ``aim`` read.
+        aim: (policy parameters, goals [E, ...]) -> tree of arrays [E, ...] that ``act`` reads of goals. Goals stay, so this is
+            computed once an episode. The goals themselves if not given.
+        diagnose: (agent, Statistics, goals [E, ...] of a rollout) -> further metrics, [] float32 by name, averaged over the
+            parts of a learner.
+        networks: Networks of the algorithm, for tools that look inside (`networks.Networks`); None for none.
+    """
+
+    init: Callable[[jax.Array], Agent]
+    act: Callable[[PolicyParams, jax.Array, Any], jax.Array]
+    update: Update
+    policy_params: Callable[[Agent, Statistics], PolicyParams]
+    aim: Callable[[PolicyParams, jax.Array], Any] = lambda params, goals: goals
+    diagnose: Callable[[Agent, Statistics, jax.Array], Metrics] = lambda agent, statistics, goals: {}
+    networks: Any = None
+
+
+def scan_batches(step: Callable[[Agent, Statistics, Batch, jax.Array], tuple[Agent, Metrics]]) -> Update:
+    """Make `Algorithm.update` of a gradient step.
+
+    Args:
+        step: (agent, Statistics, Batch, key) -> (agent, metrics, [] float32 by name).
+    """
+
+    def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
+        def take(agent: Agent, row: tuple[Any, jax.Array]) -> tuple[Agent, Metrics]:
+            choice, step_key = row
+            return step(agent, statistics, batches.read(choice), step_key)
+
+        count = jax.tree.leaves(batches.choices)[0].shape[0]
+        agent, metrics = jax.lax.scan(take, agent, (batches.choices, jax.random.split(key, count)))
+        return agent, jax.tree.map(lambda values: jnp.mean(values, axis=0), metrics)
+
+    return update

@@ -1,0 +1,189 @@
+"""Auxiliary tasks and their weighting as parts of a learner: made from a `Config`, with what each of its steps does for them.
+
+collecting   what tasks compute of whole episodes (`AuxTask.episode`)
+sampling     views and targets of a batch (`AuxTask.view`, `AuxTask.target`)
+ddpg         latents of all observations that some task reads, losses, and a weighted gradient for each encoder
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import auxtasks
+from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
+from jaxrl_vis.learner.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, make_weighting
+from jaxrl_vis.plugins import call, find
+from jaxrl_vis.types import Batch, Episodes, Params
+
+_EPISODES_AT_ONCE = 10  # whose arrays are computed together: some 500 images fill a GPU, and more would fill its memory
+
+
+@dataclasses.dataclass(frozen=True)
+class Auxiliary:
+    """The auxiliary tasks of a learner, which may be none, and how their losses are weighted.
+
+    Attributes:
+        tasks: By name.
+        weighting: Weighting of their losses and the main one.
+        way: Method of the gradients of losses (`weighting.gradients`).
+    """
+
+    tasks: dict[str, AuxTask]
+    weighting: Weighting
+    way: Way = "latents"
+
+    @property
+    def needs_image(self) -> bool:
+        """True if some task reads normalised images."""
+        return any("image" in task.needs for task in self.tasks.values())
+
+    @property
+    def encoded(self) -> tuple[str, ...]:
+        """Observations besides those before and the goals that are encoded with gradient: ``after``, and names of views."""
+        after = ("after",) if any("latent_tp1" in task.needs for task in self.tasks.values()) else ()
+        return (*after, *(name for name, task in self.tasks.items() if task.view is not None))
+
+    def init_heads(self, key: jax.Array) -> dict[str, Params]:
+        """Fresh parameters of all heads, by task."""
+        return {name: task.init(task.fold(key)) for name, task in self.tasks.items()}
+
+    def init_state(self, critic: Params) -> WeightingState | None:
+        """The weighting's state; None where there is nothing to weight and nothing to remember.
+
+        Args:
+            critic: All parameters of the critic, in whose encoder gradients are compared.
+        """
+        return None if self.weighting.name == "none" else self.start(critic)
+
+    def start(self, critic: Params) -> WeightingState:
+        """The weighting's state before the first update."""
+        kept = (critic,) if self.weighting.hold is not None else ()
+        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *kept)
+
+    def with_stored(self, episodes: Episodes) -> Episodes:
+        """Return a rollout's episodes with the arrays that tasks compute once an episode."""
+        images, stored = episodes.observations[:, :-1], {}
+        for name, task in self.tasks.items():
+            if task.episode is not None:
+                stored[name] = jax.lax.map(task.episode, images, batch_size=_EPISODES_AT_ONCE)
+        return episodes.replace(stored=stored)
+
+    def stored_spec(self, observation: jax.ShapeDtypeStruct, horizon: int) -> dict[str, jax.ShapeDtypeStruct]:
+        """Return shapes and dtypes of the arrays that lie beside one episode, by task.
+
+        Args:
+            observation: Shape and dtype of one observation.
+            horizon: T.
+        """
+        images = jax.ShapeDtypeStruct((horizon + 1, *observation.shape), observation.dtype)
+        return {name: jax.eval_shape(task.episode, images) for name, task in self.tasks.items() if task.episode is not None}
+
+    def with_targets(self, key: jax.Array, batch: Batch, stored: dict[str, jax.Array]) -> Batch:
+        """Return a batch with the views and the targets of all tasks.
+
+        Args:
+            key: [] a typed key, from which views are drawn.
+            batch: With raw images.
+            stored: [B, ...] by task, as the replay has it.
+        """
+        views, targets = {}, {}
+        for name, task in self.tasks.items():
+            transitions = Transitions(batch.observation_t, batch.observation_tp1, batch.action, stored.get(name))
+            if task.view is not None:
+                views[name], targets[name] = task.view(key if task.draws_unfolded else task.fold(key), transitions)
+            elif task.target is not None:
+                targets[name] = task.target(transitions)
+        return batch.replace(views=views, targets=targets)
+
+    def losses(self, heads: dict[str, Params], view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, jax.Array]:
+        """Return the loss of each task, [] float32 by name.
+
+        Args:
+            heads: From `init_heads`.
+            view: Inputs that all tasks share.
+            latents: [B, L] of the tasks' own views, by name.
+            batch: The transitions, with targets.
+        """
+        views = self._views(view, latents, batch)
+        return {name: task.loss(heads[name], views[name]) for name, task in self.tasks.items()}
+
+    def predictions(
+        self, heads: dict[str, Params], view: View, latents: dict[str, jax.Array], batch: Batch
+    ) -> dict[str, jax.Array]:
+        """Return the prediction of each task (`AuxTask.predict`), by name; arguments as of `losses`."""
+        views = self._views(view, latents, batch)
+        return {name: task.predict(heads[name], views[name]) for name, task in self.tasks.items()}
+
+    def _views(self, view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, View]:
+        """The inputs of each task, with its target shifted as the batch's images are."""
+        views = {}
+        for name, task in self.tasks.items():
+            target = batch.targets.get(name)
+            if task.shift is not None and batch.shift is not None:
+                target = task.shift(target, batch.shift)
+            views[name] = view.replace(latent_view=latents.get(name), target=target)
+        return views
+
+
+def make_auxiliary(
+    config: Config, observation: jax.ShapeDtypeStruct, action_size: int, frame_stack: int, dtype: Any
+) -> Auxiliary:
+    """The auxiliary tasks and the weighting that a configuration asks for.
+
+    Args:
+        config: The run.
+        observation: Shape and dtype of one observation.
+        action_size: A.
+        frame_stack: Images that an observation stacks.
+        dtype: Dtype that the networks compute in.
+
+    Raises:
+        RequestError: They do not go together, or not with the rest of the configuration.
+    """
+    if config.weighting in WEIGHTINGS:
+        weighting = make_weighting(config.weighting, **_options(config))
+    else:
+        maker = find("weighting", config.weighting, WEIGHTINGS, config.env_folder)
+        weighting = call("weighting", config.weighting, maker, of=Weighting)
+    if config.aux_tasks and not weighting.auxiliary:
+        raise RequestError(
+            f"aux_tasks are given, but weighting {config.weighting} learns none: choose --weighting ol_aux, or leave them out"
+        )
+    if weighting.auxiliary and not config.aux_tasks:
+        raise RequestError(
+            f"weighting {config.weighting} has no auxiliary tasks to weight: add --aux-tasks with some of "
+            f"{' '.join(auxtasks.NAMES)}, or use --weighting none"
+        )
+    if config.updates_per_iteration % weighting.interval:
+        raise RequestError(
+            f"weighting_interval ({weighting.interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
+        )
+    if config.aux_tasks and config.n_step > 1:
+        raise RequestError("n_step and aux_tasks exclude each other: targets are of single steps")
+    options = auxtasks.RELEASE if config.aux_form == "release" else auxtasks.Options()
+    spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype, options)
+    way: Way = "per_loss" if weighting.needs == "gradients" else "latents"
+    return Auxiliary(auxtasks.make(config.aux_tasks, spec, config.env_folder), weighting, way)
+
+
+def _options(config: Config) -> dict[str, Any]:
+    """Arguments of the function that makes the configuration's weighting."""
+    options: dict[str, Any] = {}
+    if config.weighting in ("ol_aux", "ol_aux_ablation"):
+        options |= {
+            "interval": config.weighting_interval,
+            "learning_rate": config.critic_learning_rate,
+            "beta": config.weighting_beta,
+        }
+        if config.weighting_main_grad != "main":
+            options["main_grad"] = config.weighting_main_grad
+        if config.weighting_window != 1:
+            options["window"] = config.weighting_window
+    if config.weighting == "fixed":
+        options["weights"] = config.weighting_fixed
+    if config.weighting == "cosine":
+        options["log"] = config.weighting_log
+    return options

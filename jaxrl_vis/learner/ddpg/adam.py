@@ -1,0 +1,65 @@
+"""Adam (Kingma and Ba, 2015) for several networks at once: what `optax.adam` computes, with its states, in fewer GPU kernels.
+
+XLA makes one kernel of the steps of all arrays of one shape, whichever network they belong to, if there is an array that these
+steps all read. A single number does not count. So what changes from one step to the next, for all networks and both moments,
+is one array here (`corrections`), where optax has a number for each.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis.types import Params
+
+# Of both moments; these and the other one are optax's own.
+_DECAYS = (0.9, 0.999)
+_SMALL = 1e-8
+
+
+def init(params: Params) -> Any:
+    """The optax state before the first step."""
+    return optax.adam(0.0).init(params)
+
+
+def count(state: Any) -> jax.Array:
+    """[] int32, steps that a state has seen."""
+    return state[0].count
+
+
+def with_count(state: Any, steps: jax.Array) -> Any:
+    """The state with another `count`."""
+    return (state[0]._replace(count=steps), *state[1:])
+
+
+def corrections(counts: jax.Array) -> jax.Array:
+    """Return divisors of moments, which began at 0: [N, 2] float32, for the first and the second moment.
+
+    Args:
+        counts: [N] int32, steps of N networks, from 1.
+    """
+    return 1.0 - jnp.array(_DECAYS, jnp.float32) ** counts[:, None]
+
+
+def step(params: Params, gradient: Params, state: Any, learning_rate: float, correction: jax.Array) -> tuple[Params, Any]:
+    """One step of one network: new parameters, and a state with new moments and the old `count`.
+
+    Args:
+        params: float32.
+        gradient: Likewise.
+        state: As of optax; its `count` is not read.
+        learning_rate: The size of a step.
+        correction: [2] float32, a row of `corrections`.
+    """
+    moments = state[0]
+    first, second = (_averaged(*each, gradient) for each in zip(_DECAYS, (1, 2), (moments.mu, moments.nu), strict=True))
+
+    def moved(leaf: jax.Array, mean: jax.Array, square: jax.Array) -> jax.Array:
+        return leaf - learning_rate * (mean / correction[0] / (jnp.sqrt(square / correction[1]) + _SMALL))
+
+    return jax.tree.map(moved, params, first, second), (moments._replace(mu=first, nu=second), *state[1:])
+
+
+def _averaged(decay: float, order: int, moment: Params, gradient: Params) -> Params:
+    return jax.tree.map(lambda average, slope: (1.0 - decay) * slope**order + decay * average, moment, gradient)

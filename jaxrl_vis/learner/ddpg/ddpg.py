@@ -1,0 +1,386 @@
+"""Deep deterministic policy gradient with goals (Lillicrap et al., 2016), as pure functions.
+
+    prepare      inputs of the networks, which nothing that is learned changes
+    gradients    losses of a batch, main and auxiliary, and one weighted gradient for each network
+    apply        optimisers, then target networks
+    update       all of them, in a scan over the batches of an iteration
+
+The losses are in `objectives`.
+
+Encoding images is most of the work, and `Config` can save some of it: ``encoders="shared"`` lets the actor act on the critic's
+latents, too, ``target_encoder=False`` computes targets with the online encoders, and ``actor_interval`` spares the actor steps.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.learner.algorithm import Algorithm, Batches, Setup
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
+from jaxrl_vis.learner.ddpg import adam, diagnostics
+from jaxrl_vis.learner.ddpg.latent_reward import LatentReward, make_latent_reward
+from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
+from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
+from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
+
+# Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
+_HEADS = 0x686473
+# The same for the autoencoder that makes rewards.
+_AUTOENCODER = 0x617574
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Agent(Replaceable):
+    """Networks, their targets and optimisers.
+
+    Attributes:
+        actor, critic: Online parameters. The actor is a head alone where it shares the critic's encoder.
+        target_actor, target_critic: Slowly following copies; heads alone where there is no target encoder.
+        actor_optimizer, critic_optimizer: optax states.
+        updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
+        weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
+        autoencoder: `latent_reward.AutoencoderState`; None where rewards come from elsewhere.
+    """
+
+    actor: Params
+    critic: Params
+    target_actor: Params
+    target_critic: Params
+    actor_optimizer: Any
+    critic_optimizer: Any
+    updates: jax.Array
+    weighting: Any = None
+    autoencoder: Any = None
+
+
+class ActorParams(NamedTuple):
+    """Parameters of the policy.
+
+    Attributes:
+        actor: With an encoder, of its own or the critic's.
+        observations, goals: Statistics that these are normalised with.
+    """
+
+    actor: Params
+    observations: NormalizerState
+    goals: NormalizerState
+
+
+class Working(NamedTuple):
+    """An agent between two gradient steps of one iteration.
+
+    Attributes:
+        agent: The agent; its counters are those of the beginning.
+        copies: Its parameters as the networks compute with them.
+        scaling: Scaling of observations. It stays the same, and is here because it would otherwise be worked out in every step,
+            before all else.
+        counts: [3] int32, gradient steps: those of the critic, of the actor, and `Agent.updates`.
+    """
+
+    agent: Agent
+    copies: ComputeCopies
+    scaling: BatchScaling
+    counts: jax.Array
+
+
+class Prepared(NamedTuple):
+    """A batch as `GradientSteps.gradients` takes it.
+
+    Attributes:
+        batch: With rewards.
+        inputs: Its observations as the encoders read them.
+        image: [B, C, H, W] its observations before the action, normalised, where an auxiliary task asks for them; else None.
+    """
+
+    batch: Batch
+    inputs: Inputs
+    image: jax.Array | None = None
+
+
+class Gradients(NamedTuple):
+    """Gradients of a batch.
+
+    Attributes:
+        critic, actor: For the optimisers, float32; None for an actor that stays as it is.
+        weighting: State of the weighting after this batch; None where there is nothing to remember.
+        autoencoder: For the optimiser of the autoencoder that makes rewards; None where there is none.
+    """
+
+    critic: Params
+    actor: Params | None
+    weighting: WeightingState | None = None
+    autoencoder: Params | None = None
+
+
+class GradientSteps(NamedTuple):
+    """Gradient steps of DDPG. Pure; all states are pytrees.
+
+    Attributes:
+        init: key -> Agent.
+        begin: (Agent, Statistics) -> Working, before the first of several gradient steps.
+        prepare: (Working, Batch with rewards) -> Prepared, the same for every gradient step after one `begin`.
+        gradients: (Working, Prepared, whether for the actor, too) -> (Gradients, metrics of [] float32).
+        apply: (Working, Gradients) -> Working, after one gradient step.
+        end: Working -> Agent.
+    """
+
+    init: Callable[[jax.Array], Agent]
+    begin: Callable[[Agent, Statistics], Working]
+    prepare: Callable[[Working, Batch], Prepared]
+    gradients: Callable[[Working, Prepared, bool], tuple[Gradients, Metrics]]
+    apply: Callable[[Working, Gradients], Working]
+    end: Callable[[Working], Agent]
+
+
+def _networks_of(state: Agent) -> tuple[Params, ...]:
+    """The four networks' parameters, in the order of `ComputeCopies`."""
+    return state.actor, state.critic, state.target_actor, state.target_critic
+
+
+def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, key: jax.Array) -> Agent:
+    """An agent that has learned nothing: targets equal the online networks."""
+    actor_key, critic_key = jax.random.split(key)
+    actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
+    target_actor, target_critic = networks.init_target(actor), networks.init_target(critic)
+    if auxiliary.tasks:
+        actor_key, critic_key = (jax.random.fold_in(each, _HEADS) for each in (actor_key, critic_key))
+        critic["heads"] = auxiliary.init_heads(critic_key)
+        if "encoder" in actor:
+            actor["heads"] = auxiliary.init_heads(actor_key)
+    return Agent(
+        actor=actor,
+        critic=critic,
+        target_actor=target_actor,
+        target_critic=target_critic,
+        actor_optimizer=adam.init(actor),
+        critic_optimizer=adam.init(critic),
+        updates=jnp.zeros((), jnp.int32),
+        weighting=auxiliary.init_state(critic),
+        autoencoder=None if latent_reward is None else latent_reward.init(jax.random.fold_in(key, _AUTOENCODER)),
+    )
+
+
+def _counts_of(agent: Agent) -> jax.Array:
+    """`Working.counts`: one array, because XLA has a kernel for each counter that is one number."""
+    return jnp.stack([adam.count(agent.critic_optimizer), adam.count(agent.actor_optimizer), agent.updates])
+
+
+def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
+    """The agent with its own counters again."""
+    return agent.replace(
+        critic_optimizer=adam.with_count(agent.critic_optimizer, counts[0]),
+        actor_optimizer=adam.with_count(agent.actor_optimizer, counts[1]),
+        updates=counts[2],
+    )
+
+
+def _copies_of(networks: Networks, agent: Agent) -> ComputeCopies:
+    """All four networks as they are computed with."""
+    return ComputeCopies(*map(networks.compute_copy, _networks_of(agent)))
+
+
+def _begin(networks: Networks, agent: Agent, statistics: Statistics) -> Working:
+    """`GradientSteps.begin`."""
+    return Working(agent, _copies_of(networks, agent), networks.batch_scaling(statistics), _counts_of(agent))
+
+
+def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config) -> Agent:
+    """One step of both optimisers, and the targets a little after the online networks; ``counts`` include this step."""
+    corrections = adam.corrections(counts[:2])
+    critic, critic_moments = adam.step(
+        state.critic, gradients.critic, state.critic_optimizer, config.critic_learning_rate, corrections[0]
+    )
+    actor, actor_moments = state.actor, state.actor_optimizer
+    if gradients.actor is not None:
+        actor, actor_moments = adam.step(actor, gradients.actor, actor_moments, config.actor_learning_rate, corrections[1])
+    follow = jnp.where(counts[2] % config.target_update_interval == 0, 1.0 - config.target_decay, 0.0)
+
+    def followed(online: Params, target: Params) -> Params:
+        return optax.incremental_update({part: online[part] for part in target}, target, follow)
+
+    return state.replace(
+        actor=actor,
+        critic=critic,
+        target_actor=followed(actor, state.target_actor),
+        target_critic=followed(critic, state.target_critic),
+        actor_optimizer=actor_moments,
+        critic_optimizer=critic_moments,
+        weighting=gradients.weighting,
+    )
+
+
+def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, goals: jax.Array) -> Metrics:
+    """`Algorithm.diagnose`: the mean value of the policy's actions where the goal itself is observed."""
+    own = (statistics.observations,) if statistics.own_goals is None else (statistics.observations, statistics.goals)
+    inputs = [networks.prepare(networks.scaling(each), goals) for each in own]
+
+    def latents(params: Params) -> jax.Array:
+        encoded = [networks.encode(params, each) for each in inputs]
+        return jnp.stack([encoded[0], encoded[-1]])
+
+    action = networks.act(agent.actor, latents(networks.with_encoder(agent.actor, agent.critic)))
+    return {"train/value_at_goals": jnp.mean(networks.value(agent.critic, latents(agent.critic), action))}
+
+
+def _metrics_of(found: Weighted, value: jax.Array) -> Metrics:
+    """Return metrics of the critic's losses and their weighting, and the mean of its values [B]."""
+    return {
+        "train/critic_loss": found.losses[MAIN],
+        "train/value": jnp.mean(value),
+        **{f"train/{name}": number for name, number in found.metrics.items()},
+        **{f"train/loss/{name}": loss for name, loss in found.losses.items() if name != MAIN},
+    }
+
+
+def make_ddpg(
+    networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None, shards: Shards = ONE
+) -> GradientSteps:
+    """Make the gradient steps of DDPG for these networks.
+
+    Args:
+        networks: Architecture of the parameters.
+        config: Learning rates, target decay, action penalty.
+        resolved: Discount, bounds of the targets, filter threshold.
+        auxiliary: Auxiliary tasks; None for those that ``config`` asks for, without stacked images.
+        shards: Shards of the learner: batches are those of one shard, gradients and metrics those of the whole.
+    """
+    if auxiliary is None:
+        auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
+    latent_reward = make_latent_reward(networks, config, resolved)
+    learning = Objectives(networks, config, resolved, auxiliary, shards)
+    keeps_state = auxiliary.weighting.name != "none"
+
+    def prepare(working: Working, batch: Batch) -> Prepared:
+        image = None
+        if auxiliary.needs_image:
+            image = networks.normalize(working.scaling.observations, batch.observation_t, batch.shift)
+        # Before, goal, after, views: the online networks read the first two, their targets the second and third.
+        return Prepared(batch, networks.prepare_batch(working.scaling, batch), image)
+
+    def gradients(working: Working, prepared: Prepared, with_actor: bool = True) -> tuple[Gradients, Metrics]:
+        agent, (batch, inputs, image) = working.agent, prepared
+        now = ComputeCopies(*map(networks.with_compute_copy, _networks_of(agent), working.copies))
+        rewarded = None
+        if latent_reward is not None:
+            rewarded = latent_reward.of_batch(agent.autoencoder, working.scaling.observations, inputs, batch)
+        if rewarded is not None:
+            batch = batch.replace(reward=rewarded.reward)
+        assert batch.reward is not None
+        state = auxiliary.start(now.critic) if agent.weighting is None else agent.weighting
+        found = learning.critic_gradient(now, inputs, image, batch)(now.critic, state)
+        latents, value, keep = found.extra
+        counts = diagnostics.count_rewards(
+            batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
+        )
+        metrics = _metrics_of(found, value)
+        actor_gradient, mean_square = None, None
+        if with_actor:
+            (policy_loss, action), actor_gradient = jax.value_and_grad(learning.of_actor, has_aux=True)(
+                now.actor, now.critic, inputs, latents, image, batch, found.weights
+            )
+            actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
+            metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))
+        if rewarded is not None:
+            metrics["train/autoencoder_loss"] = rewarded.loss
+        of_autoencoder = rewarded.gradient if rewarded is not None else None
+        # Of a learner in several parts, this is the one thing that an update waits for the others for.
+        own_gradient = None if learning.reduces_early else found.gradient
+        own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts = shards.mean(
+            (own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts)
+        )
+        if mean_square is not None:
+            metrics["train/action_size"] = jnp.sqrt(mean_square)
+        metrics |= {f"train/{name}": share for name, share in diagnostics.shares(counts, shards.count).items()}
+        critic_gradient = found.gradient if own_gradient is None else own_gradient
+        return Gradients(critic_gradient, actor_gradient, found.state if keeps_state else None, of_autoencoder), metrics
+
+    def apply(working: Working, chosen: Gradients) -> Working:
+        counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])
+        agent = _apply(working.agent, counts, chosen, config)
+        if latent_reward is not None:
+            agent = agent.replace(autoencoder=latent_reward.apply(agent.autoencoder, chosen.autoencoder))
+        return working._replace(agent=agent, copies=_copies_of(networks, agent), counts=counts)
+
+    return GradientSteps(
+        init=lambda key: _start(networks, auxiliary, latent_reward, key),
+        begin=functools.partial(_begin, networks),
+        prepare=prepare,
+        gradients=gradients,
+        apply=apply,
+        end=lambda working: _with_counts(working.agent, working.counts),
+    )
+
+
+def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Agent, Metrics]]:
+    """Make `Algorithm.update` of gradient steps."""
+    interval = config.actor_interval
+
+    def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
+        names: list[str] = []
+
+        def take(state: tuple[Working, Prepared], following: Any) -> tuple[tuple[Working, Prepared], jax.Array]:
+            """Take gradient steps of which the last is the actor's, too; unrolled, so that the body has no conditional.
+
+            Each has its batch already, and reads and prepares the next one. A GPU does that while it computes; with its own
+            batch it would have to begin with it.
+            """
+            (working, prepared), rows = state, []
+            for number in range(interval):
+                coming = read(working, jax.tree.map(lambda leaf, number=number: leaf[number], following))
+                gradients, metrics = steps.gradients(working, prepared, number == interval - 1)
+                working, prepared = steps.apply(working, gradients), coming
+                rows.append(metrics)
+            names[:] = rows[-1]
+            # As one vector, because writing each number by itself would be a kernel each.
+            metrics = jnp.stack([_mean([row[name] for row in rows if name in row]) for name in names])
+            return (working, prepared), metrics
+
+        def read(working: Working, choice: Any) -> Prepared:
+            return steps.prepare(working, batches.read(choice))
+
+        working = steps.begin(agent, statistics)
+        prepared = read(working, jax.tree.map(lambda leaf: leaf[0], batches.choices))
+        # The last prefetch wraps around to the first batch and is discarded.
+        following = jax.tree.map(
+            lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), batches.choices
+        )
+        (working, _), metrics = jax.lax.scan(take, (working, prepared), following)
+        return steps.end(working), dict(zip(names, jnp.mean(metrics, axis=0), strict=True))
+
+    return update
+
+
+def _mean(values: list[jax.Array]) -> jax.Array:
+    return functools.reduce(jnp.add, values) / len(values)
+
+
+def make(setup: Setup) -> Algorithm:
+    """Make DDPG."""
+    config, resolved = setup.config, setup.resolved
+    networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias)
+    steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards)
+
+    def policy_params(agent: Agent, statistics: Statistics) -> ActorParams:
+        return ActorParams(networks.with_encoder(agent.actor, agent.critic), statistics.observations, statistics.goals)
+
+    def encode(policy: ActorParams, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
+        return networks.encode(policy.actor, networks.prepare(networks.scaling(statistics), observations))
+
+    def aim(policy: ActorParams, goals: jax.Array) -> jax.Array:
+        return encode(policy, policy.goals, goals)
+
+    def act(policy: ActorParams, observations: jax.Array, aim: jax.Array) -> jax.Array:
+        return networks.act(policy.actor, jnp.stack([encode(policy, policy.observations, observations), aim]))
+
+    diagnose = functools.partial(_value_at_goals, networks)
+    return Algorithm(steps.init, act, make_update(config, steps), policy_params, aim, diagnose, networks)

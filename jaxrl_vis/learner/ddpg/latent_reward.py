@@ -1,0 +1,141 @@
+"""Rewards from the latent space of an autoencoder that is trained along with the learner (thesis, section 5.1.5, Auto Encoder).
+
+    reward = R- + (R+ - R-) max(0, cosine of the latents of what was reached and of the goal)
+
+The autoencoder has an encoder of its own, like those of actor and critic, and reconstructs what was reached. Rewards are made
+anew for every batch, with the encoder as it is at that moment, and no gradient passes through them.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import auxtasks
+from jaxrl_vis.learner.networks.networks import Inputs, Networks
+from jaxrl_vis.learner.networks.normalizer import Scaling
+from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.types import Batch, Params, Replaceable
+
+_SMALL = 1e-6  # of a latent's length: the direction of a shorter one means nothing
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class AutoencoderState(Replaceable):
+    """An autoencoder between two gradient steps.
+
+    Attributes:
+        params: ``encoder`` and ``decoder``, nested dictionaries of float32.
+        optimizer: optax state.
+    """
+
+    params: Params
+    optimizer: Any
+
+
+class Rewarded(NamedTuple):
+    """Result of `LatentReward.of_batch`.
+
+    Attributes:
+        reward: [B] float32, without gradient.
+        loss: [] float32, mean squared error of the reconstruction, of normalised observations.
+        gradient: Gradient of that loss, for the parameters, float32.
+    """
+
+    reward: jax.Array
+    loss: jax.Array
+    gradient: Params
+
+
+def cosine_reward(latent: jax.Array, goal_latent: jax.Array, positive: float = 1.0, negative: float = 0.0) -> jax.Array:
+    """``positive`` for latents [B, L] of one direction, ``negative`` for those at a right angle or more: [B] float32.
+
+    Args:
+        latent: [B, L] any float dtype, of what was reached.
+        goal_latent: [B, L], of the goals.
+        positive: R+.
+        negative: R-.
+    """
+    first, second = (each.astype(jnp.float32) for each in (latent, goal_latent))
+    lengths = jnp.linalg.norm(first, axis=-1) * jnp.linalg.norm(second, axis=-1)
+    cosine = jnp.sum(first * second, axis=-1) / jnp.maximum(lengths, _SMALL**2)
+    return jax.lax.stop_gradient(negative + (positive - negative) * jnp.clip(cosine, 0.0, 1.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class LatentReward:
+    """The autoencoder of one configuration; all methods are pure. Make it with `make_latent_reward`."""
+
+    networks: Networks
+    resolved: Resolved
+    task: auxtasks.AuxTask
+    optimizer: optax.GradientTransformation
+
+    def init(self, key: jax.Array) -> AutoencoderState:
+        """A fresh autoencoder."""
+        encoder_key, decoder_key = jax.random.split(key)
+        params = {"encoder": self.networks.init_encoder(encoder_key), "decoder": self.task.init(decoder_key)}
+        return AutoencoderState(params=params, optimizer=self.optimizer.init(params))
+
+    def of_batch(self, state: AutoencoderState, scaling: Scaling, inputs: Inputs, batch: Batch) -> Rewarded:
+        """Rewards of a batch, and the gradient for the autoencoder.
+
+        Args:
+            state: The autoencoder.
+            scaling: Scaling of observations.
+            inputs: From `Networks.prepare_batch`.
+            batch: The transitions.
+        """
+        networks = self.networks
+        if batch.reached is None:
+            reached, pieces = batch.observation_tp1, inputs.pieces("after")
+        else:
+            reached = batch.reached
+            pieces = [(networks.prepare(scaling, reached), slice(None))]
+        image = networks.normalize(scaling, reached)
+
+        def reconstruction(params: Params) -> tuple[jax.Array, jax.Array]:
+            latent = networks.encode_pieces(params, pieces)
+            view = auxtasks.View(latent_t=latent, action=batch.action, image=image)
+            return self.task.loss(params["decoder"], view), latent
+
+        params = state.params
+        (loss, latent), gradient = jax.value_and_grad(reconstruction, has_aux=True)(params)
+        goal_latent = networks.encode_pieces(params, inputs.pieces("goal"))
+        reward = cosine_reward(latent, goal_latent, self.resolved.reward_positive, self.resolved.reward_negative)
+        return Rewarded(reward, loss, gradient)
+
+    def apply(self, state: AutoencoderState, gradient: Params) -> AutoencoderState:
+        """One step of the optimiser."""
+        change, moments = self.optimizer.update(gradient, state.optimizer)
+        return AutoencoderState(params=optax.apply_updates(state.params, change), optimizer=moments)
+
+
+def make_latent_reward(networks: Networks, config: Config, resolved: Resolved) -> LatentReward | None:
+    """Make the autoencoder that a configuration rewards with; None where rewards come from elsewhere.
+
+    Args:
+        networks: Architecture of the autoencoder's separate encoder.
+        config: The method and the step size, that of the critic.
+        resolved: R+ and R-.
+
+    Raises:
+        RequestError: Observations are no images.
+    """
+    method = resolved.method
+    if method.needs_images and not networks.sees_images:
+        raise RequestError(
+            f"method {config.method} encodes images, and {config.env} shows states: train on Visual{config.env}, or use "
+            "--method indicator"
+        )
+    if method.reward != "autoencoder":
+        return None
+    shape = networks.observation_spec, networks.action_size, config.latent_size
+    spec = auxtasks.Spec(*shape, levels=len(config.encoder_filters), dtype=networks.dtype)
+    task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
+    return LatentReward(networks, resolved, task, optax.adam(config.critic_learning_rate))

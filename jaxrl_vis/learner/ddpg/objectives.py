@@ -1,0 +1,215 @@
+"""Losses of the critic and the actor for a batch, auxiliary ones included, and one weighted gradient for each.
+
+Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
+it needs in one pass:
+
+    critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, views
+    their targets                           goal, after
+
+The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.learner.auxtasks import View
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.ddpg import losses
+from jaxrl_vis.learner.networks import forward_mode
+from jaxrl_vis.learner.networks.networks import Inputs, Networks
+from jaxrl_vis.learner.parallel.shards import Shards
+from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
+from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.types import Batch, Params
+
+
+class ComputeCopies(NamedTuple):
+    """Networks of an agent in the dtype that they are computed with (`Networks.compute_copy`)."""
+
+    actor: Params
+    critic: Params
+    target_actor: Params
+    target_critic: Params
+
+
+def _encode(networks: Networks, params: Params, inputs: Inputs, *names: str) -> jax.Array:
+    """Latents [names, B, latent] of the observations of these names."""
+    return networks.encode_pieces(params, inputs.pieces(*names)).reshape(len(names), inputs.size, -1)
+
+
+class Latents(NamedTuple):
+    """Latents of a transition's observations by one online network, [B, latent] each.
+
+    Attributes:
+        pair: [2, B, latent] before and goal, as heads take them.
+        before: The first of them.
+        after: None where no loss reads it.
+        views: Latents of images that auxiliary tasks have made, by name.
+    """
+
+    pair: jax.Array
+    before: jax.Array
+    after: jax.Array | None
+    views: dict[str, jax.Array]
+
+
+def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, apart: bool) -> Latents:
+    """Latents of all observations that losses read, with gradient.
+
+    Most auxiliary losses read two of them or one. Encoded ``apart``, the gradient of each loss passes through these alone.
+    """
+    names = ("before", "goal", *auxiliary.encoded)
+    if apart:
+        found = [_encode(networks, params, inputs, name)[0] for name in names]
+        pair = jnp.stack(found[:2])
+    else:
+        found = _encode(networks, params, inputs, *names)
+        pair = found[:2]
+    return _with_others(auxiliary, pair, found[0], found[2:])
+
+
+def _with_others(auxiliary: Auxiliary, pair: jax.Array, before: jax.Array, others: Iterable[jax.Array]) -> Latents:
+    views = dict(zip(auxiliary.encoded, others, strict=True))
+    after = views.pop("after", None)
+    return Latents(pair, before, after, views)
+
+
+_MAIN_READS, _OTHERS_READ = "main", "others"
+
+
+def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
+    """Latents that the critic's main loss reads, and those that auxiliary losses read, as functions of the encoder.
+
+    The main loss looks at goals and auxiliary losses never do, so gradients have less to pass through.
+    """
+
+    def of(*names: str) -> Callable[[Params], jax.Array]:
+        return lambda encoder: _encode(networks, {"encoder": encoder}, inputs, *names)
+
+    return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.encoded)}
+
+
+def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
+    """Latents as losses take them, from what was encoded at once or by `_encoders`."""
+    if isinstance(found, Latents):
+        return found
+    before, *others = found[_OTHERS_READ]
+    return _with_others(auxiliary, found[_MAIN_READS], before, others)
+
+
+def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
+    """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
+
+    Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
+    """
+    if networks.config.target_encoder:
+        of_critic = _encode(networks, now.target_critic, inputs, "goal", "after")[::-1]
+    else:
+        after = latents.after
+        after = _encode(networks, now.critic, inputs, "after") if after is None else after[None]
+        of_critic = jnp.concatenate([after, latents.pair[1:]])
+    if networks.config.encoders == "shared":
+        return of_critic, of_critic
+    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, "goal", "after")[::-1]
+    return of_actor, of_critic
+
+
+@dataclasses.dataclass(frozen=True)
+class Objectives:
+    """The losses of both networks and their weighted gradients, for one configuration."""
+
+    networks: Networks
+    config: Config
+    resolved: Resolved
+    auxiliary: Auxiliary
+    shards: Shards
+
+    @property
+    def reduces_early(self) -> bool:
+        """True if the critic's gradients are averaged over the shards of a learner before they are weighted.
+
+        A weighting that takes logarithms of losses, or compares gradients, must see those of the whole learner. What others
+        make of them is a sum, which may be averaged afterwards, together with all else.
+        """
+        weighting = self.auxiliary.weighting
+        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.log)
+
+    def critic_gradient(
+        self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch
+    ) -> Callable[[Params, WeightingState], Weighted]:
+        """Make the function of the critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
+        networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
+
+        def encode(encoder: Params) -> Latents:
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=way == "per_loss")
+
+        def critic_losses(critic: Params, found: Latents | dict[str, jax.Array]):
+            assert batch.reward is not None
+            latents = _together(self.auxiliary, found)
+            target = self._target(now, inputs, latents, batch)
+            value = networks.value(critic, latents.pair, batch.action)
+            keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
+            others = self._auxiliary(critic, latents, inputs, image, batch)
+            return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
+
+        # Where the main gradient is passed on by itself, the others' need not pass through all that it does.
+        passes_apart = way == "latents" and weighting.needs == "dots"
+        encoders = _encoders(networks, self.auxiliary, inputs) if passes_apart else encode
+        options: dict[str, Any] = {"forwards": forward_mode.with_tangents, "encode": encoders, "has_aux": True}
+        if self.reduces_early:
+            options["reduce"] = self.shards.mean
+        return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
+
+    def _kept(self, keep: jax.Array) -> jax.Array | None:
+        """Transitions that count in a part, on average over the parts, by which all divide alike; None: its own."""
+        if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
+            return None
+        return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
+
+    def _target(self, now: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch) -> jax.Array:
+        assert batch.reward is not None
+        networks, resolved = self.networks, self.resolved
+        of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
+        value_tp1 = networks.value(now.target_critic, of_critic, networks.act(now.target_actor, of_actor))
+        discount = resolved.discount if batch.discount is None else batch.discount
+        return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
+
+    def of_actor(
+        self,
+        actor: Params,
+        critic: Params,
+        inputs: Inputs,
+        critic_latents: Latents,
+        image: jax.Array | None,
+        batch: Batch,
+        weights: dict[str, jax.Array],
+    ) -> tuple[jax.Array, jax.Array]:
+        """The actor's loss, those of its auxiliary tasks with the critic's weights added, and its actions [B, A]."""
+        has_encoder = self.config.encoders == "separate"
+        latents, others = critic_latents, {}
+        if has_encoder:
+            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
+            others = self._auxiliary(actor, latents, inputs, image, batch)
+        if self.auxiliary.weighting.log:
+            others = {name: self.shards.whole(loss) for name, loss in others.items()}
+        action = self.networks.act(actor, latents.pair)
+        value = self.networks.value(critic, critic_latents.pair, action)
+        best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
+        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole, self.config.actor_log)
+        return loss + self.auxiliary.weighting.objective(weights, others), action
+
+    def _auxiliary(
+        self, params: Params, latents: Latents, inputs: Inputs, image: jax.Array | None, batch: Batch
+    ) -> dict[str, jax.Array]:
+        """Losses of the auxiliary tasks on a network's latents, by name."""
+        if not self.auxiliary.tasks:
+            return {}
+        patches = inputs.observed if self.networks.uses_kernel else None
+        view = View(latents.before, batch.action, latents.after, image, patches=patches)
+        return self.auxiliary.losses(params["heads"], view, latents.views, batch)

@@ -1,0 +1,139 @@
+"""Second half of a training iteration, after its rollout, for one learner, as pure functions that are not compiled yet.
+
+    insert      one contiguous slice of the replay; observation statistics
+    update      scan over U: sample, relabel, reward, gradient step, target networks
+    learn       both, and metrics: fixed-shape means
+
+All draw from ``fold_in(seed's key, iteration)``.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.learner.acting.rollout_parts import Played, join_parts
+from jaxrl_vis.learner.algorithm import Algorithm, Batches
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.memory.sampling import Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.parallel.sharding import Layout
+from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
+
+Insert = Callable[[TrainState, ReplayState, Episodes, jax.Array, jax.Array], tuple[TrainState, ReplayState]]
+"""(TrainState, ReplayState, Episodes, key [], iteration []) -> what it makes of the first two."""
+
+Update = Callable[[TrainState, ReplayState, jax.Array, jax.Array], tuple[TrainState, Metrics]]
+"""(TrainState, ReplayState, key [], iteration []) -> the learner after all gradient steps, and means of their metrics."""
+
+# Folded into an iteration's key for what draws statistics. Large, because small numbers give the keys of `jax.random.split`.
+_STATISTICS = 0x73656E
+# The same for what an algorithm draws.
+_UPDATES = 0x757064
+
+
+class Learned(NamedTuple):
+    """Result of an iteration.
+
+    Attributes:
+        loop: The state that the next iteration begins with.
+        metrics: [S] float32 by name.
+    """
+
+    loop: LoopState
+    metrics: Metrics
+
+
+def split_key(key: jax.Array, iteration: jax.Array) -> jax.Array:
+    """Return two keys [2] of an iteration of a learner: for its rollout, and for what follows."""
+    return jax.random.split(jax.random.fold_in(key, iteration))
+
+
+def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> Batches:
+    """Choose the batches of all gradient steps at once: in a loop, drawing numbers would be a dozen tiny kernels a step."""
+    keys = jax.random.split(key, config.updates_per_iteration)
+    choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
+    return Batches(choices, lambda choice: sampler.batch(replay, choice))
+
+
+def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
+    """Update the normaliser with the observations of a rollout."""
+    if config.normalizer_source == "rollouts":
+        observations, goals = episodes.observations, episodes.observations[:, -1:]
+        if train.goal_normalizer is not None:
+            observations = observations[:, :-1]
+        axes = (0, 1)
+    else:  # as the authors' release: as many transitions as the rollout has, relabelled
+        count = config.num_envs * sampler.replay.horizon
+        latest = sampler.replay._replace(num_rollouts=1, mean_age=None)
+        sampler = dataclasses.replace(sampler, config=config.replace(batch_size=count), replay=latest)
+        rollout = latest.of_rollout(episodes)
+        batch = sampler.batch(rollout, sampler.choose(rollout, key, jnp.zeros((), jnp.int32)))
+        observations, goals = batch.observation_t, batch.goal
+        if train.goal_normalizer is None:
+            observations = jnp.concatenate([observations, goals])
+        axes = (0,)
+    train = train.replace(normalizer=normalizer.update(train.normalizer, observations, axes, sampler.shards))
+    if train.goal_normalizer is None:
+        return train
+    return train.replace(goal_normalizer=normalizer.update(train.goal_normalizer, goals, axes, sampler.shards))
+
+
+def make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Insert:
+    """Make the insertion of a rollout into the replay and the statistics."""
+
+    def insert(
+        train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
+    ) -> tuple[TrainState, ReplayState]:
+        episodes = auxiliary.with_stored(episodes)
+        replay_state = sampler.replay.insert(replay_state, episodes, iteration)
+        return _update_statistics(train, episodes, jax.random.fold_in(key, _STATISTICS), config, sampler), replay_state
+
+    return insert
+
+
+def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Update:
+    """Make the gradient steps of an iteration by themselves, to be timed."""
+
+    def update(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
+        batches = choose_batches(config, sampler, replay, key, iteration)
+        agent, metrics = algorithm.update(train.agent, train.statistics, batches, jax.random.fold_in(key, _UPDATES))
+        return train.replace(agent=agent), metrics
+
+    return update
+
+
+def make_learn(
+    config: Config, insert: Insert, algorithm: Algorithm, sampler: Sampler, layout: Layout
+) -> Callable[[LoopState, Sequence[Played]], Learned]:
+    """Make the second half of an iteration.
+
+    Returns:
+        (LoopState, the rollout's parts in their order) -> `Learned`, of one learner or one shard of it, whose replay lies as
+        ``layout`` says. Environments of the last part that are not the rollout's are left out.
+    """
+    shards, num_envs = sampler.shards, sampler.replay.num_envs
+
+    def learn(loop: LoopState, parts: Sequence[Played]) -> Learned:
+        episodes, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, num_envs), *parts)
+        key = split_key(loop.key, loop.iteration)[1]
+        train, replay_state = insert(loop.train, layout.unfolded(loop.replay), episodes, key, loop.iteration)
+        batches = choose_batches(config, sampler, replay_state, key, loop.iteration)
+        agent, metrics = algorithm.update(train.agent, train.statistics, batches, jax.random.fold_in(key, _UPDATES))
+        train = train.replace(agent=agent)
+        means = {f"train/{name}": jnp.mean(values) for name, values in outcome.items()}
+        means |= algorithm.diagnose(train.agent, train.statistics, episodes.observations[:, -1])
+        metrics |= shards.mean(means)
+        metrics["guard/nonfinite"] = shards.total(_count_nonfinite((metrics, episodes.states, episodes.actions)))
+        replay_state = layout.folded(replay_state, num_envs)
+        return Learned(LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics)
+
+    return learn
+
+
+def _count_nonfinite(tree: Any) -> jax.Array:
+    floats = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return sum((jnp.sum(~jnp.isfinite(leaf)) for leaf in floats), jnp.zeros((), jnp.int32)).astype(jnp.float32)

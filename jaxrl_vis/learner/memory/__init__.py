@@ -1,0 +1,1 @@
+"""Memory: the replay, and what is made of its episodes: batches, goals, rewards."""

@@ -1,0 +1,34 @@
+"""Goal relabelling: which observation of its own episode a transition should have reached (thesis, section 5.1.4).
+
+An episode's frames lie in slots 0 ... T, its original goal in slot T+1 (`types.Episodes`), so to relabel is to choose a slot.
+For the transition from slot t to t+1:
+
+    with p1 p2          slot t+1                     reached for certain: a positive even under the indicator reward
+    with p1 (1 - p2)    a slot of t+1 ... T, evenly  hindsight experience replay's "future" (Andrychowicz et al., 2017)
+    with 1 - p1         slot T+1                     the goal that the policy was given
+
+What is observed in that slot becomes the goal in `sampling`.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.memory.random_integers import scaled
+
+
+def choose_goal_slots(
+    key: jax.Array, time: jax.Array, horizon: int, relabel_probability: float, balance_probability: float
+) -> jax.Array:
+    """A goal slot for every transition: [B] int32 in {t+1, ..., T+1}.
+
+    Args:
+        key: [] a typed key.
+        time: [B] int32, t in [0, T).
+        horizon: T.
+        relabel_probability: p1.
+        balance_probability: p2.
+    """
+    strategy, fraction = jax.random.uniform(key, (2, *time.shape))
+    future = time + 1 + scaled(fraction, horizon - time)
+    slots = jnp.where(strategy < relabel_probability, future, horizon + 1)
+    return jnp.where(strategy < relabel_probability * balance_probability, time + 1, slots).astype(jnp.int32)

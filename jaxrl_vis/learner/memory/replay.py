@@ -1,0 +1,249 @@
+"""A ring of whole episodes, byte for byte as they came in, each observation once.
+
+    observations  [N, T+2, C, H, W/4] uint32     slots 0 ... T: the episode;  slot T+1: its goal
+                   |                |
+                   |                +-- four pixels (uint8) a word: XLA copies element by element, whatever their size
+                   +-- rollouts of E episodes, one after the other; N is a multiple of E
+
+Images whose width four does not divide, and state vectors, are kept as they are. Where observations stack the images of the
+latest control steps, the newest one of each is kept: the others are in the slots before it, or in slot 0 where the episode
+began. A goal stands still, so that all its images are one.
+
+A rollout is written as one contiguous slice. The place follows from the iteration, which all seeds share, so that under `vmap`
+over seeds it stays a slice and does not become a scatter. Samples are drawn from the newest ``size`` episodes.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.memory.random_integers import scaled
+from jaxrl_vis.types import Batch, Episodes, ReplayState
+
+_WORD = 4  # bytes
+
+
+def _packs(dtype: Any, width: int) -> bool:
+    return dtype == jnp.uint8 and width % _WORD == 0
+
+
+def pack(observations: jax.Array) -> jax.Array:
+    """Observations as they are stored: [..., W] uint8 -> [..., W/4] uint32 where four divides W, else unchanged."""
+    *shape, width = observations.shape
+    if not _packs(observations.dtype, width):
+        return observations
+    return jax.lax.bitcast_convert_type(observations.reshape(*shape, width // _WORD, _WORD), jnp.uint32)
+
+
+def unpack(observations: jax.Array) -> jax.Array:
+    """Undoes `pack`."""
+    if observations.dtype != jnp.uint32:
+        return observations
+    *shape, words = observations.shape
+    return jax.lax.bitcast_convert_type(observations, jnp.uint8).reshape(*shape, words * _WORD)
+
+
+def _pack_steps(array: jax.Array) -> jax.Array:
+    """`pack` of an array [episodes, steps, ...], whose steps stay apart."""
+    return pack(array) if array.ndim > 2 else array
+
+
+class Indices(NamedTuple):
+    """Places of B transitions: [B] int32 each.
+
+    Attributes:
+        episode: In [0, N).
+        time: t in [0, T).
+    """
+
+    episode: jax.Array
+    time: jax.Array
+
+
+class Replay(NamedTuple):
+    """A replay's fixed sizes. All its functions are pure.
+
+    Attributes:
+        num_rollouts: Rollouts that the ring holds.
+        num_envs: E, episodes in a rollout.
+        horizon: T.
+        frame_stack: F, images that an observation stacks along C, the newest first; 1 for state vectors.
+        mean_age: Mean age of samples, in rollouts, if probabilities are to fall exponentially with age; None: they are even.
+    """
+
+    num_rollouts: int
+    num_envs: int
+    horizon: int
+    frame_stack: int = 1
+    mean_age: float | None = None
+
+    @property
+    def num_episodes(self) -> int:
+        """N, episodes that the ring holds."""
+        return self.num_rollouts * self.num_envs
+
+    def init(
+        self,
+        observation: jax.ShapeDtypeStruct,
+        goal_state_size: int,
+        action_size: int,
+        stored: Mapping[str, jax.ShapeDtypeStruct] | None = None,
+    ) -> ReplayState:
+        """An empty replay.
+
+        Args:
+            observation: Shape and dtype of one observation (`GoalEnv.observation_spec`).
+            goal_state_size: G.
+            action_size: A.
+            stored: Shapes and dtypes of what lies beside one episode, by auxiliary task (`Auxiliary.stored_spec`).
+        """
+        episodes, horizon = self.num_episodes, self.horizon
+        beside = {
+            name: _pack_steps(jnp.zeros((episodes, *spec.shape), spec.dtype)) for name, spec in dict(stored or {}).items()
+        }
+        first, *others = observation.shape
+        kept = (episodes, horizon + 2, first // self.frame_stack, *others)
+        return ReplayState(
+            episodes=Episodes(
+                observations=pack(jnp.zeros(kept, observation.dtype)),
+                states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
+                actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
+                stored=beside,
+            ),
+            size=jnp.zeros((), jnp.int32),
+        )
+
+    def spec(self, *args: Any) -> ReplayState:
+        """Shapes and dtypes of the storage, without allocating it; arguments as of `init`."""
+        return jax.eval_shape(lambda: self.init(*args))
+
+    def _stored(self, rollout: Episodes) -> Episodes:
+        """Episodes as they are stored."""
+        newest = rollout.observations[:, :, : rollout.observations.shape[2] // self.frame_stack]
+        stored = {name: _pack_steps(array) for name, array in rollout.stored.items()}
+        return rollout.replace(observations=pack(newest), stored=stored)
+
+    def of_rollout(self, rollout: Episodes) -> ReplayState:
+        """A replay of one rollout that holds just these E episodes."""
+        return ReplayState(episodes=self._stored(rollout), size=jnp.full((), self.num_envs, jnp.int32))
+
+    def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
+        """Writes the E episodes of a rollout, over the oldest ones once the ring is full.
+
+        Args:
+            state: The replay before.
+            rollout: E episodes, unpacked.
+            iteration: [] int32, iterations before this one: it settles the place.
+        """
+        start = (iteration % self.num_rollouts) * self.num_envs
+        episodes = jax.tree.map(
+            lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0),
+            state.episodes,
+            self._stored(rollout),
+        )
+        return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
+
+    def _latest(self, iteration: jax.Array) -> jax.Array:
+        """Return the place of the last episode of the rollout of ``iteration``."""
+        return (iteration % self.num_rollouts + 1) * self.num_envs - 1
+
+    def is_stored(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
+        """Return which places hold an episode: [N] bool. Not always the first: a resumed run may begin anywhere in the ring.
+
+        Args:
+            state: The replay, with the rollout of ``iteration`` inserted.
+            iteration: [] int32.
+        """
+        age = (self._latest(iteration) - jnp.arange(self.num_episodes)) % self.num_episodes
+        return age < state.size
+
+    def sample_indices(self, state: ReplayState, key: jax.Array, iteration: jax.Array, batch_size: int) -> Indices:
+        """B transitions of the stored ones: evenly, or newer ones more often than older ones (``mean_age``).
+
+        Args:
+            state: The replay, with the rollout of ``iteration`` inserted.
+            key: [] a typed key.
+            iteration: [] int32.
+            batch_size: B.
+        """
+        of_episode, of_time = jax.random.uniform(key, (2, batch_size))
+        latest = self._latest(iteration)
+        size = jnp.maximum(state.size, 1)
+        if self.mean_age is not None:  # an exponential distribution that ends with the oldest episode
+            mean = self.mean_age * self.num_envs
+            of_episode = -mean * jnp.log1p(of_episode * jnp.expm1(-size / mean)) / size
+        age = scaled(of_episode, size)
+        return Indices(episode=(latest - age) % self.num_episodes, time=scaled(of_time, self.horizon))
+
+    def gather(
+        self,
+        state: ReplayState,
+        indices: Indices,
+        goal_slot: jax.Array,
+        steps: int = 1,
+        goal_episode: jax.Array | None = None,
+    ) -> Batch:
+        """Reads transitions, with what is in a slot of the same episode, or of another one, as their goal.
+
+        Args:
+            state: The replay.
+            indices: Places of the transitions, [B] each.
+            goal_slot: [B] int32 in [1, T+1].
+            steps: Steps of a transition; it has fewer where the episode ends.
+            goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
+
+        Returns:
+            The transitions, without rewards; of stacked images the goal's stand still.
+        """
+        observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
+        episode, time = indices
+        last = jnp.minimum(time + steps, self.horizon) if steps > 1 else time + 1
+        goal_episode = episode if goal_episode is None else goal_episode
+        episodes, slots = jnp.stack([episode, goal_episode, episode]), jnp.stack([time, goal_slot, last])
+        return Batch(
+            observations=self._read(observations, episodes, slots, jnp.array([[False], [True], [False]])),
+            action=actions[episode, time],
+            state_tp1=states[episode, time + 1],
+            goal_state=states[goal_episode, goal_slot],
+        )
+
+    def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, stands_still: jax.Array) -> jax.Array:
+        """Observations [..., C, H, W] in slots [...] of episodes [...]; of what stands still, all images are the newest."""
+        if self.frame_stack == 1:
+            return unpack(stored[episodes, slots])
+        ago = jnp.where(stands_still[..., None], 0, jnp.arange(self.frame_stack))
+        images = unpack(stored[episodes[..., None], jnp.maximum(slots[..., None] - ago, 0)])
+        return images.reshape(*slots.shape, -1, *images.shape[-2:])
+
+    def stacked(self, state: ReplayState) -> jax.Array:
+        """All observations of the episodes as they were collected, [N, T+2, ...]."""
+        stored = state.episodes.observations
+        episodes, slots = jnp.indices(stored.shape[:2])
+        return self._read(stored, episodes, slots, slots > self.horizon)
+
+    def stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
+        """Return the arrays that auxiliary tasks have stored of transitions, by task: [B, ...]."""
+        return {name: unpack(array[indices.episode, indices.time]) for name, array in state.episodes.stored.items()}
+
+
+def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int = 1, mean_age: int | None = None) -> Replay:
+    """A replay of at least ``transitions`` transitions, rounded up to whole rollouts; nothing is allocated yet.
+
+    Args:
+        transitions: Least number of transitions to hold.
+        num_envs: E, episodes in a rollout.
+        horizon: T, control steps in an episode.
+        frame_stack: F, images that an observation stacks.
+        mean_age: Mean age of samples, transitions; None: samples are even.
+    """
+    of_rollout = num_envs * horizon
+    in_rollouts = None if mean_age is None else mean_age / of_rollout
+    return Replay(max(1, math.ceil(transitions / of_rollout)), num_envs, horizon, frame_stack, in_rollouts)
+
+
+def num_bytes(spec: ReplayState) -> int:
+    """Bytes that a replay of this spec takes."""
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(spec))

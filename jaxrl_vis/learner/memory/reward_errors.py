@@ -1,0 +1,73 @@
+"""A state estimator that errs, in the place of the oracle's true states (thesis, equation 5.2).
+
+    estimate      Gaussian noise on the estimated state
+    flip          rewards that are false, everywhere or only where the workspace is cluttered
+
+An estimator is a function of what it sees. Its errors are drawn with keys that are made from the true states themselves, so a
+transition is misjudged in the same way every time it is sampled, and errors do not average out.
+"""
+
+import jax
+import jax.numpy as jnp
+
+_NOISE, _FALSE = 0x6E6F69, 0x66616C
+
+
+def _keys(states: jax.Array, purpose: int) -> jax.Array:
+    """Typed keys [B] that follow from states [B, K] float32 alone."""
+    words = jax.lax.bitcast_convert_type(states.astype(jnp.float32), jnp.uint32)
+    mixed = jnp.zeros(words.shape[:1], jnp.uint32)
+    for column in range(words.shape[1]):  # multiplicative hashing (Knuth); `fold_in` mixes the bits once more
+        mixed = (mixed ^ words[:, column]) * jnp.uint32(0x9E3779B1)
+        mixed = mixed ^ (mixed >> 15)
+    return jax.vmap(lambda word: jax.random.fold_in(jax.random.key(purpose), word))(mixed)
+
+
+def estimate(states: jax.Array, noise: float) -> jax.Array:
+    """Return an estimator's estimates of true states: [B, G] float32, in their unit.
+
+    Args:
+        states: [B, G] float32.
+        noise: Standard deviation of the error in each coordinate, in the unit of the states.
+    """
+    draw = jax.vmap(lambda key: jax.random.normal(key, states.shape[1:]))
+    return states + noise * draw(_keys(states, _NOISE))
+
+
+def flip(
+    is_positive: jax.Array,
+    states: jax.Array,
+    goal_states: jax.Array,
+    false_positives: float,
+    false_negatives: float,
+    clutter: float = 1.0,
+    clutter_end: jax.Array | None = None,
+) -> jax.Array:
+    """Return which rewards are positive after some of them were misjudged: [B] bool.
+
+    Args:
+        is_positive: [B] bool, before.
+        states: [B, G] float32, the true states that were reached.
+        goal_states: [B, G] float32, those of the goals.
+        false_positives: Share of the negatives that become positives.
+        false_negatives: Share of the positives that become negatives.
+        clutter: Share of the workspace where this happens, so much more often that the shares above hold for the whole.
+        clutter_end: [] float32, from `find_clutter_end`; None: it happens everywhere.
+    """
+    number = jax.vmap(jax.random.uniform)(_keys(jnp.concatenate([states, goal_states], axis=1), _FALSE))
+    is_false = number < jnp.where(is_positive, false_negatives, false_positives) / clutter
+    if clutter_end is not None:
+        is_false &= states[:, 0] < clutter_end
+    return is_positive ^ is_false
+
+
+def find_clutter_end(goal_states: jax.Array, is_stored: jax.Array, clutter: float) -> jax.Array:
+    """The first coordinate below which the share ``clutter`` of all goals lies: [] float32.
+
+    Args:
+        goal_states: [N, G] float32, true states of goals: they are spread over the workspace whatever the policy does.
+        is_stored: [N] bool, which of the N there are.
+        clutter: The share, in (0, 1).
+    """
+    ordered = jnp.sort(jnp.where(is_stored, goal_states[:, 0], jnp.inf))
+    return ordered[jnp.clip((clutter * jnp.sum(is_stored)).astype(jnp.int32), 0, len(ordered) - 1)]

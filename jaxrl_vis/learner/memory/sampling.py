@@ -1,0 +1,195 @@
+"""From the replay to a batch that a loss can be taken of: sample, relabel, reward.
+
+    choose     which transitions (`replay`), and which slot of its own episode is each one's goal (`relabel`)
+    batch      reads them, makes goals of what was observed in those slots, and rewards what was reached
+
+Rewards are computed anew from what the replay holds, by the same functions that score the environments. No MuJoCo here.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
+from jaxrl_vis.learner.memory import reward_errors
+from jaxrl_vis.learner.memory.random_integers import scaled
+from jaxrl_vis.learner.memory.relabel import choose_goal_slots
+from jaxrl_vis.learner.memory.replay import Indices, Replay
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.types import Batch, ReplayState
+from jaxrl_vis_envs import goals
+
+# Folded into a key for draws that only some configurations make, so that they change nothing for the others.
+_TRIVIAL, _SHIFT, _TARGETS = 0x747276, 0x736866, 0x617578
+
+
+class Choice(NamedTuple):
+    """Choice of transitions and of their goals; made ahead, for many batches at once.
+
+    Attributes:
+        indices: Places of the transitions, [B] each.
+        goal_slot: [B] int32 in [t + 1, T + 1]; of another episode, in [1, T].
+        goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
+        shift: [B, 2] int32, see `Batch`; or None.
+        target_key: [] a typed key, for targets of auxiliary tasks; or None.
+        clutter_end: [] float32, see `reward_errors`; or None.
+    """
+
+    indices: Indices
+    goal_slot: jax.Array
+    goal_episode: jax.Array | None = None
+    shift: jax.Array | None = None
+    target_key: jax.Array | None = None
+    clutter_end: jax.Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampler:
+    """Draws batches; all methods are pure.
+
+    Attributes:
+        config: Batch size, method, and p1.
+        resolved: p2, R+ and R-.
+        replay: Sizes of the replay to read from.
+        threshold: Threshold of the oracle's reward, in the unit of the true states.
+        as_goal: [...] -> [...], makes a goal of what was reached (`GoalEnv.as_goal`); None where an observation is one already.
+        auxiliary: Auxiliary tasks, whose targets batches carry.
+        shards: Shards of the learner. ``replay`` is one, and so are batches; the configuration's batch size is that of all.
+    """
+
+    config: Config
+    resolved: Resolved
+    replay: Replay
+    threshold: float
+    as_goal: Callable[[jax.Array], jax.Array] | None = None
+    auxiliary: Auxiliary | None = None
+    shards: Shards = ONE
+
+    def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
+        """Draws B transitions and their goals: all of them for every part of a learner, which then keeps its own.
+
+        Args:
+            state: The replay, with the rollout of ``iteration`` inserted.
+            key: [] a typed key.
+            iteration: [] int32.
+        """
+        sample_key, goal_key = jax.random.split(key)
+        indices = self.replay.sample_indices(state, sample_key, iteration, self.config.batch_size)
+        goal_slot = self.goal_slots(goal_key, indices.time)
+        choice = Choice(indices, goal_slot)
+        if self.config.trivial_goals < 1.0:
+            is_replaced = self._replaced(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
+            # Transitions are drawn at random, so those of the next one's episode are, too.
+            choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
+        if self.config.random_shift:
+            most, shape = self.config.random_shift, (self.config.batch_size, 2)
+            fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
+            choice = choice._replace(shift=scaled(fraction, 2 * most + 1) - most)
+        if self.config.reward_clutter < 1.0:
+            choice = choice._replace(clutter_end=self._clutter_end(state, iteration))
+        parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))
+        choice = parted._replace(clutter_end=choice.clutter_end)
+        if not self._has_targets:
+            return choice
+        return choice._replace(target_key=self.shards.own_key(jax.random.fold_in(key, _TARGETS)))
+
+    def _clutter_end(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
+        goal_states = self.shards.gather(state.episodes.states[:, -1])
+        is_stored = self.shards.gather(self.replay.is_stored(state, iteration))
+        return reward_errors.find_clutter_end(goal_states, is_stored, self.config.reward_clutter)
+
+    @property
+    def _has_targets(self) -> bool:
+        return self.auxiliary is not None and bool(self.auxiliary.tasks)
+
+    def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
+        """Goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
+        shares = self.config.relabel_probability, self.resolved.balance_probability
+        return choose_goal_slots(key, time, self.replay.horizon, *shares)
+
+    def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
+        """Return which relabelled goals [B] bool another episode's replace: most of those that are reached already.
+
+        Not to the original goals. Where these look different from what episodes show (VisualFingerTurn's finger always hangs
+        down in them), all that is seldom reached would look like that, and a critic would tell rewards by it.
+        """
+        episode, time = indices
+        states = state.episodes.states
+        is_trivial = goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
+        is_trivial &= goal_slot <= self.replay.horizon
+        return is_trivial & ~jax.random.bernoulli(key, self.config.trivial_goals, time.shape)
+
+    def batch(self, state: ReplayState, choice: Choice) -> Batch:
+        """Reads what was chosen, with goals that stand still and rewards that belong to them.
+
+        Args:
+            state: The replay.
+            choice: From `choose`.
+
+        Returns:
+            B transitions with rewards.
+        """
+        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step, choice.goal_episode)
+        batch = batch.replace(shift=choice.shift)
+        if choice.target_key is not None:
+            assert self.auxiliary is not None
+            batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.stored(state, choice.indices))
+        reached = batch.observation_tp1
+        if self.as_goal is not None:
+            # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.
+            reached = jax.vmap(self.as_goal)(batch.observation_tp1)
+            batch = batch.replace(reached=reached)
+        if self.config.n_step > 1:
+            return self._rewarded_over_steps(state, choice, batch)
+        batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
+        if self.resolved.method.reward == "autoencoder":
+            return batch  # the learner rewards it, with the encoder as it is by then (`latent_reward`)
+        return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
+
+    def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
+        """The oracle's rewards of up to ``n_step`` steps, discounted and summed, and the discount of what follows them."""
+        episode, time = choice.indices
+        after = time[:, None] + 1 + jnp.arange(self.config.n_step)  # slots that the steps lead to, [B, n]
+        is_step = after <= self.replay.horizon
+        reached = state.episodes.states[episode[:, None], jnp.minimum(after, self.replay.horizon)]
+        values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
+        rewards = goals.oracle_reward(reached, batch.goal_state[:, None], self.threshold, **values)
+        weights = is_step * self.resolved.discount ** jnp.arange(self.config.n_step)
+        return batch.replace(
+            reward=jnp.sum(weights * rewards, axis=1),
+            discount=self.resolved.discount ** jnp.sum(is_step, axis=1).astype(jnp.float32),
+        )
+
+    def reward(self, batch: Batch, reached: jax.Array, clutter_end: jax.Array | None = None) -> jax.Array:
+        """Rewards [B] float32.
+
+        Args:
+            batch: The transitions, relabelled.
+            reached: [B, ...] what they have reached, as a goal would show it.
+            clutter_end: As of `Choice`.
+        """
+        values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
+        method = self.resolved.method
+        if method.reward == "oracle":
+            return self._estimated_reward(batch, clutter_end)
+        if callable(method.reward):
+            return method.reward(batch, reached, values["positive"], values["negative"])
+        return goals.indicator_reward(reached, batch.goal, num_axes=reached.ndim - 1, **values)
+
+    def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
+        """The oracle's rewards, with the errors of an estimator where the configuration asks for some."""
+        config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
+        states = reward_errors.estimate(batch.state_tp1, config.reward_noise) if config.reward_noise else batch.state_tp1
+        reward = goals.oracle_reward(states, batch.goal_state, self.threshold, positive, negative)
+        shares = config.reward_false_positives, config.reward_false_negatives
+        if not any(shares):
+            return reward
+        is_positive = reward_errors.flip(
+            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.reward_clutter, clutter_end
+        )
+        return jnp.where(is_positive, positive, negative).astype(jnp.float32)

@@ -1,0 +1,104 @@
+"""The kernel of the encoder's first layers that also makes their tangents: forward along a direction of the weights.
+
+And the same in plain JAX, as in `kernels.passes`. Weightings that need dot products of gradients ask for it
+(`learner.tangents`).
+"""
+
+import functools
+import math
+from typing import Any
+
+import jax
+
+from jaxrl_vis.learner.networks.kernels.passes import (
+    FORWARD,
+    FORWARD_TILES,
+    TILE,
+    Weights,
+    apply,
+    apply_plainly,
+    as_quarters,
+    before,
+    cast_kernels,
+    dispatch,
+    dot,
+    joined,
+    layer,
+    quarters_of,
+    read,
+    rows,
+    rows_of,
+    whole,
+)
+from jaxrl_vis.learner.networks.kernels.patches import divisor
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
+
+
+def _tangent_kernel(x_ref, *refs):
+    inputs, (out_ref, tangent_ref) = refs[:-2], refs[-2:]
+    weights, along = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
+
+    def one_tile(tile, _):
+        values, tangents = x_ref[quarters_of(tile), :], None
+        for level, parameters in enumerate(zip(*weights, *along, strict=True)):
+            tangents = None if tangents is None else joined(tangents, level)
+            values, tangents = _layer_along(joined(values, level), tangents, *parameters)
+        assert tangents is not None  # there is a layer
+        out_ref[rows_of(tile), :], tangent_ref[rows_of(tile), :] = values, tangents
+
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
+
+
+def _layer_along(
+    values: jax.Array,
+    tangents: jax.Array | None,
+    kernel: jax.Array,
+    bias: jax.Array,
+    kernel_along: jax.Array,
+    bias_along: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """`layer` and its tangent, for tangents of the values (None: they have none), of the kernel and of the bias."""
+    out, change = layer(values, kernel, bias), dot(values, kernel_along) + bias_along[None, :]
+    if tangents is not None:
+        change += dot(tangents, kernel)
+    return out, before(out, change)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
+def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
+    """`apply`, differentiable forwards instead, with respect to the weights."""
+    return apply(patches, weights, first, count, interpret)
+
+
+@apply_forwards.defjvp
+def _apply_along(first: int, count: int, interpret: bool, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    patches, weights = primals
+    place = {"first": first, "count": count}
+    on_gpu = functools.partial(_along_on_gpu, **place, interpret=interpret)
+    plainly = functools.partial(_along_plainly, **place)
+    return dispatch(on_gpu, plainly, patches, weights, tangents[1], interpret=interpret)
+
+
+def _along_on_gpu(
+    patches: jax.Array, weights: Weights, along: Weights, first: int, count: int, interpret: bool = False
+) -> tuple[jax.Array, jax.Array]:
+    """Return the result of `apply` for patches, and its tangent along a direction of the weights, [count, F] each."""
+    outputs = weights.biases[-1].shape[0]
+    block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
+    data, data_spec = as_quarters(patches, first, block)
+    cast = jax.tree.leaves([cast_kernels(each, patches.dtype) for each in (weights, along)])
+    out = jax.ShapeDtypeStruct((count, outputs), patches.dtype)
+    return kernel_call(
+        _tangent_kernel,
+        out_shape=(out, out),
+        grid=(count // block,),
+        in_specs=[data_spec, *map(whole, cast)],
+        out_specs=(rows(block, outputs), rows(block, outputs)),
+        compiler_params=FORWARD,
+        interpret=interpret,
+        name="encode_patches_along",
+    )(data, *cast)
+
+
+def _along_plainly(patches: jax.Array, weights: Weights, along: Weights, first: int, count: int) -> tuple[jax.Array, jax.Array]:
+    return jax.jvp(lambda weights: apply_plainly(patches, weights, first, count), (weights,), (along,))

@@ -1,0 +1,297 @@
+"""The kernels of the encoder's first layers: forward and backward (`kernels.encoder`; `kernels.jvp` has a third).
+
+Each with the same in plain JAX, for processes without such a GPU and as the kernels' reference.
+"""
+
+import functools
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plgpu
+
+from jaxrl_vis.learner.networks.kernels.patches import LEVELS, divisor, prepare_on_gpu
+from jaxrl_vis_envs.compiling.compilation import accelerator, dispatch_by_platform, tracing_for, use_gpu_kernels
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
+
+LEAST_ROWS = 16
+"""Least number of rows of a product in a kernel."""
+TILE = 16
+"""Patches in a tile."""
+# Measured on an H200: tiles that one program works through (at most, on the way back), and how they are run.
+FORWARD_TILES, FORWARD = 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
+_BACKWARD_TILES, _BACKWARD = 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
+# As many sums as these fit into the registers of four warps; more need eight.
+_MOST_SUMS, _BACKWARD_WITH_MORE = 16_384, plgpu.CompilerParams(num_warps=8, num_stages=1)
+_LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors
+
+
+class Weights(NamedTuple):
+    """Layers as the kernels multiply them, float32.
+
+    Attributes:
+        kernels: [16 C', 4 F1] for a quarter, where C' is C padded to a power of two; [4 F1, F2]; [4 F2, F3].
+        biases: [4 F1]; [F2]; [F3].
+    """
+
+    kernels: tuple[jax.Array, ...]
+    biases: tuple[jax.Array, ...]
+
+
+# -- Where they run
+
+
+def is_available() -> bool:
+    """Return True if this process has a GPU that the kernels run on, see `jaxrl_vis_envs.compiling.compilation`."""
+    if accelerator() != "cuda":
+        return False
+    with tracing_for("cuda"):
+        return use_gpu_kernels(probe)
+
+
+def probe() -> None:
+    """Compiles small instances of all three kernels for the device that is the default; raises what that raises."""
+    probe_program().lower().compile()
+
+
+def probe_program() -> Any:
+    """Small instances of all three kernels in one program, traced (`jax.stages.Traced`)."""
+    shape, levels = (4, 16, 16), LEVELS + 1
+    images, of_pixels = jnp.zeros((LEAST_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
+    sizes = (64, 64), (64, 16), (64, 16)
+    weights = Weights(tuple(map(jnp.zeros, sizes)), tuple(jnp.zeros(columns) for _, columns in sizes))
+
+    def all_three(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
+        patches = prepare_on_gpu(images, mean, scale, None, levels, 5.0, jnp.bfloat16)
+        patches = patches.reshape(-1, patches.shape[-1])
+        out = _apply_on_gpu(patches, weights, 0, patches.shape[0])
+        return _backward_on_gpu(patches, weights, out, out, 0, patches.shape[0])
+
+    return jax.jit(all_three).trace(images, of_pixels, of_pixels, weights)
+
+
+def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
+    """The kernel where a program is compiled for a GPU that runs it, and the same in plain JAX for every other platform."""
+    if interpret:
+        return on_gpu(*arguments)
+    return dispatch_by_platform(lambda *given: (on_gpu if use_gpu_kernels(probe) else plain)(*given), *arguments)
+
+
+# -- Layers
+
+
+def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -> jax.Array:
+    """A product in float32, over axis ``contract[0]`` of the left side and ``contract[1]`` of the right one."""
+    dimensions = (((contract[0],), (contract[1],)), ((), ()))
+    return jax.lax.dot_general(left, right, dimensions, preferred_element_type=jnp.float32)
+
+
+def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """A product with bias and rectifier, in the dtype of ``values``."""
+    return rectified(dot(values, kernel) + bias[None, :]).astype(values.dtype)
+
+
+def rectified(values: jax.Array) -> jax.Array:
+    """A rectifier with gradient 0 at 0, as `jax.nn.relu` has and `jnp.maximum` has not: blank parts of images lie there."""
+    return jnp.where(values > 0.0, values, 0.0)
+
+
+def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
+    """The gradient before a rectifier whose output is ``after``, in its dtype."""
+    return jnp.where(after > 0.0, gradient, 0.0).astype(after.dtype)
+
+
+def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
+    """Return the output of each layer for [4 R, 16 C'] quarters of patches; `joined` says in which rows."""
+    found, values = [], quarters
+    for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
+        values = layer(joined(values, level), kernel, bias)
+        found.append(values)
+    return found
+
+
+def joined(values: jax.Array, level: int) -> jax.Array:
+    """Return the rows that a layer multiplies: the third one four quarters side by side, others those of the layer before."""
+    return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
+
+
+def read(refs: Any) -> Weights:
+    """Return the weights as arguments of a kernel: kernels, then biases."""
+    values = tuple(ref[...] for ref in refs)
+    return Weights(values[: len(values) // 2], values[len(values) // 2 :])
+
+
+def _forward_kernel(x_ref, *refs):
+    weights, out_ref = read(refs[:-1]), refs[-1]
+
+    def one_tile(tile, _):
+        *_, out_ref[rows_of(tile), :] = _layers(x_ref[quarters_of(tile), :], weights)
+
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
+
+
+def rows_of(tile: Any) -> Any:
+    """Rows of a tile in the result."""
+    return pl.ds(tile * TILE, TILE)
+
+
+def quarters_of(tile: Any) -> Any:
+    """Quarters of patches of a tile."""
+    return pl.ds(4 * tile * TILE, 4 * TILE)
+
+
+def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
+    weights, sums_ref = read(refs[:-1]), refs[-1]
+    hidden_layers = Weights(weights.kernels[:-1], weights.biases[:-1])
+
+    def add_rows(values):
+        """The sum over rows, in each of the result's rows: as a product, it costs half of what a reduction does."""
+        return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
+
+    def one_tile(tile, sums):
+        values = [x_ref[quarters_of(tile), :]]
+        values += [*_layers(values[0], hidden_layers), out_ref[rows_of(tile), :]]
+        gradient, of_kernels, of_biases = gradient_ref[rows_of(tile), :], list(sums.kernels), list(sums.biases)
+        for level in reversed(range(LEVELS)):
+            gradient = before(values[level + 1], gradient)
+            of_kernels[level] += dot(joined(values[level], level), gradient, (0, 0))
+            of_biases[level] += add_rows(gradient)
+            if level:
+                gradient = dot(gradient, weights.kernels[level], (1, 1)).reshape(values[level].shape)
+        return Weights(tuple(of_kernels), tuple(of_biases))
+
+    start = Weights(
+        tuple(jnp.zeros(kernel.shape, jnp.float32) for kernel in weights.kernels),
+        tuple(jnp.zeros((LEAST_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
+    )
+    sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, start), 0
+    # A bias's are sixteen times the same sum.
+    for value in (*sums.kernels, *(jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS) for value in sums.biases)):
+        sums_ref[pl.ds(first, value.size)] = value.reshape(-1)
+        first += value.size
+
+
+def whole(array: jax.Array) -> pl.BlockSpec:
+    """All of an array for each program."""
+    return pl.BlockSpec(array.shape, lambda program: (0,) * array.ndim)
+
+
+def rows(count: int, columns: int, skipped: int = 0) -> pl.BlockSpec:
+    """``count`` rows of a matrix for each program, after the first ``skipped`` blocks of as many rows."""
+    return pl.BlockSpec((count, columns), lambda program: (program + skipped, 0))
+
+
+def tiles_of_program(tiles: int, total: int, limit: int) -> int:
+    """Return the number of tiles per program where it leaves a sum: many, for few sums, as long as all processors are busy.
+
+    Args:
+        tiles: What the number must divide.
+        total: Tiles of all programs.
+        limit: At most so many.
+    """
+    most = divisor(tiles, limit)
+    while most > 1 and total < most * _LEAST_PROGRAMS:
+        most //= 2
+    return most
+
+
+def cast_kernels(weights: Weights, dtype: Any) -> Weights:
+    """Kernels in the dtype of the products; biases are added in float32."""
+    return weights._replace(kernels=tuple(kernel.astype(dtype) for kernel in weights.kernels))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
+    """Layers of 2x2 stride-2 convolutions with rectifiers, for some patches: [M, 64 C'] -> [count, F], same dtype.
+
+    Differentiable with respect to the weights only: patches are data.
+
+    Args:
+        patches: [M, 64 C'] from `prepare`.
+        weights: From `make_weights`.
+        first, count: Which patches; both multiples of `TILE`.
+        interpret: Run the kernel without a GPU, slowly.
+    """
+    place = {"first": first, "count": count}
+    on_gpu = functools.partial(_apply_on_gpu, **place, interpret=interpret)
+    return dispatch(on_gpu, functools.partial(apply_plainly, **place), patches, weights, interpret=interpret)
+
+
+def as_quarters(patches: jax.Array, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
+    """Patches as the kernels read them, and a program's ``block`` of them."""
+    size = patches.shape[1] // 4
+    return patches.reshape(-1, size), rows(4 * block, size, first // block)
+
+
+def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
+    outputs = weights.biases[-1].shape[0]
+    block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
+    data, data_spec = as_quarters(patches, first, block)
+    cast = jax.tree.leaves(cast_kernels(weights, patches.dtype))
+    return kernel_call(
+        _forward_kernel,
+        out_shape=jax.ShapeDtypeStruct((count, outputs), patches.dtype),
+        grid=(count // block,),
+        in_specs=[data_spec, *map(whole, cast)],
+        out_specs=rows(block, outputs),
+        compiler_params=FORWARD,
+        interpret=interpret,
+        name="encode_patches",
+    )(data, *cast)
+
+
+def apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
+    """`apply` in plain JAX."""
+    chosen = patches[first : first + count].reshape(-1, patches.shape[1] // 4)
+    return _layers(chosen, cast_kernels(weights, patches.dtype))[-1]
+
+
+def _apply_forward(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool):
+    out = apply(patches, weights, first, count, interpret)
+    return out, (patches, weights, out)
+
+
+def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gradient: jax.Array):
+    patches, weights, out = residuals
+    place = {"first": first, "count": count}
+    on_gpu = functools.partial(_backward_on_gpu, **place, interpret=interpret)
+    plainly = functools.partial(_backward_plainly, **place)
+    return jnp.zeros_like(patches), dispatch(on_gpu, plainly, patches, weights, out, gradient, interpret=interpret)
+
+
+def _backward_on_gpu(
+    patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int, interpret: bool = False
+) -> Weights:
+    """Gradients of the weights, float32."""
+    outputs = out.shape[1]
+    block = TILE * tiles_of_program(math.gcd(first, count) // TILE, count // TILE, _BACKWARD_TILES)
+    programs = count // block
+    data, data_spec = as_quarters(patches, first, block)
+    cast, like = jax.tree.leaves(cast_kernels(weights, patches.dtype)), jax.tree.leaves(weights)
+    total = sum(array.size for array in like)
+    partial_sums = kernel_call(
+        _backward_kernel,
+        # All weights in one row, so that one reduction adds up the programs.
+        out_shape=jax.ShapeDtypeStruct((programs, total), jnp.float32),
+        grid=(programs,),
+        in_specs=[data_spec, rows(block, outputs), rows(block, outputs), *map(whole, cast)],
+        out_specs=pl.BlockSpec((None, total), lambda program: (program, 0)),
+        compiler_params=_BACKWARD if total <= _MOST_SUMS else _BACKWARD_WITH_MORE,
+        interpret=interpret,
+        name="encode_patches_backward",
+    )(data, out, gradient, *cast)
+    sums = jnp.split(jnp.sum(partial_sums, axis=0), list(itertools.accumulate(array.size for array in like))[:-1])
+    sums = [part.reshape(array.shape).astype(array.dtype) for part, array in zip(sums, like, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(weights), sums)
+
+
+def _backward_plainly(
+    patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int
+) -> Weights:
+    return jax.vjp(lambda weights: apply_plainly(patches, weights, first, count), weights)[1](gradient)[0]
+
+
+apply.defvjp(_apply_forward, _apply_backward)

@@ -1,0 +1,27 @@
+"""Matrix products whose gradients come out in the order that the optimiser reads."""
+
+import jax
+
+from jaxrl_vis.learner.networks import forward_mode
+
+
+def product(values: jax.Array, kernel: jax.Array) -> jax.Array:
+    """``values @ kernel``, [..., M, K] and [..., K, N]."""
+    return values @ kernel if forward_mode.are_wanted() else _with_rule(values, kernel)
+
+
+@jax.custom_vjp
+def _with_rule(values: jax.Array, kernel: jax.Array) -> jax.Array:
+    return values @ kernel
+
+
+def _backward(residuals: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    values, kernel = residuals
+    # JAX's own rule makes the kernel's gradient transposed, and the optimiser then reads it against the grain.
+    batch = tuple(range(values.ndim - 2))
+    rows, columns = len(batch), len(batch) + 1
+    kernel_gradient = jax.lax.dot_general(values, gradient, (((rows,), (rows,)), (batch, batch)))
+    return jax.lax.dot_general(gradient, kernel, (((columns,), (columns,)), (batch, batch))), kernel_gradient
+
+
+_with_rule.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _backward)

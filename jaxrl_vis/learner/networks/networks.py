@@ -1,0 +1,365 @@
+"""Encoder, actor and critic (OL-AUX, appendix; hyper-parameters in `Config`). The only file that knows flax.
+
+The encoder is a stack of 2x2 convolutions with stride 2. Such windows never overlap, so each layer IS a matrix product of
+[pixels, 4 * channels in] with [4 * channels in, channels out]. If the pixels are put into nested 2x2 blocks once,
+
+    [B, C, H, W]  ->  [B, H/16, W/16, 2*2, 2*2, 2*2, 2*2 * C]      (four layers; the finest block last)
+
+every layer is one reshape and one matrix product over the last axis, with no copy between layers. The order is made on the
+uint8 image, where it is cheapest. Borders that do not fill a block are cropped, as a convolution without padding does.
+
+Observation and goal go through the same encoder; actor and critic have one each.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.blocks import shifted, to_blocks
+from jaxrl_vis.learner.networks.kernels import encoder as encoder_kernel
+from jaxrl_vis.learner.networks.matmul import product
+from jaxrl_vis.learner.networks.normalizer import Scaling
+from jaxrl_vis.types import Batch, NormalizerState, Params, Statistics
+
+_glorot = nn.initializers.glorot_uniform()
+
+# Inputs at most this wide are multiplied element by element: a GPU's matrix units would pad them.
+_NARROW = 16
+
+
+class _Encoder(nn.Module):
+    """[B, blocks, 4^levels * C] -> [B, latent]; of several such arrays, one after the other."""
+
+    filters: Sequence[int]
+    latent_size: int
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, *pieces: jax.Array, first_layer: int = 0) -> jax.Array:
+        pieces = tuple(blocks.astype(self.dtype) for blocks in pieces)
+        count, size = pieces[0].shape[1:]
+        channels = size // 4 ** (len(self.filters) - first_layer)
+        for level, filters in list(enumerate(self.filters))[first_layer:]:
+            # Initialised as the convolution that it is: fan-out counts the window too.
+            kernel = self.param(
+                f"kernel_{level}",
+                lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape),
+                (4 * channels, filters),
+            )
+            bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,)).astype(self.dtype)
+            kernel = kernel.astype(self.dtype)
+            pieces = tuple(nn.relu(product(values.reshape(-1, 4 * channels), kernel) + bias) for values in pieces)
+            channels = filters
+        # Only here, where they are smallest, are the pieces put together.
+        features = [values.reshape(-1, count * channels) for values in pieces]
+        features = jnp.concatenate(features) if len(features) > 1 else features[0]
+        return _Dense(self.latent_size, self.dtype, name="latent")(features)
+
+
+class _Dense(nn.Module):
+    """[B, inputs] -> [B, size], as `flax.linen.Dense`.
+
+    Inputs may come in parts that belong side by side, as arrays [B, part] or [parts, B, part]: nothing is put together first.
+    """
+
+    size: int
+    dtype: Any
+    bias_init: nn.initializers.Initializer = nn.initializers.zeros
+
+    @nn.compact
+    def __call__(self, *inputs: jax.Array) -> jax.Array:
+        inputs = tuple(values if values.ndim == 3 else values[None] for values in inputs)
+        width = sum(values.shape[0] * values.shape[-1] for values in inputs)
+        kernel = self.param("kernel", _glorot, (width, self.size)).astype(self.dtype)
+        total, first = self.param("bias", self.bias_init, (self.size,)).astype(self.dtype), 0
+        for values in inputs:
+            parts, _, part = values.shape
+            rows = kernel[first : first + parts * part].reshape(parts, part, self.size)
+            values = values.astype(self.dtype)
+            if part <= _NARROW:
+                total = total + jnp.sum(values[..., None] * rows[:, None], axis=(0, 2))
+            else:
+                total = total + jnp.sum(product(values, rows), axis=0)
+            first += parts * part
+        return total
+
+
+def compute_dtype(config: Config) -> Any:
+    """Return the dtype that networks of a configuration compute in."""
+    chosen = config.compute_dtype
+    if chosen == "auto":
+        chosen = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+    return jnp.dtype(chosen)
+
+
+class BatchScaling(NamedTuple):
+    """Scaling of the observations of transitions.
+
+    Attributes:
+        observations: Before and after the action; goals, too, unless they have their own.
+        goals: None where they have not.
+    """
+
+    observations: Scaling
+    goals: Scaling | None
+
+
+_OBSERVED = ("before", "goal", "after")  # as `Inputs` has them
+
+Piece = tuple[jax.Array, slice]
+"""Some of an array of prepared observations: the array [B, ...], and which."""
+
+
+class Inputs(NamedTuple):
+    """The observations of B transitions as encoders read them (`Networks.prepare_batch`).
+
+    Attributes:
+        observed: [3 B, ...], those before, the goals, those after.
+        views: [B, ...] images that auxiliary tasks have made, by name.
+    """
+
+    observed: jax.Array
+    views: Mapping[str, jax.Array]
+
+    @property
+    def size(self) -> int:
+        """B."""
+        return self.observed.shape[0] // len(_OBSERVED)
+
+    def pieces(self, *names: str) -> list[Piece]:
+        """Return where observations lie: ``before``, ``goal``, ``after``, or a view, in the order of ``names``."""
+        size, found = self.size, []
+        for name in names:
+            if name in self.views:
+                found.append((self.views[name], slice(0, size)))
+                continue
+            start = _OBSERVED.index(name) * size
+            if found and found[-1][0] is self.observed and found[-1][1].stop == start:  # neighbours are one piece
+                start = found.pop()[1].start
+            found.append((self.observed, slice(start, (_OBSERVED.index(name) + 1) * size)))
+        return found
+
+
+class _Head(nn.Module):
+    """Inputs as of `_Dense` -> [B, outputs] float32."""
+
+    hidden_sizes: Sequence[int]
+    outputs: int
+    output_bias: float
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, *inputs: jax.Array) -> jax.Array:
+        for layer, size in enumerate(self.hidden_sizes):
+            inputs = (nn.relu(_Dense(size, self.dtype, name=f"hidden_{layer}")(*inputs)),)
+        # The last layer stays in float32: near Q = -50 neighbouring bfloat16 numbers lie 0.25 apart.
+        bias = nn.initializers.constant(self.output_bias)
+        return _Dense(self.outputs, jnp.float32, bias, name="output")(*inputs)
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """Pure functions of parameters, for one task and one configuration.
+
+    Attributes:
+        init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
+        prepare: (scaling, observations [B, ...], possibly how to shift them) -> inputs: what encoders read; made once for all
+            four networks.
+        encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
+        act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
+        value: (critic, latents [2, B, latent], action [B, A]) -> [B] float32.
+    """
+
+    config: Config
+    observation_spec: jax.ShapeDtypeStruct
+    action_size: int
+    critic_output_bias: float
+
+    def __post_init__(self) -> None:
+        """Checks the image's size, and whether it can be moved as far as it is to be.
+
+        Raises:
+            RequestError: The image is smaller than one block of the encoder, or could be moved out of sight; or there is no
+                image to be moved.
+        """
+        shift = self.config.random_shift
+        if shift and not self.sees_images:
+            raise RequestError(f"random_shift {shift} moves images, and {self.config.env} observes states: leave it out")
+        if self.sees_images:
+            *_, height, width = self.observation_spec.shape
+            least = 2**self._levels
+            if min(height, width) < least:
+                raise RequestError(
+                    f"image_size {min(height, width)} is too small for {self._levels} encoder layers, which need at least "
+                    f"{least}: raise --image-size or shorten --encoder-filters"
+                )
+            if shift >= min(height, width):
+                raise RequestError(
+                    f"random_shift {shift} could move images of {min(height, width)} pixels out of sight: take a few pixels, "
+                    "such as --random-shift 2"
+                )
+
+    @property
+    def sees_images(self) -> bool:
+        """True if observations are planar images rather than state vectors."""
+        return len(self.observation_spec.shape) == 3
+
+    @property
+    def uses_kernel(self) -> bool:
+        """True if the first layers are those of `kernels.encoder`, one kernel on a GPU, instead of one product each."""
+        return (
+            self.sees_images
+            and self.dtype == jnp.bfloat16
+            and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
+            and encoder_kernel.is_available()
+        )
+
+    @property
+    def _levels(self) -> int:
+        return len(self.config.encoder_filters)
+
+    @property
+    def dtype(self) -> Any:
+        """The dtype that the networks compute in."""
+        return compute_dtype(self.config)
+
+    @property
+    def _encoder(self) -> Any:
+        return _Encoder(self.config.encoder_filters, self.config.latent_size, self.dtype)
+
+    def _head(self, outputs: int, output_bias: float) -> Any:
+        return _Head(self.config.hidden_sizes, outputs, output_bias, self.dtype)
+
+    @property
+    def _latent_size(self) -> int:
+        return self.config.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
+
+    def _init(self, key: jax.Array, head: _Head, head_inputs: int, has_encoder: bool = True) -> Params:
+        encoder_key, head_key = jax.random.split(key)
+        params = {"head": head.init(head_key, jnp.zeros((1, head_inputs)))["params"]}
+        if self.sees_images and has_encoder:
+            params["encoder"] = self.init_encoder(encoder_key)
+        return params
+
+    def init_encoder(self, key: jax.Array) -> Params:
+        """Fresh parameters of an encoder of images, for ``{"encoder": ...}``."""
+        blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
+        return self._encoder.init(key, blocks)["params"]
+
+    def init_actor(self, key: jax.Array) -> Params:
+        """Fresh actor parameters: without an encoder where it shares the critic's."""
+        has_encoder = self.config.encoders == "separate"
+        return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size, has_encoder=has_encoder)
+
+    def init_critic(self, key: jax.Array) -> Params:
+        """Fresh critic parameters."""
+        return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
+
+    def init_target(self, online: Params) -> Params:
+        """A copy of online parameters for a target network to start with: the head alone where targets have no encoders."""
+        kept = online if self.config.target_encoder else {"head": online["head"]}
+        return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
+
+    def with_encoder(self, params: Params, other: Params) -> Params:
+        """``params`` with the encoder of ``other``, unless they have their own or nobody needs one."""
+        if "encoder" in params or "encoder" not in other:
+            return params
+        return {**params, "encoder": other["encoder"]}
+
+    def compute_copy(self, params: Params) -> Params:
+        """The large kernels in the dtype that the networks compute in; None for all parameters that stay as they are.
+
+        With `with_compute_copy`, a learner that makes this copy where it changes the parameters saves the networks a conversion
+        at every use.
+        """
+
+        def copy(path: Any, leaf: jax.Array) -> jax.Array | None:
+            stays = leaf.ndim < 2 or leaf.dtype == self.dtype or any(entry.key == "output" for entry in path)
+            return None if stays else leaf.astype(self.dtype)
+
+        return jax.tree_util.tree_map_with_path(copy, params)
+
+    def with_compute_copy(self, params: Params, copy: Params) -> Params:
+        """Parameters that are computed with: the copy where there is one. Every function here takes them like the originals."""
+        return jax.tree.map(
+            lambda converted, leaf: leaf if converted is None else converted, copy, params, is_leaf=lambda leaf: leaf is None
+        )
+
+    def scaling(self, statistics: NormalizerState) -> Scaling:
+        """Return the scaling that `prepare` and `normalize` take."""
+        return Scaling(statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
+
+    def batch_scaling(self, statistics: Statistics) -> BatchScaling:
+        """Return the scaling that `prepare_batch` takes. It stays the same for all gradient steps of an iteration."""
+        of_goals = None if statistics.own_goals is None else self.scaling(statistics.own_goals)
+        return BatchScaling(self.scaling(statistics.observations), of_goals)
+
+    def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
+        """`prepare` of all observations of B transitions."""
+        of_observations, of_goals = scaling
+        views = {name: self.prepare(of_observations, images, batch.shift) for name, images in batch.views.items()}
+        if of_goals is None:  # together, and while they are bytes
+            count, size, *shape = batch.observations.shape
+            shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
+            together = self.prepare(of_observations, batch.observations.reshape(count * size, *shape), shift)
+            return Inputs(together, views)
+        each_scaling = (of_observations, of_goals, of_observations)
+        pieces = [self.prepare(each, rows, batch.shift) for each, rows in zip(each_scaling, batch.observations, strict=True)]
+        return Inputs(jnp.concatenate(pieces), views)
+
+    def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
+        """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
+
+        Images may be moved by ``shift`` [B, 2] int32, as of `Batch`. They are normalised first: what moves in is the mean.
+        """
+        mean, scale = scaling
+        if not self.sees_images:
+            return self._normalized(observations, mean, scale)
+        if self.uses_kernel:
+            limit = self.config.normalizer_clip
+            return encoder_kernel.prepare(observations, mean, scale, self._levels, limit, self.dtype, shift)
+        if shift is not None:
+            return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
+        return self._normalized(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
+
+    def normalize(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
+        """As `prepare`, with the observations in their own order: [B, ...] in the dtype that the networks compute in."""
+        normalized = self._normalized(observations, *scaling)
+        return normalized if shift is None else shifted(normalized, shift)
+
+    def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
+        limit = self.config.normalizer_clip
+        return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
+
+    def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
+        """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""
+        return self.encode_pieces(params, [(inputs, which)])
+
+    def encode_pieces(self, params: Params, pieces: Sequence[Piece]) -> jax.Array:
+        """Latents of some of several arrays of prepared observations, one after the other: [B, latent]."""
+        if not self.sees_images:
+            return jnp.concatenate([inputs[which] for inputs, which in pieces])
+        if not self.uses_kernel:
+            return self._encoder.apply({"params": params["encoder"]}, *(inputs[which] for inputs, which in pieces))
+        channels = self.observation_spec.shape[0]
+        weights = encoder_kernel.make_weights(params["encoder"], channels)
+        found = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
+        finer = 4 ** (self._levels - encoder_kernel.LEVELS)
+        blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in found]
+        return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
+
+    def act(self, actor: Params, latents: jax.Array) -> jax.Array:
+        """Actions [B, A] float32 in (-1, 1) for latents [2, B, latent] of observations and goals."""
+        return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
+
+    def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
+        """Values [B] float32 of actions [B, A] for latents [2, B, latent] of observations and goals."""
+        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, latents, action)[..., 0]

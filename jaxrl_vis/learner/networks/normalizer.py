@@ -1,0 +1,62 @@
+"""Running mean and deviation of observations, per pixel and channel, merged batch by batch (Chan et al., 1979).
+
+A camera that stands still sees mostly things that never change: subtracting the mean image leaves what moves.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.types import NormalizerState
+
+
+class Scaling(NamedTuple):
+    """Mean and scale that observations are normalised with.
+
+    Attributes:
+        mean: [...] float32, in the observation's unit.
+        scale: [...] float32, 1 / standard deviation.
+    """
+
+    mean: jax.Array
+    scale: jax.Array
+
+
+def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
+    """Statistics of no observations of this shape."""
+    zeros = jnp.zeros(observation_spec.shape, jnp.float32)
+    return NormalizerState(count=jnp.zeros((), jnp.float32), mean=zeros, sum_of_squares=zeros)
+
+
+def update(
+    state: NormalizerState, observations: jax.Array, axes: tuple[int, ...] = (0, 1), shards: Shards = ONE
+) -> NormalizerState:
+    """Merges the statistics of ``observations`` [E, T+2, ...] into the running ones.
+
+    Args:
+        state: Statistics so far.
+        observations: In their own dtype, with leading axes to reduce.
+        axes: The leading axes.
+        shards: Shards of the learner; ``observations`` are those of one shard.
+    """
+    count = jnp.float32(shards.count)
+    for axis in axes:
+        count = count * observations.shape[axis]
+    # Deviations are taken from the running mean, not from zero: close to it they are small, and squares keep their digits.
+    centred = observations.astype(jnp.float32) - state.mean
+    shift = shards.mean(jnp.mean(centred, axis=axes))
+    batch_squares = shards.total(jnp.sum(jnp.square(centred), axis=axes)) - count * jnp.square(shift)
+    total = state.count + count
+    return NormalizerState(
+        count=total,
+        mean=state.mean + shift * (count / total),
+        sum_of_squares=state.sum_of_squares + jnp.maximum(batch_squares, 0.0) + jnp.square(shift) * state.count * count / total,
+    )
+
+
+def scale(state: NormalizerState, floor: float) -> jax.Array:
+    """1 / standard deviation [...] float32, the deviation being at least ``floor``."""
+    variance = state.sum_of_squares / jnp.maximum(state.count, 1.0)
+    return 1.0 / jnp.maximum(jnp.sqrt(variance), floor)

@@ -1,0 +1,1 @@
+"""Several devices: placement of seeds and shards, and what shards tell each other."""

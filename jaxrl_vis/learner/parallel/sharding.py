@@ -1,0 +1,220 @@
+"""Several devices: a mesh with an axis for seeds and one for the data of each learner.
+
+    seed    learners lie on different devices, side by side, and never communicate
+    data    the devices share one learner: each plays its part of the environments, keeps these episodes in its part of the
+            replay, and takes its part of every batch from there; gradients, statistics and metrics are averaged
+
+Every device runs the whole training iteration on its own part (`jax.shard_map`), so what is communicated is what this module
+averages, and nothing else. Random numbers are drawn for the whole learner, and each device takes its part of them: environment
+number 7 starts and explores alike on however many devices. Batches differ in one respect from those of a single device: part d
+of a batch is drawn from the episodes of the environments of device d, so each environment group contributes equally to it.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as Spec
+
+from jaxrl_vis.config import Config, data_devices_of
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.parallel.shards import DATA, ONE, Shards
+from jaxrl_vis.types import LoopState, ReplayState
+
+SEED = "seed"
+"""Name of the other axis of the mesh."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Placement of the seeds of a run, and of the shards of each learner, on devices; make it with `make_layout`.
+
+    Between two iterations, the replay of a learner that is divided is an array [S, rollouts, E, ...] in place of
+    [S, rollouts * E, ...]: the same bytes, so that a run may go on with another number of devices.
+
+    Attributes:
+        mesh: The devices, with the axes `SEED` and `DATA`; None: JAX's first device, and plain arrays.
+        shards: The parts of each learner.
+    """
+
+    mesh: Mesh | None = None
+    shards: Shards = ONE
+
+    @property
+    def num_devices(self) -> int:
+        """Devices that are used."""
+        return 1 if self.mesh is None else self.mesh.size
+
+    @property
+    def name(self) -> str:
+        """For people, such as ``2 x NVIDIA H200``."""
+        kind = jax.devices()[0].device_kind
+        if self.mesh is None:
+            return kind
+        shared = f", each learner on {self.shards.count} of them" if self.shards.count > 1 else ""
+        return f"{self.num_devices} x {kind}{shared}"
+
+    @property
+    def devices(self) -> list[Any]:
+        """Those of them that belong to this process."""
+        return jax.devices()[:1] if self.mesh is None else list(self.mesh.local_devices)
+
+    @property
+    def by_seed(self) -> Spec:
+        """[S, ...]: each seed on its devices."""
+        return Spec(SEED)
+
+    @property
+    def by_environment(self) -> Spec:
+        """[S, E, ...]: each environment on its device."""
+        return Spec(SEED, DATA)
+
+    @property
+    def read_by_host(self) -> Spec:
+        """[S, ...], where the host is to read it: where seeds lie on devices of other processes, all devices get all of it."""
+        return Spec() if jax.process_count() > 1 else Spec(SEED)
+
+    @property
+    def everywhere(self) -> Spec:
+        """The same on all devices."""
+        return Spec()
+
+    @property
+    def replay(self) -> Any:
+        """Specs of a `ReplayState`."""
+        episodes = Spec(SEED) if self.shards.count == 1 else Spec(SEED, None, DATA)
+        return ReplayState(episodes=episodes, size=Spec(SEED))  # type: ignore[arg-type]
+
+    @property
+    def loop(self) -> Any:
+        """Specs of a `LoopState`."""
+        return LoopState(train=Spec(SEED), replay=self.replay, key=Spec(SEED), iteration=Spec())  # type: ignore[arg-type]
+
+    def shardings(self, specs: Any) -> Any:
+        """A tree of partition specs as shardings that `jax.jit` and `jax.device_put` take; None on one device."""
+        if self.mesh is None:
+            return None
+        place = functools.partial(NamedSharding, self.mesh)
+        return jax.tree.map(place, specs, is_leaf=lambda leaf: isinstance(leaf, Spec))
+
+    def spread(
+        self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, kept_as: Any = None, **options: Any
+    ) -> Any:
+        """Compiles a function of one device's part so that it runs on all devices.
+
+        Args:
+            function: Function of one device's parts of its arguments.
+            in_specs: A partition spec, or a tree of them, for each argument.
+            out_specs: The same for what it returns.
+            jit: Such as `jax.jit`.
+            kept_as: Partition specs of what is returned in the end; None: ``out_specs``.
+            **options: Of ``jit``.
+        """
+        if self.mesh is None:
+            return jit(function, **options)
+        # Kernels and custom rules do not say along which axes their results vary, so JAX cannot check it.
+        mapped = jax.shard_map(function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+        shardings = {"in_shardings": self.shardings(in_specs), "out_shardings": self.shardings(kept_as or out_specs)}
+        return jit(mapped, **shardings, **options)
+
+    def with_shardings(self, shapes: Any, specs: Any) -> Any:
+        """Shapes (as of `jax.eval_shape`) that also say where their arrays lie.
+
+        Args:
+            shapes: A pytree.
+            specs: Partition specs: a tree of which each leaf stands for a part of ``shapes``.
+        """
+        if self.mesh is None:
+            return shapes
+
+        def placed(sharding: NamedSharding, part: Any) -> Any:
+            return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), part)
+
+        return jax.tree.map(placed, self.shardings(specs), shapes)
+
+    def put(self, tree: Any, specs: Any) -> Any:
+        """Moves arrays to where they belong; a leaf of ``specs`` stands for a part of ``tree``."""
+        if self.mesh is None:
+            return tree
+
+        def placed(sharding: NamedSharding, part: Any) -> Any:
+            return jax.tree.map(lambda leaf: put_array(leaf, sharding), part)
+
+        return jax.tree.map(placed, self.shardings(specs), tree)
+
+    def folded(self, replay: ReplayState, num_envs: int) -> ReplayState:
+        """Return one device's part of a learner's replay as it is between two iterations.
+
+        Args:
+            replay: Replay of one learner, [rollouts * E, ...].
+            num_envs: E, environments in this part.
+        """
+        count = self.shards.count
+        if count == 1:
+            return replay
+        episodes = jax.tree.map(lambda leaf: leaf.reshape(-1, num_envs, *leaf.shape[1:]), replay.episodes)
+        return ReplayState(episodes=episodes, size=replay.size * count)
+
+    def unfolded(self, replay: ReplayState) -> ReplayState:
+        """Undo `folded`."""
+        count = self.shards.count
+        if count == 1:
+            return replay
+        episodes = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), replay.episodes)
+        return ReplayState(episodes=episodes, size=replay.size // count)
+
+
+def put_array(array: Any, sharding: Any) -> jax.Array:
+    """Moves an array to where it belongs, which may be devices of several processes: all call this with the same array."""
+    if sharding.is_fully_addressable or getattr(array, "sharding", None) == sharding:
+        return jax.device_put(array, sharding)
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        words = put_array(np.asarray(jax.random.key_data(array)), sharding)
+        return jax.jit(jax.random.wrap_key_data, out_shardings=sharding)(words)
+    host = np.asarray(array)
+    return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
+
+
+ONE_DEVICE = Layout()
+"""Everything on JAX's first device."""
+
+
+def _avoid_shardy() -> None:
+    """Lets XLA partition programs by GSPMD where Shardy would end the process.
+
+    In jaxlib 0.11 a pass of Shardy reads past the end of a list, and so dies of a segmentation fault, where constants that a
+    `jax.shard_map` closes over turn out to be unused (`ManualComputationUnusedInputsPattern`); physics models are full of them.
+    """
+    if jax.__version_info__ >= (0, 11):
+        jax.config.update("jax_use_shardy_partitioner", False)
+
+
+def make_layout(config: Config) -> Layout:
+    """Place the seeds of a run, and the shards of each learner, on devices.
+
+    Args:
+        config: The run; its ``devices`` and ``data_devices``.
+
+    Raises:
+        RequestError: There are not so many devices.
+    """
+    if config.devices == 1 and jax.process_count() == 1:
+        return ONE_DEVICE
+    there = jax.devices()
+    if config.devices > len(there):
+        what = "there is 1" if len(there) == 1 else f"there are {len(there)}"
+        raise RequestError(f"devices {config.devices} asks for more than {what} ({there[0].device_kind}): write --devices all")
+    if jax.process_count() > 1 and config.devices < len(there):
+        raise RequestError(
+            f"devices {config.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes without "
+            "work: write --devices all, or start fewer processes"
+        )
+    _avoid_shardy()
+    along_data = data_devices_of(config)
+    devices = np.asarray(there[: config.devices], dtype=object).reshape(-1, along_data)
+    return Layout(Mesh(devices, (SEED, DATA)), Shards(along_data))

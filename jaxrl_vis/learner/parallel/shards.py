@@ -1,0 +1,77 @@
+"""The parts that one learner is divided into, seen from within one of them: what is averaged, and what is whose.
+
+Every function here is called in a mapped axis (of `jax.shard_map` or `jax.vmap`) called `DATA`, unless there is one part only:
+then each returns what it is given, and nothing of it is left in the program.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.flatten_util import ravel_pytree
+
+DATA = "data"
+"""Name of the axis."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shards:
+    """The parts of one learner.
+
+    Attributes:
+        count: Number of shards.
+    """
+
+    count: int = 1
+
+    def mean(self, tree: Any) -> Any:
+        """The mean of a pytree of float32 arrays over the parts, by one all-reduce of one flat buffer."""
+        if self.count == 1:
+            return tree
+        flat, restore = ravel_pytree(tree)
+        return restore(jax.lax.pmean(flat, DATA))
+
+    def total(self, array: jax.Array) -> jax.Array:
+        """The sum over the parts."""
+        return array if self.count == 1 else jax.lax.psum(array, DATA)
+
+    def whole(self, mean: jax.Array) -> jax.Array:
+        """The whole learner's mean, of this part's; its gradient is this part's alone, so that `mean` makes that whole, too."""
+        return mean if self.count == 1 else mean + jax.lax.stop_gradient(self.mean(mean) - mean)
+
+    def part(self, array: jax.Array) -> jax.Array:
+        """This part of what the whole learner has, along the first axis."""
+        if self.count == 1:
+            return array
+        size = array.shape[0] // self.count
+        return jax.lax.dynamic_slice_in_dim(array, jax.lax.axis_index(DATA) * size, size)
+
+    def draw(self, draw: Callable[[tuple[int, ...]], jax.Array], shape: tuple[int, ...]) -> jax.Array:
+        """Random numbers of ``shape`` for this part: its part of those that the whole learner draws.
+
+        Args:
+            draw: shape -> random numbers, with a key that all parts share.
+            shape: Shape of this part; the first axis is the one that is divided.
+        """
+        return self.part(draw((shape[0] * self.count, *shape[1:])))
+
+    def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+        """Standard normal numbers for this part's images, of ``shape``; the same ones however a learner is divided."""
+        return self.draw(lambda whole: jax.random.normal(key, whole), shape)
+
+    def split(self, key: jax.Array, count: int) -> jax.Array:
+        """Return a key for each of the ``count`` environments of this part."""
+        return self.part(jax.random.split(key, count * self.count))
+
+    def gather(self, array: jax.Array, axis: int = 0) -> jax.Array:
+        """All parts of an array, one after the other along ``axis``."""
+        return array if self.count == 1 else jax.lax.all_gather(array, DATA, axis=axis, tiled=True)
+
+    def own_key(self, key: jax.Array) -> jax.Array:
+        """A key for what each part draws by itself."""
+        return key if self.count == 1 else jax.random.fold_in(key, jax.lax.axis_index(DATA))
+
+
+ONE = Shards()
+"""A learner that is not divided."""

@@ -1,0 +1,102 @@
+"""Weightings without a memory: their weights are given, or follow from the gradients of the step itself."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.learner.weighting.base import (
+    MAIN,
+    Losses,
+    Weighting,
+    WeightingState,
+    Weights,
+    auxiliary_names,
+    checked,
+    report,
+    start,
+)
+from jaxrl_vis.types import Metrics, Params
+
+
+def none() -> Weighting:
+    """The main loss alone, as it is (thesis 5.2.3.3, "No Auxiliary Losses")."""
+    return _constant("none", 0.0, auxiliary=False)
+
+
+def none_log(main_eps: float = 1e-8) -> Weighting:
+    """The logarithm of the main loss alone: what the logarithm does without auxiliary losses."""
+    return _constant("none_log", 0.0, auxiliary=False, log=True, main_eps=main_eps)
+
+
+def plain_sum() -> Weighting:
+    """All losses as they are, added up."""
+    return _constant("sum", 1.0)
+
+
+def balance(eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
+    """The logarithms of all losses, added up (thesis 5.2.3.3, "Gradient Balancing")."""
+    return _constant("balance", 1.0, log=True, eps=eps, main_eps=main_eps)
+
+
+def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
+    """Weights that are chosen by hand and stay.
+
+    Args:
+        weights: One number for all auxiliary losses, or a number for each by its name.
+        log: True if logarithms of the losses are learned.
+        eps, main_eps: See `Weighting`.
+
+    Raises:
+        RequestError: A weight is not finite; from ``init``: there is none for a loss, or no loss for a weight.
+    """
+    for weight in weights.values() if isinstance(weights, Mapping) else [weights]:
+        if not math.isfinite(weight):
+            raise RequestError(f"a fixed weight must be a finite number, not {weight}")
+    return _constant("fixed", weights, log=log, eps=eps, main_eps=main_eps)
+
+
+def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
+    """Each auxiliary loss counts once where its gradient does not point against the main one, else not at all.
+
+    Weight 1 where the cosine of the two gradients is at least 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine Similarity"). Only
+    the sign matters, so no norm is needed, and logarithms do not change the weights.
+
+    Args:
+        log: True if logarithms of the losses are learned.
+        eps, main_eps: See `Weighting`.
+    """
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        others = auxiliary_names("cosine", names)
+        return start(others, dict.fromkeys(others, 1.0))
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
+        slopes = weighting.slopes(losses)
+        dots = {name: slopes[MAIN] * slopes[name] * statistics[name] for name in state.weights if name != MAIN}
+        one = state.weights[MAIN]
+        # The sign is that of the dot itself: slopes are positive, but might make a small one vanish.
+        weights = {MAIN: one} | {name: jnp.where(statistics[name] >= 0.0, one, 0.0 * one) for name in dots}
+        return weights, state.replace(weights=weights, updates=state.updates + 1), report(weights, dots)
+
+    weighting = checked(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps))
+    return weighting
+
+
+def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool = True, **more: Any) -> Weighting:
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        others = auxiliary_names(name, names, needed=auxiliary)
+        if not isinstance(weights, Mapping):
+            return start(others, dict.fromkeys(others, weights))
+        for wrong in sorted(set(weights) - set(others)):
+            raise RequestError(f"there is no auxiliary loss {wrong!r} to weight{nearest(wrong, others)}")
+        for missing in sorted(set(others) - set(weights)):
+            raise RequestError(f"there is no weight for loss {missing!r}; give one, or one number for all losses")
+        return start(others, weights)
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
+        return state.weights, state.replace(updates=state.updates + 1), report(state.weights) if auxiliary else {}
+
+    return checked(Weighting(name, init, update, auxiliary=auxiliary, **more))

@@ -1,0 +1,181 @@
+"""Variants of OL-AUX that need whole gradients: the rule of the authors' release, and the ablation of figure 5.7.
+
+They keep gradients, or parameters, in their state, and take as many passes through the shared parameters as there are losses.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.learner.weighting.base import (
+    MAIN,
+    Losses,
+    Weighting,
+    WeightingState,
+    Weights,
+    auxiliary_names,
+    checked,
+    dot,
+    report,
+    scaled,
+    start,
+    weighted_sum,
+)
+from jaxrl_vis.learner.weighting.ol_aux import check_count, check_state, make_rule
+from jaxrl_vis.types import Metrics, Params
+
+MainGradient = Literal["main", "total"]
+
+
+def ol_aux_window(
+    interval: int = 5,
+    learning_rate: float = 1e-3,
+    beta: float | None = None,
+    log: bool = True,
+    eps: float = 0.02,
+    main_eps: float = 1e-8,
+    main_grad: MainGradient = "main",
+    window: int = 1,
+    minimum: float | None = 0.0,
+    multiplicative: bool = False,
+) -> Weighting:
+    """OL-AUX-N as in the authors' release, by gradients that are averaged over the latest updates before they are compared.
+
+    Args:
+        interval, learning_rate, beta, log, eps, main_eps, minimum: As of `ol_aux.ol_aux`.
+        main_grad: main, the gradient of the main loss (thesis), or total, that of everything that is learned, which adds
+            w_i |g_i|^2 to each dot (release).
+        window: Latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
+        multiplicative: Compare w_i g_i in the place of g_i, as the authors' quadratic example does.
+
+    Raises:
+        RequestError: An argument makes no sense; from ``init``: ``shared`` is not given; from ``update``: the state is another
+            weighting's.
+    """
+    label = "ol_aux"
+    check_count(label, "window", window)
+    _check_main_grad(label, main_grad)
+    move = make_rule(label, interval, learning_rate, beta, minimum, multiplicative)
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        others = _names(label, names, shared)
+        sums = {name: jnp.zeros(()) for name in others}
+        return start(others, dict.fromkeys(others, 1.0), sums=sums, window=_zeros((MAIN, *others), shared, window))
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
+        check_state(label, state)
+        latest = _learned(weighting, losses, statistics)
+        latest[MAIN] = _direction(main_grad, latest, state.weights)
+        kept = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
+        count = jnp.minimum(state.updates + 1, window)  # the window begins with zeros
+        mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, kept)
+        dots = {name: dot(mean[MAIN], mean[name]) for name in state.sums}
+        sums = jax.tree.map(jnp.add, state.sums, dots)
+        after = move(state, scaled(sums, 1.0 / interval), sums, window=kept)
+        return state.weights, after, report(state.weights, dots)
+
+    weighting = checked(
+        Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, interval=interval)
+    )
+    return weighting
+
+
+def ol_aux_ablation(
+    interval: int = 5,
+    learning_rate: float = 1e-3,
+    beta: float | None = None,
+    log: bool = True,
+    eps: float = 0.02,
+    main_eps: float = 1e-8,
+    main_grad: MainGradient = "main",
+    window: int = 1,
+    minimum: float | None = 0.0,
+) -> Weighting:
+    """OL-AUX-N (Ablation) of figure 5.7: the one-step rule, every N updates, on as much data as OL-AUX-N reads in them.
+
+    Gradients and losses of N minibatches, all of them taken at the parameters that the interval began with, are averaged as if
+    they were one minibatch of N times the size, and compared once. So the weights follow what helps within one step, from
+    gradients that are as smooth as those of OL-AUX-N.
+
+    Args:
+        interval: N.
+        learning_rate, beta, log, eps, main_eps, minimum: As of `ol_aux.ol_aux`.
+        main_grad: As of `ol_aux_window`.
+        window: 1; gradients are averaged over the interval already.
+
+    Raises:
+        RequestError: An argument makes no sense; from ``init``: ``shared`` or ``params`` is not given.
+    """
+    label = "ol_aux_ablation"
+    check_count(label, "window", window)
+    if window > 1:
+        raise RequestError(f"weighting {label} averages gradients over its interval already; leave window at 1")
+    _check_main_grad(label, main_grad)
+    move = make_rule(label, interval, learning_rate, beta, minimum)
+
+    def init(names: Iterable[str], shared: Params = None, params: Params = None) -> WeightingState:
+        others = _names(label, names, shared)
+        if params is None:
+            raise RequestError(f"weighting {label} keeps parameters: give init all of them, too")
+        sums = {name: jnp.zeros(()) for name in (MAIN, *others)}
+        sums = {"losses": sums, "gradients": _zeros((MAIN, *others), shared)}
+        held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), params)
+        return start(others, dict.fromkeys(others, 1.0), sums=sums, params=held)
+
+    def hold(params: Params, state: WeightingState) -> WeightingState:
+        is_new = state.updates % interval == 0
+        return state.replace(
+            params=jax.tree.map(lambda new, old: jnp.where(is_new, new.astype(old.dtype), old), params, state.params)
+        )
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
+        check_state(label, state)
+        sums = jax.tree.map(jnp.add, state.sums, {"losses": dict(losses), "gradients": dict(statistics)})
+        # As of one large minibatch.
+        mean = scaled(sums, 1.0 / (state.updates % interval + 1))
+        gradients = _learned(weighting, mean["losses"], mean["gradients"])
+        direction = _direction(main_grad, gradients, state.weights)
+        dots = {name: dot(direction, gradient) for name, gradient in gradients.items() if name != MAIN}
+        return state.weights, move(state, dots, sums, params=state.params), report(state.weights, dots)
+
+    weighting = checked(
+        Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, interval=interval, hold=hold)
+    )
+    return weighting
+
+
+def _check_main_grad(label: str, main_grad: str) -> None:
+    if main_grad not in get_args(MainGradient):
+        raise RequestError(
+            f"main_grad of weighting {label} cannot be {main_grad!r}{nearest(main_grad, get_args(MainGradient))}"
+        )
+
+
+def _names(label: str, names: Iterable[str], shared: Params) -> tuple[str, ...]:
+    """Names of the auxiliary losses."""
+    others = auxiliary_names(label, names)
+    if shared is None:
+        raise RequestError(f"weighting {label} keeps gradients: give init the shared parameters, too")
+    return others
+
+
+def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
+    """Gradients of the losses as those of what is learned."""
+    return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
+
+
+def _direction(main_grad: MainGradient, gradients: Mapping[str, Params], weights: Weights) -> Params:
+    """The gradient that the others are compared with, from gradients of what is learned."""
+    return gradients[MAIN] if main_grad == "main" else weighted_sum(gradients, weights)
+
+
+def _zeros(names: Iterable[str], shared: Params, *leading: int) -> dict[str, Params]:
+    """A tree of zeros for each name, at least float32."""
+
+    def zeros(leaf: Any) -> jax.Array:
+        return jnp.zeros((*leading, *leaf.shape), jnp.promote_types(leaf.dtype, jnp.float32))
+
+    return {name: jax.tree.map(zeros, shared) for name in names}

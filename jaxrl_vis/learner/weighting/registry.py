@@ -1,0 +1,51 @@
+"""All weightings by name. A new one is a function that makes it, and a row here."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.learner.weighting.base import Weighting
+from jaxrl_vis.learner.weighting.constant import balance, cosine, fixed, none, none_log, plain_sum
+from jaxrl_vis.learner.weighting.ol_aux import ol_aux
+from jaxrl_vis.learner.weighting.ol_aux_variants import ol_aux_ablation, ol_aux_window
+
+WEIGHTINGS: dict[str, Callable[..., Weighting]] = {
+    "none": none,
+    "none_log": none_log,
+    "sum": plain_sum,
+    "fixed": fixed,
+    "balance": balance,
+    "cosine": cosine,
+    "ol_aux": ol_aux,
+    "ol_aux_ablation": ol_aux_ablation,
+}
+# Slower functions for options that the first ones lack.
+_VARIANTS: dict[str, Callable[..., Weighting]] = {"ol_aux": ol_aux_window}
+
+
+def make_weighting(name: str, **options: Any) -> Weighting:
+    """A weighting by its name.
+
+    Args:
+        name: One of `WEIGHTINGS`.
+        options: Arguments of the function that makes it.
+
+    Raises:
+        RequestError: There is no such weighting, it has no such option, or the option's value makes no sense.
+    """
+    if name not in WEIGHTINGS:
+        raise RequestError(f"unknown weighting {name!r}{nearest(name, WEIGHTINGS)}")
+    maker = WEIGHTINGS[name]
+    if not set(options) <= set(_parameters(maker)):
+        maker = _VARIANTS.get(name, maker)
+    allowed = _parameters(maker)
+    for option in options:
+        if option not in allowed:
+            mend = nearest(option, allowed) if allowed else "; it has none"
+            raise RequestError(f"weighting {name} has no option {option!r}{mend}")
+    return maker(**options)
+
+
+def _parameters(maker: Callable[..., Weighting]) -> tuple[str, ...]:
+    return tuple(inspect.signature(maker).parameters)

@@ -1,0 +1,93 @@
+"""Parts of a run that are named: built-in ones by a word, a person's own as ``module:Name``. Imports no JAX by itself.
+
+Algorithms, reward methods, auxiliary losses and weightings are named so, as tasks are (`jaxrl_vis_envs.task_modules`). A module
+is imported from ``Config.env_folder``, or else the current folder, or else as Python finds it.
+"""
+
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any, TypeVar
+
+from jaxrl_vis import fields
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis_envs import task_modules
+
+T = TypeVar("T")
+
+
+def own_names(config: Config) -> dict[str, str]:
+    """Return the names of a configuration that are ``module:Name``, by what they name: task, algorithm, aux_tasks 1, ..."""
+    names = {"task": config.env}
+    for field, hint in fields.hints(Config).items():
+        if not fields.names_parts(hint):
+            continue
+        value = getattr(config, field)
+        names |= (
+            {f"{field} {number}": name for number, name in enumerate(value, 1)} if isinstance(value, tuple) else {field: value}
+        )
+    return {kind: name for kind, name in names.items() if task_modules.is_own(name)}
+
+
+def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None) -> T | Any:
+    """Return a part by its name; one of ``module:Name`` is imported.
+
+    Args:
+        kind: Kind of the part, for messages.
+        name: A key of ``known``, or ``module:Name``.
+        known: Built-in parts by name.
+        folder: Folder from which modules are imported first.
+
+    Raises:
+        RequestError: There is no such part, or its module cannot be imported.
+    """
+    if not task_modules.is_own(name):
+        if name not in known:
+            raise RequestError(f"unknown {kind} {name!r}{nearest(name, known)}")
+        return known[name]
+    module, attribute = load(name, folder)
+    if not hasattr(module, attribute):
+        names = [public for public in vars(module) if not public.startswith("_")]
+        raise RequestError(f"{module.__name__} has no {attribute}{nearest(attribute, names)}")
+    return getattr(module, attribute)
+
+
+def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
+    """Import the module of ``module:Name``, and return it with the second half of the name.
+
+    Raises:
+        RequestError: It is not written so, or cannot be imported.
+    """
+    try:
+        module, attribute = task_modules.split(name)
+        return task_modules.load(module, folder), attribute
+    except ValueError as error:
+        raise RequestError(str(error)) from error
+
+
+def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
+    """Return what somebody's function makes, and check what it is.
+
+    Args:
+        kind, name: As of `find`, for messages.
+        maker: The function, or the part itself.
+        arguments: Arguments of the function.
+        of: Class of the part.
+
+    Raises:
+        RequestError: It fails, or makes something else.
+    """
+    if isinstance(maker, of):
+        return maker
+    if not callable(maker):
+        raise RequestError(f"{name} is no {kind}: it must be a function that returns a {of.__name__}, not {maker!r}")
+    try:
+        made = maker(*arguments)
+    except RequestError:
+        raise
+    except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
+        file = getattr(getattr(maker, "__code__", None), "co_filename", None)
+        raise RequestError(f"{kind} {name} cannot be made: {task_modules.blame(error, file)}") from error
+    if not isinstance(made, of):
+        raise RequestError(f"{name} is no {kind}: it returned a {type(made).__name__}, not a {of.__name__}")
+    return made

@@ -1,0 +1,184 @@
+"""Memory that a run needs, compared with what a device has before anything is allocated."""
+
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE, Layout
+
+# What stays unclaimed: XLA's workspaces and the allocator's gaps on an accelerator, the program and its libraries on a host.
+_SLACK_BYTES = 256 * 2**20
+
+# Copies of one rollout that live beside the replay: the scan's frames in time-major order, then in the replay's order, and the
+# floats of a part of them on the way through the networks.
+_ROLLOUT_COPIES = 3
+
+# Copies of the parameters and optimiser states: gradients, updates, and what XLA does not write in place.
+_TRAIN_COPIES = 2
+
+# Float32 copies of a batch's images in a gradient step, hidden layers included; measured with XLA's memory_analysis (preset
+# cpu, one and three seeds). On an accelerator, `check_compiled` asks again with the compiler's own figures.
+_BATCH_COPIES = 30
+
+
+def tree_bytes(shapes: Any) -> int:
+    """Bytes of all arrays (or their shapes) in a pytree; typed keys count as their words."""
+
+    def size(leaf: Any) -> int:
+        item = 8 if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
+        return math.prod(leaf.shape) * item
+
+    return sum(size(leaf) for leaf in jax.tree.leaves(shapes))
+
+
+def available_bytes(device: Any = None) -> int | None:
+    """Bytes that a device (the first one) can still give, or, for a CPU, that the host can; None where nobody says."""
+    device = jax.local_devices()[0] if device is None else device
+    if device.platform != "cpu":
+        statistics = device.memory_stats() or {}
+        if "bytes_limit" not in statistics:
+            return None
+        return int(statistics["bytes_limit"] - statistics.get("bytes_in_use", 0))
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return min(int(line.split()[1]) * 1024, _container_bytes())
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _container_bytes() -> int:
+    """Return the bytes that a container's limit (cgroup version 2) leaves; a very large number where there is none."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = (group / "memory.max").read_text(encoding="ascii").strip()
+        used = int((group / "memory.current").read_text(encoding="ascii"))
+        # Cached files count as used, but give way.
+        statistics = dict(line.split() for line in (group / "memory.stat").read_text(encoding="ascii").splitlines())
+        return int(limit) - used + int(statistics.get("inactive_file", 0))
+    except (OSError, ValueError):
+        return 2**62
+
+
+def show_bytes(count: float) -> str:
+    """``1.5 GiB`` and the like: always in GiB, so that any two sizes can be compared at a glance."""
+    gib = count / 2**30
+    return f"{gib:.1f} GiB" if gib >= 0.1 else f"{gib:.3f} GiB" if gib >= 0.001 else "under 0.001 GiB"
+
+
+def _least_available(layout: Layout) -> int | None:
+    """Bytes that each of the run's devices can give; None where one does not say."""
+    if layout.mesh is None:
+        return available_bytes()
+    if layout.devices[0].platform == "cpu":  # the host's memory is that of all of them
+        there = available_bytes()
+        return None if there is None else there // len(layout.devices)
+    found = [available_bytes(device) for device in layout.devices]
+    return None if None in found else min(each for each in found if each is not None)
+
+
+def check_memory(
+    config: Config,
+    loop_shapes: Any,
+    replay_bytes: int,
+    steps_per_iteration: int,
+    layout: Layout = ONE_DEVICE,
+    frame_stack: int = 1,
+) -> str:
+    """Compares what a run needs on a device with what there is.
+
+    Args:
+        config: The run.
+        loop_shapes: The loop state's shapes, all seeds.
+        replay_bytes: Bytes of one seed's replay.
+        steps_per_iteration: Environment steps of one seed in an iteration; the replay's capacity is a multiple of it.
+        layout: Placement of the run.
+        frame_stack: Images that an observation stacks, of which the replay keeps one; rollouts and batches have all.
+
+    Returns:
+        A line for the reader, such as ``replay 0.3 GiB of 22.0 GiB``.
+
+    Raises:
+        RequestError: It does not fit. Says what would.
+    """
+    capacity = math.ceil(config.replay_transitions / steps_per_iteration) * steps_per_iteration
+    parts = layout.shards.count
+    share = parts / layout.num_devices  # of the seeds, on each device
+    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.seeds) * share
+    replay = replay_bytes * config.seeds * share / parts
+    bytes_per_rollout = replay * steps_per_iteration / capacity
+    collected = bytes_per_rollout * frame_stack
+    batch = collected / steps_per_iteration * config.batch_size * 4
+    beside = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
+    there, each = _least_available(layout), "" if layout.num_devices == 1 else " a device"
+    if there is None:
+        return f"replay {show_bytes(replay)}{each}"
+    if replay + beside > there:
+        fitting = int((there - beside) // bytes_per_rollout) * steps_per_iteration
+        if fitting > 0:
+            mend = f"--replay-transitions {fitting} fits"
+        else:
+            mend = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
+        seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
+        raise RequestError(
+            f"a replay of {config.replay_transitions} transitions for {seeds} needs "
+            f"{show_bytes(replay)}{each}, and networks and rollouts {show_bytes(beside)} more; there are "
+            f"{show_bytes(there)}{each}: {mend}"
+        )
+    return f"replay {show_bytes(replay)} of {show_bytes(there)}{each}"
+
+
+def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> None:
+    """The same question with the compiler's own figures. Still nothing is allocated.
+
+    Args:
+        programs: Compiled programs by name; ``learn`` among them, where a state is to be made.
+        already_there: The loop state is on the device already.
+        layout: Placement of the run; the compiler's figures are those of one device.
+
+    Raises:
+        RequestError: A program's scratch memory does not fit beside the state.
+    """
+    there = _least_available(layout)
+    if there is None:
+        return
+    state, scratch = _sizes(programs)
+    for name, size in scratch.items():
+        if size + (0 if already_there else state) > there:
+            raise RequestError(
+                f"{name} needs {show_bytes(size)} of scratch memory beside a state of {show_bytes(state)}; there are "
+                f"{show_bytes(there)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
+            )
+
+
+def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> bool:
+    """Return True if all programs have room at once, so that one may be called while another still runs.
+
+    Args:
+        programs, already_there, layout: As of `check_compiled`.
+    """
+    there = _least_available(layout)
+    state, scratch = _sizes(programs)
+    return there is None or sum(scratch.values()) + (0 if already_there else state) <= there
+
+
+def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:
+    """Bytes of the state that is trained, and of each program's scratch memory, on one device, as the compiler says."""
+    analyses = {name: program.memory_analysis() for name, program in programs.items()}
+    training = analyses.get("learn")
+    scratch = {
+        name: analysis.temp_size_in_bytes + analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+        for name, analysis in analyses.items()
+        if analysis is not None and name != "init"
+    }
+    return training.argument_size_in_bytes if training else 0, scratch

@@ -1,0 +1,277 @@
+"""A configuration and its compiled programs: everything that a run, an evaluation or a notebook executes on the device.
+
+All of it is compiled before training starts, so that the end of a run, where signals and full disks come, compiles nothing.
+
+A training iteration is two programs, ``play`` and ``learn`` (`jaxrl_vis.learner.train_step`), which XLA compiles side by side.
+A CPU evaluates with ``play``, too; other devices have a program for it.
+"""
+
+import concurrent.futures
+import contextlib
+import functools
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis import processes
+from jaxrl_vis.config import Config
+from jaxrl_vis.devices import cache_fault, default_cache, enable_compilation_cache
+from jaxrl_vis.learner.acting.evaluate import Evaluation
+from jaxrl_vis.learner.acting.rollout import Exploration
+from jaxrl_vis.learner.iteration import Learned
+from jaxrl_vis.learner.train_step import JIT_OPTIONS
+from jaxrl_vis.report import videos
+from jaxrl_vis.run.arrays import to_host
+from jaxrl_vis.run.compiled.nonfinite import broken_leaves
+from jaxrl_vis.run.compiled.pending import Pending, stacked
+from jaxrl_vis.run.compiled.threaded_rollout import ThreadedRollout
+from jaxrl_vis.run.compiled.trace_cache import TraceCache, fingerprint
+from jaxrl_vis.run.signals import shield_this_thread
+from jaxrl_vis.types import LoopState, Metrics, TrainState
+from jaxrl_vis_envs.compiling.compilation import assume_kernels_compile, failed_kernels, tracing_for_default_device
+
+# Evaluation draws from a key of its own, the same at every evaluation and for every seed.
+_EVALUATION_SEED = 2**31 - 1
+_TRAINING = ("play", "learn", "keys")
+# Programs that take long to trace.
+_CACHED = ("init", "play", "learn", "evaluate")
+# Of objects made since the last collection of garbage; Python's own default is 700.
+_OBJECTS_WHILE_TRACING = 100_000
+
+
+@contextlib.contextmanager
+def rarely_collecting_garbage() -> Iterator[None]:
+    """Collect garbage rarely while tracing, which makes millions of objects and next to no garbage: it saves an eighth."""
+    before = gc.get_threshold()
+    gc.set_threshold(max(before[0], _OBJECTS_WHILE_TRACING) if before[0] else 0, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+
+
+class Programs:
+    """Programs of a configuration. Nothing is compiled or allocated until it is called or `compile` is.
+
+    Args:
+        config: The run.
+        program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
+        keep: Keep on disk what was traced, and trace nothing that is kept there: `trace_cache` says when that is right. Only
+            where one device computes.
+        cache: Keep on disk what was compiled, too.
+
+    Attributes:
+        config: The run.
+        program: The jitted functions and their sizes.
+        env: The environment.
+        layout: Placement of seeds and shards.
+        seeds: The seeds, in the order of the seed axis.
+    """
+
+    def __init__(self, config: Config, program: Any, keep: bool = False, cache: bool = True):
+        self.config, self.program, self.env = config, program, program.env
+        self.layout = program.layout
+        self.seeds = range(config.seed, config.seed + config.seeds)
+        self._compiled: dict[str, Any] = {}
+        self._stacks: dict[frozenset[str], Any] = {}
+        self._traces: TraceCache | None = None
+        self._may_keep, self._caches = keep and cache and self.layout.mesh is None, cache
+        self._rollout = ThreadedRollout(program.part_size)
+
+    @functools.cached_property
+    def run_keys(self) -> jax.Array:
+        """[S] typed keys: seed i of a run starts from ``jax.random.key(config.seed + i)``."""
+        return self.layout.put(jnp.stack([jax.random.key(seed) for seed in self.seeds]), self.layout.by_seed)
+
+    @functools.cached_property
+    def evaluation_key(self) -> jax.Array:
+        """[] the typed key that draws the episodes of every evaluation."""
+        return self.layout.put(jax.random.key(_EVALUATION_SEED), self.layout.everywhere)
+
+    @functools.cached_property
+    def shapes(self) -> LoopState:
+        """Shapes and types of the loop state, and where it lies; traced, not allocated."""
+        with tracing_for_default_device(), assume_kernels_compile():  # as it will be compiled, so that it is traced once
+            shapes = jax.eval_shape(self.program.init, self.run_keys)
+        return self.layout.with_shardings(shapes, self.layout.loop)
+
+    @functools.cached_property
+    def shows_images(self) -> bool:
+        """True if what the robot sees can be shown in a video."""
+        replay = jax.eval_shape(jax.vmap(self.layout.unfolded), self.shapes.replay)
+        _, episodes, slots, *image = replay.episodes.observations.shape
+        return videos.shows_images((episodes, slots, *image))
+
+    @property
+    def image_seconds(self) -> float:
+        """Time for which an image of the video is shown, s: as long as it lasted, but not too fast to follow."""
+        return max(0.04, float(self.env.control_period))
+
+    @property
+    def evaluates_ahead(self) -> bool:
+        """True if `evaluate` returns before the device has done its work."""
+        return not self.program.plays_any
+
+    @property
+    def _evaluation(self) -> tuple[str, ...]:
+        return ("play",) if self.program.plays_any else ("evaluate",)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the programs that a run needs; first those that take longest to compile, while the others are traced."""
+        return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "broken_leaves", "keys")))
+
+    def compile(self, names: Sequence[str] | None = None, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
+        """Compile programs side by side, the small operations of saving and evaluating included.
+
+        Each function is traced once, here, and what was compiled here is what runs later.
+
+        Args:
+            names: Names of the programs; None: all that a run needs. What is compiled already is not compiled again.
+            meanwhile: Called when all is traced, and XLA has the processor to itself.
+
+        Returns:
+            All programs that are compiled, by name.
+        """
+        missing = [name for name in names or self.names if name not in self._compiled]
+        traces, trusting = self._open_traces() if missing else None, True
+        while missing:
+            try:
+                # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock, meanwhile.
+                with (
+                    concurrent.futures.ThreadPoolExecutor(len(missing), initializer=shield_this_thread) as pool,
+                    assume_kernels_compile() if trusting else contextlib.nullcontext(),
+                ):
+                    futures = {}
+                    for name in missing:
+                        function, arguments = self._call(name)
+                        with tracing_for_default_device(), rarely_collecting_garbage():
+                            if traces is not None and name in _CACHED:
+                                lowered = traces.lower(name, function, arguments)
+                            else:
+                                lowered = function.lower(*arguments)
+                        futures[name] = pool.submit(lowered.compile)
+                    self._finish(missing, meanwhile)
+                    self._keep({name: future.result() for name, future in futures.items()})
+                if traces is not None:
+                    traces.write()
+                break
+            except Exception:
+                if traces is not None:  # whatever is wrong with what is kept, or with a kernel in it, shows without it
+                    traces.forget()
+                    traces, self._may_keep = None, False
+                elif trusting and failed_kernels():
+                    trusting = False
+                else:
+                    raise
+        return dict(self._compiled)
+
+    def _open_traces(self) -> TraceCache | None:
+        """The programs that were traced for this configuration; None where none are to be kept."""
+        cache = enable_compilation_cache() if self._caches else ""
+        identity = fingerprint(self.config, self.env) if cache and self._may_keep else None
+        if identity is None:
+            return None
+        return TraceCache(Path(cache) / "programs", identity, self.shapes, JIT_OPTIONS)
+
+    def _finish(self, names: Sequence[str], meanwhile: Callable[[], None]) -> None:
+        """Do what can be done while XLA compiles."""
+        if "init" in names and not processes.are_several():
+            # Taking keys apart, as saving does, is a program, too.
+            to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
+        meanwhile()
+
+    def _keep(self, compiled: dict[str, Any]) -> None:
+        """Keep compiled programs, and compile what makes one array of their metrics."""
+        for program in compiled.values():
+            if metrics := getattr(program.out_info, "metrics", None):
+                shapes = {name: _without_layout(shape) for name, shape in metrics.items()}
+                self._stacks[frozenset(shapes)] = stacked.lower(shapes).compile()
+        self._compiled |= compiled
+
+    def lower(self, name: str) -> Any:
+        """Trace and lower a program, as `compile` does where none is kept."""
+        function, arguments = self._call(name)
+        with tracing_for_default_device(), rarely_collecting_garbage():
+            return function.lower(*arguments)
+
+    def _call(self, name: str) -> tuple[Any, tuple]:
+        """A jitted function and shapes of its arguments."""
+        if name == "init":
+            return self.program.init, (self.run_keys,)
+        shapes, number = self.shapes, jax.ShapeDtypeStruct((), jnp.float32)
+        first, noise = jax.ShapeDtypeStruct((), jnp.int32), Exploration(number, number)  # type: ignore[arg-type]
+        calls: dict[str, tuple[Any, tuple]] = {
+            "broken_leaves": (jax.jit(broken_leaves), (shapes,)),
+            "keys": (self.program.keys, (shapes.key, shapes.iteration)),
+            "play": (self.program.play, (shapes.train, shapes.key, first, noise)),
+            "learn": (self.program.learn, (shapes, self.program.parts_spec)),
+            "evaluate": (self.program.evaluate, (shapes.train, self.evaluation_key)),
+        }
+        return calls[name]
+
+    def compiled(self, name: str) -> Any:
+        """One compiled program, by its name in `compile`."""
+        return self.compile([name])[name]
+
+    def init(self, keys: jax.Array) -> LoopState:
+        """A fresh learner with an empty replay, for each of the typed keys [S]."""
+        return self.compiled("init")(self.layout.put(keys, self.layout.by_seed))
+
+    def of_evaluation(self) -> dict[str, Any]:
+        """The compiled programs that an evaluation needs, by name."""
+        return {name: self.compile(self._evaluation)[name] for name in self._evaluation}
+
+    def of_training(self) -> dict[str, Any]:
+        """The compiled programs that an iteration needs, by name."""
+        compiled = self.compile(_TRAINING)
+        return {name: compiled[name] for name in _TRAINING}
+
+    def play(self, train: TrainState, keys: jax.Array) -> list[Any]:
+        """The parts of a rollout of training, in their order (`rollout_parts.Played`), with typed keys [S]."""
+        count, exploration = self.config.num_envs, self.program.exploration
+        return self._rollout.play(self.compiled("play"), train, keys, count, exploration)
+
+    def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
+        """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
+        compiled = self.of_training()  # before the first is called, so that they are compiled side by side
+        keys = compiled["keys"](loop.key, loop.iteration)
+        learned: Learned = compiled["learn"](loop, self.play(loop.train, keys))
+        return learned.loop, learned.metrics
+
+    def evaluate(self, train: TrainState, key: jax.Array | None = None) -> Evaluation:
+        """Metrics of the policy without noise, [S] float32, and images of the first few episodes of every seed.
+
+        Args:
+            train: The learner, [S, ...].
+            key: Draws the episodes; None: always the same ones.
+        """
+        chosen: Any = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
+        if not self.program.plays_any:
+            return self.compiled("evaluate")(train, chosen)
+        keys = jnp.stack([chosen] * len(self.seeds))
+        return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.eval_episodes, self.env.frame_stack)
+
+    def pending(self, metrics: Metrics) -> Pending:
+        """Metrics from `train_iteration` or `evaluate`, to be read by the host; nothing is compiled for it."""
+        return Pending(metrics, self._stacks.get(frozenset(metrics), stacked))
+
+    def broken_leaves(self, loop: LoopState) -> list[str]:
+        """Names of the floating-point leaves of the loop state that hold a NaN or an infinity."""
+        return [name for name, is_broken in jax.device_get(self.compiled("broken_leaves")(loop)).items() if is_broken]
+
+    def says_of_cache(self) -> str:
+        """Describe what the next start will find in the cache of what is compiled now."""
+        folder, fault = enable_compilation_cache(), cache_fault()
+        if fault is not None:
+            return f"as will every start: {fault}"
+        return f"once; the next start finds it in {'the cache' if folder == str(default_cache()) else folder}"
+
+
+def _without_layout(shape: Any) -> jax.ShapeDtypeStruct:
+    """The shape of a compiled program's result, without its layout in the device's memory."""
+    return jax.ShapeDtypeStruct(shape.shape, shape.dtype, sharding=shape.sharding)

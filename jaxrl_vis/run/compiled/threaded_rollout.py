@@ -1,0 +1,74 @@
+"""Rollouts in parts, which the threads of a CPU play side by side, and evaluations by the same program.
+
+Each thread waits for the end of what it calls. Without, XLA would take one call after the other. A rollout that is one part is
+called and not waited for, so that a GPU's host is ahead of it.
+"""
+
+import concurrent.futures
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from jaxrl_vis.learner.acting.evaluate import Evaluation, num_recorded, summarize
+from jaxrl_vis.learner.acting.rollout import NO_EXPLORATION, Exploration
+from jaxrl_vis.learner.acting.rollout_parts import Played, join_parts
+from jaxrl_vis.run.signals import shield_this_thread
+from jaxrl_vis.types import Episodes, Metrics, TrainState
+from jaxrl_vis_envs.cores import num_cores
+
+
+class ThreadedRollout:
+    """Any number of environments, played in parts of one size.
+
+    Args:
+        size: P, environments of a part.
+    """
+
+    def __init__(self, size: int):
+        self._size = size
+        self._pool = concurrent.futures.ThreadPoolExecutor(num_cores(), initializer=shield_this_thread)
+
+    def play(
+        self,
+        program: Callable[..., Played],
+        train: TrainState,
+        keys: jax.Array,
+        count: int,
+        exploration: Exploration,
+        num_kept: int | None = None,
+    ) -> list[tuple[Episodes | None, Metrics]]:
+        """Play ``count`` episodes, rounded up to whole parts.
+
+        Args:
+            program: `TrainStep.play`, compiled.
+            train: The learners, [S, ...].
+            keys: [S] typed keys.
+            count: Episodes of each learner.
+            exploration: The noise.
+            num_kept: Number of episodes to keep (the first ones, rounded up to whole parts); None: all.
+
+        Returns:
+            Each part's episodes (None where they are not kept) and outcome.
+        """
+        noise = Exploration(*map(np.float32, exploration))  # type: ignore[arg-type]
+        if count <= self._size:
+            return [program(train, keys, np.int32(0), noise)]
+
+        def play(first: int) -> tuple[Episodes | None, Metrics]:
+            episodes, outcome = jax.block_until_ready(program(train, keys, np.int32(first), noise))
+            return episodes if num_kept is None or first < num_kept else None, outcome
+
+        return list(self._pool.map(play, range(0, count, self._size)))
+
+    def evaluate(
+        self, program: Callable[..., Played], train: TrainState, keys: jax.Array, count: int, frame_stack: int
+    ) -> Evaluation:
+        """Evaluate by ``program``, as `TrainStep.evaluate` does, with the key of each seed, [S]; returns NumPy's arrays."""
+        num_kept = num_recorded(count)
+        played = jax.device_get(self.play(program, train, keys, count, NO_EXPLORATION, num_kept=num_kept))
+        outcome = {
+            name: join_parts([part[name] for _, part in played], count, np, axis=1) for name in ("success", "goal_distance")
+        }
+        kept = [episodes.observations for episodes, _ in played if episodes is not None]
+        return summarize(outcome, join_parts(kept, num_kept, np, axis=1), outcome["success"], frame_stack, np)

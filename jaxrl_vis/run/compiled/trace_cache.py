@@ -1,0 +1,196 @@
+"""Cache of traced programs on disk, so that a run that has been traced once starts without tracing.
+
+XLA's cache spares compiling a program again. Tracing it, which is Python, goes before that, and takes seconds. Programs are
+stored as StableHLO (`jax.export`), next to XLA's cache: reading it runs no code.
+
+A program belongs to one fingerprint: the code of both packages, the versions of the libraries, the configuration, JAX's
+settings and the device. It does not cover what a process has replaced in its own modules (a patched loss, say). So only
+commands use the cache, not scripts and notebooks, and not with parts from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns
+it off.
+
+Whoever writes a stored program decides what a run computes. So folder and files are kept for the user alone, nothing is read
+that another user has written or could have written, and a file's digest covers its name, too.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib.util
+import json
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+from jax.extend.core import jaxpr_as_fun
+
+import jaxrl_vis_envs
+from jaxrl_vis.config import Config
+from jaxrl_vis.files import make_private, read_private, replacing, stranger_to
+from jaxrl_vis.learner.acting.evaluate import Evaluation
+from jaxrl_vis.learner.acting.rollout import Exploration
+from jaxrl_vis.learner.iteration import Learned
+from jaxrl_vis.plugins import own_names
+from jaxrl_vis.provenance import device_record, versions
+from jaxrl_vis.types import Episodes
+from jaxrl_vis_envs.base import GoalEnv
+from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_default_device, use_gpu_kernels
+
+VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
+MOST_FILES = 300
+"""Largest number of files, of half a megabyte each; the oldest are deleted."""
+
+HOST_FIELDS = ("env_steps", "eval_interval", "checkpoint_interval", "full_checkpoint_interval")
+"""Fields of `Config` that only the host reads: no compiled program depends on them."""
+
+_PACKAGES = ("jaxrl_vis", "jaxrl_vis_envs")
+_DIGEST_BYTES = 32
+# Triton's programs may mean something else to another jaxlib, of which JAX warns; a fingerprint has its version.
+_CHECKS = (export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton"),)
+# Kinds of nodes that `jax.export` knows by name, and one node of each kind that only signatures of programs have.
+_registered: set[type] = set()
+_SIGNATURES = (Episodes(0, 0, 0), Exploration(), Learned(0, {}), Evaluation({}, {}))  # type: ignore[arg-type]
+# These say what JAX writes down and where, and change no program. Folders may differ from run to run.
+_WITHOUT_EFFECT = ("cache", "log", "dump", "dir", "timeout", "traceback")
+
+
+def fingerprint(config: Config, env: GoalEnv) -> str | None:
+    """Return a digest of all that the programs of a run depend on, hexadecimal; None if they are not to be kept."""
+    is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not own_names(config)
+    if not is_ours or os.environ.get(VARIABLE) == "0":
+        return None
+    settings = {name: value for name, value in jax.config.values.items() if not any(part in name for part in _WITHOUT_EFFECT)}
+    with tracing_for_default_device():
+        target = [target_platform(), use_gpu_kernels()]
+    # The seed is an argument, in the form of keys.
+    compiled_in = {name: value for name, value in dataclasses.asdict(config).items() if name not in (*HOST_FIELDS, "seed")}
+    depends_on = [compiled_in, versions(), device_record(), target, settings, _code()]
+    return hashlib.sha256(json.dumps(depends_on, sort_keys=True, default=repr).encode()).hexdigest()
+
+
+@functools.cache
+def _code() -> str:
+    """A digest of all files of both packages, models and data included."""
+    digest = hashlib.sha256()
+    for package in _PACKAGES:
+        spec = importlib.util.find_spec(package)
+        assert spec is not None and spec.origin is not None
+        folder = Path(spec.origin).parent
+        for path in sorted(path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts):
+            contents = path.read_bytes()
+            digest.update(f"{package}/{path.relative_to(folder).as_posix()} {len(contents)}\n".encode() + contents)
+    return digest.hexdigest()
+
+
+class TraceCache:
+    """Traced programs of one fingerprint.
+
+    Args:
+        folder: Folder of the files; it need not exist.
+        fingerprint: From `fingerprint`.
+        nodes: Tree with all kinds of nodes that arguments and results have, besides those of this package's own signatures.
+        jit_options: Arguments of `jaxrl_vis_envs.jit` by name of the program.
+    """
+
+    def __init__(self, folder: Path, fingerprint: str, nodes: Any = None, jit_options: Mapping[str, Any] | None = None):
+        self._folder, self._fingerprint, self._jit_options = folder, fingerprint, jit_options or {}
+        self._fresh: dict[str, bytes] = {}
+        self._nodes = nodes
+
+    def lower(self, name: str, function: Any, arguments: tuple) -> Any:
+        """Return what ``function.lower`` returns, from the stored program; trace it now where there is none.
+
+        Args:
+            name: Name of the program.
+            function: Jitted.
+            arguments: Trees of the shapes of its arguments.
+        """
+        _register((self._nodes, arguments, _SIGNATURES))
+        data = self._read(name)
+        if data is None:
+            traced = function.trace(*arguments)
+            call, results = jaxpr_as_fun(traced.jaxpr), jax.tree.structure(traced.out_info)
+            again = jax.jit(lambda *arguments: jax.tree.unflatten(results, call(*jax.tree.leaves(arguments))))
+            exported = export.export(again, platforms=(target_platform(),), disabled_checks=_CHECKS)(*arguments)
+            self._fresh[name] = data = bytes(exported.serialize())
+        # Also what has just been traced: XLA's cache takes a program that was read for another one than that which was traced.
+        program = export.deserialize(bytearray(data))
+        return jaxrl_vis_envs.jit(program.call, **self._jit_options.get(name, {})).lower(*arguments)
+
+    def write(self) -> None:
+        """Store what was traced, after it has been compiled; nothing where the folder cannot be written to."""
+        with contextlib.suppress(OSError):
+            make_private(self._folder)
+            for name, data in self._fresh.items() if self._is_private() else ():
+                with replacing(self._path(name), durable=False, mode=0o600) as file:
+                    file.write(self._digest(name, data) + data)
+            for path in sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-MOST_FILES]:
+                path.unlink(missing_ok=True)
+        self._fresh.clear()
+
+    def forget(self) -> None:
+        """Delete the programs of this fingerprint."""
+        self._fresh.clear()
+        with contextlib.suppress(OSError):
+            for path in self._folder.glob(f"*-{self._fingerprint}.stablehlo"):
+                path.unlink(missing_ok=True)
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}-{self._fingerprint}.stablehlo"
+
+    def _read(self, name: str) -> bytes | None:
+        """Return a stored program; None for one that is missing, damaged, or possibly another user's."""
+        contents = read_private(self._path(name)) if self._is_private() else None
+        if contents is None:
+            return None
+        digest, data = contents[:_DIGEST_BYTES], contents[_DIGEST_BYTES:]
+        return data if self._digest(name, data) == digest else None
+
+    def _digest(self, name: str, data: bytes) -> bytes:
+        return hashlib.sha256(self._path(name).name.encode() + b"\0" + data).digest()
+
+    def _is_private(self) -> bool:
+        """Returns whether the folder is this user's alone; of one that is this user's, others' rights are taken first."""
+        try:
+            status = self._folder.stat()
+            if stranger_to(status) is not None:
+                make_private(self._folder)
+                status = self._folder.stat()
+        except OSError:
+            return False
+        reason = stranger_to(status)
+        if reason is not None:
+            _say_once(
+                f"programs kept in {self._folder} are not used: it {reason}; JAX_COMPILATION_CACHE_DIR names another folder"
+            )
+        return reason is None
+
+
+def _register(tree: Any) -> None:
+    """Let `jax.export` store programs that take or return nodes like those of a tree, by the names of their classes."""
+    pending = [jax.tree.structure(tree)]
+    while pending:
+        structure = pending.pop()
+        pending += structure.children()
+        kind, _ = structure.node_data() or (None, None)
+        if kind is None or kind in _registered or kind in (tuple, list, dict, type(None)):
+            continue
+        _registered.add(kind)
+        name = f"{kind.__module__}.{kind.__qualname__}"
+        with contextlib.suppress(ValueError):  # somebody else has registered it
+            if issubclass(kind, tuple):
+                export.register_namedtuple_serialization(kind, serialized_name=name)
+            else:  # a dataclass all of whose fields are children
+                export.register_pytree_node_serialization(
+                    kind, serialized_name=name, serialize_auxdata=lambda data: b"", deserialize_auxdata=lambda data: ()
+                )
+
+
+@functools.cache
+def _say_once(line: str) -> None:
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # a stream that is closed, or none
+        print(line, file=sys.stderr)
