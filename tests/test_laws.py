@@ -15,7 +15,7 @@ from test_replay import ENVS, HORIZON, encoded_rollout
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import make_replay
 from jaxrl_vis.learner.weighting import MAIN, make_weighting
-from jaxrl_vis_envs.physics import quaternions
+from jaxrl_vis_envs.physics.scalar import quaternions
 from jaxrl_vis_envs.render import Scene
 from jaxrl_vis_envs.render.camera import lens, pixel_rays
 
@@ -138,8 +138,8 @@ def test_weights_are_finite_not_negative_and_nobodys_by_name(name):
 numbers = st.floats(-1, 1, width=32)
 turns = st.tuples(*[numbers] * 4).filter(lambda parts: sum(part * part for part in parts) > 1e-3)
 multiply = jax.jit(lambda one, other: jnp.stack(jnp.broadcast_arrays(*quaternions.multiply(tuple(one), tuple(other)))))
-unit = jax.jit(lambda parts: jnp.stack(quaternions.unit(tuple(parts))))
-matrix = jax.jit(lambda turn: jnp.array(quaternions.axes_of(tuple(turn))).T)
+unit = jax.jit(lambda parts: jnp.stack(quaternions.normalize(tuple(parts))))
+matrix = jax.jit(lambda turn: jnp.array(quaternions.rotation_axes(tuple(turn))).T)
 back = jax.jit(lambda turn: jnp.stack(quaternions.inverse(tuple(turn))))
 
 
@@ -150,10 +150,10 @@ def test_quaternions_turn_as_matrices_do(first, second, third):
     near(jnp.linalg.norm(one), 1.0)
     near(matrix(multiply(one, two)), matrix(one) @ matrix(two))
     near(multiply(multiply(one, two), three), multiply(one, multiply(two, three)))
-    near(multiply(one, back(one)), np.array(quaternions.WHOLE))
+    near(multiply(one, back(one)), np.array(quaternions.IDENTITY))
     near(matrix(one) @ matrix(one).T, np.eye(3))
     near(matrix(-one), matrix(one))
-    again = np.array(quaternions.of_matrix(np.asarray(matrix(one), np.float64)))
+    again = np.array(quaternions.from_matrix(np.asarray(matrix(one), np.float64)))
     near(abs(float(again @ np.asarray(one))), 1.0)
     expected = np.empty(9)
     mujoco.mju_quat2Mat(expected, np.asarray(one, np.float64))
