@@ -99,8 +99,8 @@ def compilations():
     def watch(trainer):
         compile_all = trainer.programs.compile
 
-        def compile_and_watch(**options):
-            compiled = compile_all(**options)
+        def compile_and_watch(*names, **options):
+            compiled = compile_all(*names, **options)
             watching.append(True)
             return compiled
 
