@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis import bench, cli, provenance
+from jaxrl_vis import bench, cli
 from jaxrl_vis.bench import conditions, peaks, physics, record, roofline, timing, train, update, variation
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host import provenance
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.base import GoalEnv, State
 from jaxrl_vis_envs.pixels import PixelsConfig

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import pytest
 
 import jaxrl_vis
-from jaxrl_vis import cli, provenance
+from jaxrl_vis import cli
 from jaxrl_vis.cli import train
 from jaxrl_vis.cli.bench import Bench, Benchmark
 from jaxrl_vis.cli.envs import Envs
@@ -21,6 +21,7 @@ from jaxrl_vis.cli.play import Play
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import PRESETS, Config, preset
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
+from jaxrl_vis.host import provenance
 from jaxrl_vis.methods import METHODS, MethodName
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.command import training_options
@@ -225,7 +226,7 @@ def test_auto_follows_the_hardware() -> None:
 
 
 def test_resume_starts_from_the_saved_configuration(tmp_path: Path) -> None:
-    from jaxrl_vis.run.folder import RunFolder
+    from jaxrl_vis.run.storage.folder import RunFolder
 
     saved = PRESETS["debug"].replace(seed=3, latent_size=24, encoder_filters=(4,))
     RunFolder(tmp_path).open(saved)
@@ -234,7 +235,7 @@ def test_resume_starts_from_the_saved_configuration(tmp_path: Path) -> None:
 
 
 def test_a_given_option_counts_even_where_it_repeats_a_default(tmp_path: Path) -> None:
-    from jaxrl_vis.run.folder import RunFolder
+    from jaxrl_vis.run.storage.folder import RunFolder
 
     saved = PRESETS["debug"].replace(env="VisualReacher", discount=0.5)
     RunFolder(tmp_path).open(saved)
@@ -325,10 +326,10 @@ def test_the_default_run_folder_is_checked_before_the_work(
 
 
 def test_missing_folders_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from jaxrl_vis.run import trained
+    from jaxrl_vis.run.trained import restored_run
 
     (tmp_path / "config.json").write_text("{}")
-    monkeypatch.setattr(trained, "evaluate_run", lambda *_, **__: {"eval/success": [0.5]})
+    monkeypatch.setattr(restored_run, "evaluate_run", lambda *_, **__: {"eval/success": [0.5]})
     path = tmp_path / "new" / "folder" / "figures.json"
     assert cli.main(["eval", str(tmp_path), "--json", str(path)]) == 0
     assert json.loads(path.read_text()) == {"eval/success": [0.5]}
@@ -389,7 +390,7 @@ def test_doctor_finds_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_doctor_reports_what_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from jaxrl_vis import doctor
+    from jaxrl_vis.host import doctor
 
     def broken() -> str:
         raise RuntimeError("no device\nat all")

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from fake_program import make_fake_trainer, small_config
 
-from jaxrl_vis import cli, devices
+from jaxrl_vis import cli
+from jaxrl_vis.host import devices
 from jaxrl_vis.run.compiled.memory import show_bytes
 
 _PROGRAM = """

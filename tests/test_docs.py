@@ -33,8 +33,9 @@ from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run import metrics, trainer
-from jaxrl_vis.run.folder import MAY_CHANGE
+from jaxrl_vis.run import trainer
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.folder import MAY_CHANGE
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.names import TASKS

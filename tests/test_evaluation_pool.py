@@ -16,7 +16,7 @@ from types import ModuleType
 import pytest
 
 from jaxrl_vis.errors import RequestError, Terminated, WorkerError
-from jaxrl_vis.evaluation_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
+from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
 from jaxrl_vis.run import signals
 
 
@@ -110,7 +110,7 @@ def test_processes_end_with_the_one_that_started_them_however_that_ends(tmp_path
     script.write_text(
         "import os, time\n"
         "from pathlib import Path\n"
-        "from jaxrl_vis.evaluation_pool import map_unordered\n"
+        "from jaxrl_vis.host.worker_pool import map_unordered\n"
         "def work(number):\n"
         "    Path(__file__).with_name(f'{number}.part').write_text(str(os.getpid()))\n"
         "    Path(__file__).with_name(f'{number}.part').rename(Path(__file__).with_name(f'{number}.pid'))\n"

@@ -7,9 +7,9 @@ import threading
 
 import pytest
 
-from jaxrl_vis import files
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import check_path, is_temporary, read_json, read_private, replacing, write_atomically
+from jaxrl_vis.host import files
+from jaxrl_vis.host.files import check_path, is_temporary, read_json, read_private, replacing, write_atomically
 
 DEEP = 10**5
 

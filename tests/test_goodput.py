@@ -3,9 +3,9 @@
 import pytest
 from fake_program import make_fake_trainer, rows_without_time, small_config
 
-from jaxrl_vis.run import metrics
-from jaxrl_vis.run.checkpoint import RECENT, Checkpoints
 from jaxrl_vis.run.goodput import Account, Goodput, Process, account, read_processes
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.checkpoint import RECENT, Checkpoints
 
 
 def test_steps_of_all_processes_are_added_up():

@@ -19,7 +19,7 @@ from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.resolved import resolve
-from jaxrl_vis.run.metrics import with_precision
+from jaxrl_vis.run.storage.metrics import with_precision
 from jaxrl_vis.types import Batch, Episodes
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import goals

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run import lock
-from jaxrl_vis.run.lock import FILE_NAME, FolderGoneError, run_lock
+from jaxrl_vis.run.storage import lock
+from jaxrl_vis.run.storage.lock import FILE_NAME, FolderGoneError, run_lock
 
 fcntl = pytest.importorskip("fcntl")
 DEAD = 2**22 + 1  # a process of this number there cannot be, on Linux

@@ -15,7 +15,8 @@ from wandb.proto import wandb_internal_pb2
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run import loggers, metrics, tensorboard
+from jaxrl_vis.run.loggers import group, tensorboard
+from jaxrl_vis.run.storage import metrics
 
 BLOCK = 32 * 1024  # of W&B's files, which are logs as LevelDB writes them
 
@@ -171,7 +172,7 @@ def test_nobody_waits_for_a_logger_for_ever(
 ) -> None:
     import threading
 
-    monkeypatch.setattr(loggers, "_LEAVING_S", {True: 0.05, False: 0.05})
+    monkeypatch.setattr(group, "_LEAVING_S", {True: 0.05, False: 0.05})
     stuck = threading.Event()
     monkeypatch.setattr(tensorboard.TensorBoard, "close", lambda self: stuck.wait(30))
     list(make_fake_trainer(small_config(env_steps=20), tmp_path / "run", log=("tensorboard",)).run())
@@ -193,7 +194,7 @@ def test_what_cannot_be_is_told_before_any_work(
     assert cli.main(["train", *where, "--log", "tensorbord"]) == 2
     assert "did you mean tensorboard" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "wandb", None)
-    monkeypatch.setattr(loggers.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(group.importlib.util, "find_spec", lambda name: None)
     assert cli.main(["train", *where, "--log", "wandb"]) == 2
     error = capsys.readouterr().err
     assert "--log wandb needs wandb: " in error and "[wandb]'" in error and len(error.splitlines()) == 1

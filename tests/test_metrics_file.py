@@ -8,10 +8,10 @@ from fake_program import interrupted_at, make_fake_trainer, rows_without_time, s
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve
-from jaxrl_vis.run import metrics
-from jaxrl_vis.run.folder import RunFolder, read_run_id
-from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.studies.cells import Cell, describe_progress, find_folder, latest_rows
+from jaxrl_vis.run.loggers.group import Loggers
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.folder import RunFolder, read_run_id
+from jaxrl_vis.studies.engine.cells import Cell, describe_progress, find_folder, latest_rows
 
 
 def row(iteration: int, seed: int = 0, **changes) -> dict:

@@ -14,7 +14,7 @@ from jaxrl_vis import cli
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
-from jaxrl_vis.run.folder import default_folder
+from jaxrl_vis.run.storage.folder import default_folder
 from jaxrl_vis_envs import registry
 
 TASK = '''
@@ -294,13 +294,13 @@ def test_custom_task_in_the_gallery(my_task: str, here: Path, capsys: pytest.Cap
 
 def test_records_of_custom_tasks_depend_on_no_package_file() -> None:
     from benchmarks.ledger import staleness
-    from jaxrl_vis.provenance import CHECKOUT
+    from jaxrl_vis.host.provenance import CHECKOUT
 
     files = [file.name for file in staleness.measured_files("env/steps", "gone:Reach", True, CHECKOUT)]
     assert "env.py" in files and "reacher.py" not in files
 
 
 def test_the_saved_folder_may_change_on_resume() -> None:
-    from jaxrl_vis.run.folder import MAY_CHANGE
+    from jaxrl_vis.run.storage.folder import MAY_CHANGE
 
     assert "env_folder" in MAY_CHANGE and "env_folder" in {field.name for field in dataclasses.fields(jaxrl_vis.Config)}

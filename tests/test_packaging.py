@@ -18,17 +18,20 @@ ROOT = Path(__file__).resolve().parents[1]
 # Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other. A
 # file of a folder may have a row of its own.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "streams"),
+    ("errors", "host"),  # `host` itself is empty
     ("fields",),
     ("methods",),
-    ("cache_entries", "config", "types", "provenance", "files", "spreadsheets"),
-    ("devices", "parameters", "plugins", "processes", "validation"),
+    ("config", "types"),
+    ("validation",),
+    ("host.cache_entries", "host.provenance", "host.spreadsheets", "host.streams"),
+    ("host.files",),
+    ("host.devices", "host.distributed", "host.plugins", "host.weights_file"),
     ("resolved",),
     ("learner",),
     ("report",),
     ("run",),
-    ("evaluation_pool", "studies"),
-    ("bench", "doctor"),
+    ("host.worker_pool", "studies"),
+    ("bench", "host.doctor"),
     ("cli.parsing",),  # the part of the command line that commands of `stalks` are written with
     ("cli.checks",),
     ("stalks",),

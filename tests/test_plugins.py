@@ -11,9 +11,10 @@ import pytest
 from doc_blocks import ROOT, blocks, commands
 
 import jaxrl_vis
-from jaxrl_vis import cli, fields, plugins
+from jaxrl_vis import cli, fields
 from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host import plugins
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.environment import locate_env
 from jaxrl_vis.learner.train_step import ALGORITHMS

@@ -15,8 +15,8 @@ import pytest
 import jaxrl_vis
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.acting.rollout import play
-from jaxrl_vis.run.checkpoint import LIGHT
-from jaxrl_vis.run.trained import load, open_run
+from jaxrl_vis.run.storage.checkpoint import LIGHT
+from jaxrl_vis.run.trained.restored_run import load, open_run
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv
 from jaxrl_vis_envs.pixels import PixelsConfig

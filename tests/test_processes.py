@@ -16,11 +16,11 @@ from fake_program import as_plain, rows_without_time
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.distributed import Rank, find_rank
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.processes import Rank, find_rank
-from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.folder import read_config
+from jaxrl_vis.run.storage.checkpoint import Checkpoints
+from jaxrl_vis.run.storage.folder import read_config
 
 SRUN = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_PROCID": "3", "SLURM_STEP_NODELIST": "node[1-2]"}
 MPIRUN = {"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1", "OMPI_MCA_orte_hnp_uri": "1.0;tcp://10.0.0.1:1"}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxrl_vis import provenance
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.host import provenance
+from jaxrl_vis.host.files import write_atomically
 
 
 def commit(folder: Path, message: str = "more") -> str:

@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from readers_worker import MEGABYTES, SECONDS, Worker
 from safetensors.numpy import save
 
-from jaxrl_vis import cli, parameters
+from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.spreadsheets import escape_cell, to_csv, unescape_cell
+from jaxrl_vis.host import weights_file
+from jaxrl_vis.host.spreadsheets import escape_cell, to_csv, unescape_cell
 from jaxrl_vis.stalks.grasping.masks import painter
 from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io import masks
@@ -327,7 +328,7 @@ def test_weights_are_checked_before_a_network_is_built(worker, data, part):
     [("shape", "is not"), ("type", "is not"), ("name", "is missing or too many"), ("value", "not finite")],
 )
 def test_arrays_that_are_not_those_of_the_network_are_told(tmp_path, kind, part):
-    with parameters.safetensors.safe_open(painter.SHIPPED, "numpy") as file:
+    with weights_file.safetensors.safe_open(painter.SHIPPED, "numpy") as file:
         about, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
     name = min(name for name in arrays if name.endswith("bias"))
     arrays |= {
@@ -343,17 +344,19 @@ def test_arrays_that_are_not_those_of_the_network_are_told(tmp_path, kind, part)
 
 def test_weights_of_an_earlier_version_are_converted_bit_for_bit(tmp_path):
     write_weights(tmp_path / "new.safetensors", *read_weights(SHIPPED))
-    with parameters.safetensors.safe_open(tmp_path / "new.safetensors", "numpy") as file:
+    with weights_file.safetensors.safe_open(tmp_path / "new.safetensors", "numpy") as file:
         about, arrays = json.loads(file.metadata()["about"]), {name: file.get_tensor(name) for name in file.keys()}
     assert about["schema"] == SCHEMA and {array.dtype for array in arrays.values()} == {np.dtype(np.float16)}
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
     np.savez_compressed(tmp_path / "old.npz", about=text, **arrays)
-    with pytest.raises(RequestError, match="convert it with `python -m jaxrl_vis.parameters .*old.npz .*old.safetensors`"):
+    with pytest.raises(
+        RequestError, match="convert it with `python -m jaxrl_vis.host.weights_file .*old.npz .*old.safetensors`"
+    ):
         read_weights(tmp_path / "old.npz")
-    parameters.convert(tmp_path / "old.npz", tmp_path / "old.safetensors")
+    weights_file.convert(tmp_path / "old.npz", tmp_path / "old.safetensors")
     assert (tmp_path / "old.safetensors").read_bytes() == (tmp_path / "new.safetensors").read_bytes()
     (tmp_path / "no.npz").write_bytes(b"no weights")
-    words = [sys.executable, "-m", "jaxrl_vis.parameters", str(tmp_path / "no.npz"), str(tmp_path / "new.safetensors")]
+    words = [sys.executable, "-m", "jaxrl_vis.host.weights_file", str(tmp_path / "no.npz"), str(tmp_path / "new.safetensors")]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 1 and done.stderr.startswith("cannot convert") and len(done.stderr.splitlines()) == 1
 
@@ -362,20 +365,20 @@ def test_weights_of_ten_bits_are_off_by_half_a_step_at_most(tmp_path):
     rng = np.random.default_rng(0)
     kernel = rng.normal(size=(9, 64, 32)).astype(np.float32) * np.linspace(0.0, 2.0, 32, dtype=np.float32)
     params = {"layer": {"kernel": kernel, "bias": kernel[0, 0], "small": kernel[0]}}
-    parameters.write_parameters(tmp_path / "w.safetensors", params, {}, bits=10)
-    found, _, _ = parameters.read_parameters(tmp_path / "w.safetensors", "train", lambda about: (None, params))
+    weights_file.write_parameters(tmp_path / "w.safetensors", params, {}, bits=10)
+    found, _, _ = weights_file.read_parameters(tmp_path / "w.safetensors", "train", lambda about: (None, params))
     step = np.abs(kernel).max(axis=(0, 1)) / 511
     assert (np.abs(np.asarray(found["layer"]["kernel"]) - kernel) <= 0.501 * step).all()
     for name in ("bias", "small"):  # too few to be worth it
         np.testing.assert_array_equal(found["layer"][name], params["layer"][name].astype(np.float16))
     assert (tmp_path / "w.safetensors").stat().st_size < 2.5 * kernel.size
-    with parameters.safetensors.safe_open(tmp_path / "w.safetensors", "numpy") as file:
+    with weights_file.safetensors.safe_open(tmp_path / "w.safetensors", "numpy") as file:
         about, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}
     assert arrays.pop("layer/kernel.scale").shape == (32,) and arrays["layer/kernel.low"].shape == (9 * 64 * 32 // 4,)
     for more, part in (({}, "is missing or too many"), ({"layer/kernel.scale": np.ones(31, np.float32)}, "is not")):
         (tmp_path / "w.safetensors").write_bytes(save({**arrays, **more}, about))
         with pytest.raises(RequestError, match=part):
-            parameters.read_parameters(tmp_path / "w.safetensors", "train", lambda about: (None, params))
+            weights_file.read_parameters(tmp_path / "w.safetensors", "train", lambda about: (None, params))
 
 
 # --- families ---

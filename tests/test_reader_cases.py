@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxrl_vis import parameters
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host import weights_file
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, find_plots, read_odometry
 from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image
@@ -197,13 +197,15 @@ def test_shapes_of_labelme_that_enclose_nothing_are_left_out(tmp_path):
 def test_weights_whose_header_cannot_be_one_are_told(tmp_path, data):
     (tmp_path / "w.safetensors").write_bytes(data)
     with pytest.raises(RequestError, match=r"w.safetensors holds no weights: name a file that `train` wrote"):
-        parameters.read_parameters(tmp_path / "w.safetensors", "train", lambda about: pytest.fail("it was asked what it holds"))
+        weights_file.read_parameters(
+            tmp_path / "w.safetensors", "train", lambda about: pytest.fail("it was asked what it holds")
+        )
 
 
 def test_weights_that_are_a_folder_are_told(tmp_path):
     with pytest.raises(RequestError, match="holds no weights"):
-        parameters.read_parameters(tmp_path, "train", lambda about: pytest.fail("it was asked what it holds"))
+        weights_file.read_parameters(tmp_path, "train", lambda about: pytest.fail("it was asked what it holds"))
     with pytest.raises(RequestError, match="cannot read the weights .*none.safetensors: No such file"):
-        parameters.read_parameters(
+        weights_file.read_parameters(
             tmp_path / "none.safetensors", "train", lambda about: pytest.fail("it was asked what it holds")
         )

@@ -12,8 +12,8 @@ from test_readers import also_as_text, hold, named, worker  # noqa: F401 - a fix
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
-from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.storage.folder import RunFolder
 
 
 def test_configurations(worker, tmp_path):  # noqa: F811

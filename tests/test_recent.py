@@ -10,9 +10,9 @@ import pytest
 from fake_program import as_plain, make_fake_trainer, rows_without_time, small_config
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run import recent
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
-from jaxrl_vis.run.recent import Recent, Unusable, is_cheap
+from jaxrl_vis.run.storage import recent
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.run.storage.recent import Recent, Unusable, is_cheap
 
 E = 2  # episodes of an iteration of the fake program, whose replay holds three iterations
 NO_OTHERS = {"full_checkpoint_interval": 0, "checkpoint_interval": 100}

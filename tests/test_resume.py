@@ -13,9 +13,10 @@ import pytest
 from fake_program import final_state, interrupted_at, make_fake_trainer, rows_without_time, small_config
 
 from jaxrl_vis.errors import RequestError, StorageError
-from jaxrl_vis.run import loop, metrics
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
-from jaxrl_vis.run.folder import read_config
+from jaxrl_vis.run import loop
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.storage.folder import read_config
 
 
 @pytest.mark.parametrize("cut", [2, 4])
@@ -278,7 +279,7 @@ def test_a_dead_holders_lock_is_taken_over(tmp_path, clean_environment):
     code = f"""
 import os, signal
 from pathlib import Path
-from jaxrl_vis.run.lock import run_lock
+from jaxrl_vis.run.storage.lock import run_lock
 with run_lock(Path({str(path)!r})):
     os.kill(os.getpid(), signal.SIGKILL)
 """

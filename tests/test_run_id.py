@@ -11,14 +11,16 @@ from fake_program import FakeProgram, final_state, interrupted_at, make_fake_tra
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError, StorageError
-from jaxrl_vis.run import folder as folders
-from jaxrl_vis.run import metrics, trained, trainer
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run import trainer
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.folder import RunFolder, read_run_id
-from jaxrl_vis.run.lock import FolderGoneError
 from jaxrl_vis.run.saving import Saver
-from jaxrl_vis.run.sums import write_sums
+from jaxrl_vis.run.storage import folder as folders
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.storage.folder import RunFolder, read_run_id
+from jaxrl_vis.run.storage.lock import FolderGoneError
+from jaxrl_vis.run.storage.sums import write_sums
+from jaxrl_vis.run.trained import restored_run
 
 
 def checkpoints_in(path: Path) -> list[str]:
@@ -82,11 +84,11 @@ def test_what_uses_a_run_does_not_count_another_ones(straight, tmp_path, monkeyp
     shutil.copytree(straight[0] / "checkpoints" / LIGHT, path / "checkpoints" / LIGHT, dirs_exist_ok=True)
     metrics.append_rows(path / "metrics.jsonl", metrics.read_rows(straight[0] / "metrics.jsonl"))
     assert {row["iteration"] for row in RunFolder(path).rows()} == {2}
-    monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
-    opened = trained.open_run(path)
-    assert trained.load(opened, path).iteration == 2
+    monkeypatch.setattr(restored_run, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
+    opened = restored_run.open_run(path)
+    assert restored_run.load(opened, path).iteration == 2
     with pytest.raises(RequestError, match="no checkpoint of iteration 8, only of 2"):
-        trained.load(opened, path, 8)
+        restored_run.load(opened, path, 8)
 
 
 def without_ids(path: Path) -> Path:

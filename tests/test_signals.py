@@ -16,9 +16,9 @@ from fake_program import make_fake_trainer, rows_without_time, small_config
 from jaxrl_vis import cli
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
 from jaxrl_vis.run import signals
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
-from jaxrl_vis.run.folder import read_config
-from jaxrl_vis.run.recent import Recent
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.run.storage.folder import read_config
+from jaxrl_vis.run.storage.recent import Recent
 
 FAKE = Path(__file__).with_name("fake_program.py")
 

@@ -17,11 +17,11 @@ from fake_program import interrupted_at, make_fake_trainer, rows_without_time, s
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import StorageError
-from jaxrl_vis.run import metrics
-from jaxrl_vis.run.bar import clock
-from jaxrl_vis.run.console import RunConsole
+from jaxrl_vis.host.streams import SafeStream, safe, safe_streams
+from jaxrl_vis.run.loggers.bar import clock
+from jaxrl_vis.run.loggers.console import RunConsole
+from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.stalks.cli.progress import progress
-from jaxrl_vis.streams import SafeStream, safe, safe_streams
 from jaxrl_vis_envs.compiling import mjx_imports
 
 FULL = Path("/dev/full")
@@ -180,7 +180,7 @@ def test_files_do_not_take_the_place_of_closed_streams(tmp_path, clean_environme
 import os
 for number in range(3):
     os.close(number)
-from jaxrl_vis.streams import reserve_standard_files
+from jaxrl_vis.host.streams import reserve_standard_files
 reserve_standard_files()
 with open({str(tmp_path / "metrics.jsonl")!r}, "w") as file:
     os.write(1, b"printed"), os.write(2, b"printed")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from jaxrl_vis.studies.drawing import Curve, Panel, compose
-from jaxrl_vis.studies.figures import STUDIES
+from jaxrl_vis.studies.figures.drawing import Curve, Panel, compose
+from jaxrl_vis.studies.figures.make import STUDIES
 
 
 @pytest.mark.parametrize("figure", list(STUDIES))

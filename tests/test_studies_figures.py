@@ -11,17 +11,18 @@ import pytest
 from PIL import Image
 
 from jaxrl_vis import cli
-from jaxrl_vis.run.folder import SCHEMA
-from jaxrl_vis.spreadsheets import to_csv
-from jaxrl_vis.studies import indicator, indicator_figures
-from jaxrl_vis.studies.authors import mean_difference, released_curves
-from jaxrl_vis.studies.cells import Cell, contradiction, is_finished
-from jaxrl_vis.studies.figures import make_figure
+from jaxrl_vis.host.spreadsheets import to_csv
+from jaxrl_vis.run.storage.folder import SCHEMA
+from jaxrl_vis.studies import indicator
+from jaxrl_vis.studies.engine.cells import Cell, contradiction, is_finished
+from jaxrl_vis.studies.engine.results import Line, Reached, mean_weight, reached
+from jaxrl_vis.studies.engine.study import Scope, make_cells
+from jaxrl_vis.studies.figures import indicator_figures
+from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
+from jaxrl_vis.studies.figures.make import make_figure
+from jaxrl_vis.studies.figures.show import Request
+from jaxrl_vis.studies.figures.tables import Named, steps_table, weights_table
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
-from jaxrl_vis.studies.results import Line, Reached, mean_weight, reached
-from jaxrl_vis.studies.show import Request
-from jaxrl_vis.studies.study import Scope, make_cells
-from jaxrl_vis.studies.tables import Named, steps_table, weights_table
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import registry
 

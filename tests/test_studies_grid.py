@@ -15,11 +15,19 @@ import pytest
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset
-from jaxrl_vis.devices import Device, list_devices
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.folder import SCHEMA
-from jaxrl_vis.studies.cells import Cell, describe_progress, find_folder, finished_rows, is_finished, show_budget, split_seeds
-from jaxrl_vis.studies.grid import run_cells, train_command
+from jaxrl_vis.host.devices import Device, list_devices
+from jaxrl_vis.run.storage.folder import SCHEMA
+from jaxrl_vis.studies.engine.cells import (
+    Cell,
+    describe_progress,
+    find_folder,
+    finished_rows,
+    is_finished,
+    show_budget,
+    split_seeds,
+)
+from jaxrl_vis.studies.engine.grid import run_cells, train_command
 
 CPU = [Device("the CPU", {})]
 
@@ -155,7 +163,7 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from test_studies_grid import CPU, Script, make_cell
 from jaxrl_vis.errors import Terminated
-from jaxrl_vis.studies.grid import run_cells
+from jaxrl_vis.studies.engine.grid import run_cells
 try:
     run_cells([make_cell("a"), make_cell("b")], Path({str(tmp_path)!r}), lambda: CPU, command=Script(a="waits"))
 except KeyboardInterrupt:
@@ -178,7 +186,7 @@ except KeyboardInterrupt:
 
 def test_a_second_signal_does_not_wait(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not even for a process that does not listen; and it leaves none behind."""
-    monkeypatch.setattr("jaxrl_vis.studies.grid._GRACE_S", 0.5)
+    monkeypatch.setattr("jaxrl_vis.studies.engine.grid._GRACE_S", 0.5)
     cell = make_cell("a")
     pids: list[int] = []
 
@@ -204,7 +212,7 @@ def test_a_second_signal_does_not_wait(tmp_path: Path, monkeypatch: pytest.Monke
         real_sleep(seconds)
 
     real_sleep = time.sleep
-    monkeypatch.setattr("jaxrl_vis.studies.grid.time.sleep", sleep)
+    monkeypatch.setattr("jaxrl_vis.studies.engine.grid.time.sleep", sleep)
     with pytest.raises(KeyboardInterrupt):
         run_cells([cell], tmp_path, lambda: CPU, command=deaf, say=lambda _: None)
     with pytest.raises(ProcessLookupError):
@@ -275,7 +283,7 @@ def test_the_engine_starts_no_jax(clean_environment: dict[str, str]) -> None:
 
 def answer(monkeypatch: pytest.MonkeyPatch, order: object, status: int = 0) -> None:
     done = subprocess.CompletedProcess([], status, json.dumps(order), "jaxlib grumbles\nJAX finds no such device\n")
-    monkeypatch.setattr("jaxrl_vis.devices.subprocess.run", lambda *_, **__: done)
+    monkeypatch.setattr("jaxrl_vis.host.devices.subprocess.run", lambda *_, **__: done)
 
 
 def test_devices_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,12 +11,12 @@ import submitit
 from test_studies_grid import CPU, Script, make_cell, seen
 
 from jaxrl_vis import cli
-from jaxrl_vis.devices import Device
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.studies.cells import Cell, is_finished
-from jaxrl_vis.studies.cluster import Cluster, Job, Training
-from jaxrl_vis.studies.grid import run_cells
-from jaxrl_vis.studies.sweep import Request, make_cells, run_sweep
+from jaxrl_vis.host.devices import Device
+from jaxrl_vis.studies.engine.cells import Cell, is_finished
+from jaxrl_vis.studies.engine.cluster import Cluster, Job, Training
+from jaxrl_vis.studies.engine.grid import run_cells
+from jaxrl_vis.studies.engine.sweep import Request, make_cells, run_sweep
 
 
 def make_request(runs: Path, **changes) -> Request:

@@ -14,15 +14,15 @@ from jax.experimental.compilation_cache import compilation_cache
 import jaxrl_vis_envs
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
-from jaxrl_vis.devices import enable_compilation_cache
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import trainer
 from jaxrl_vis.run.compiled import programs, trace_cache
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.compiled.trace_cache import VARIABLE, fingerprint
-from jaxrl_vis.run.folder import RunFolder
+from jaxrl_vis.run.storage.folder import RunFolder
 from jaxrl_vis_envs.compiling import compilation
 from jaxrl_vis_envs.compiling.compilation import kernels
 

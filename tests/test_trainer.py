@@ -17,11 +17,13 @@ from jaxrl_vis.config import Config, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import loop as run_loop
-from jaxrl_vis.run import metrics, trained, trainer
-from jaxrl_vis.run.checkpoint import Checkpoints
+from jaxrl_vis.run import trainer
 from jaxrl_vis.run.compiled import memory
 from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
-from jaxrl_vis.run.folder import RunFolder, default_folder, read_config
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.checkpoint import Checkpoints
+from jaxrl_vis.run.storage.folder import RunFolder, default_folder, read_config
+from jaxrl_vis.run.trained import restored_run
 
 
 def test_a_run_reports_logs_and_draws(straight, capsys):
@@ -91,10 +93,10 @@ def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkey
     with pytest.raises(RequestError, match="(evaluate|learn|play|broken_leaves) needs .* --eval-episodes") as refused:
         memory.check_compiled(compiled, already_there=False)
     assert "\n" not in str(refused.value)
-    monkeypatch.setattr(trained, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
+    monkeypatch.setattr(restored_run, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
     monkeypatch.setattr(memory, "available_bytes", lambda: 100)
     with pytest.raises(RequestError, match="evaluate needs"):
-        trained.evaluate_run(straight[0])
+        restored_run.evaluate_run(straight[0])
 
 
 @pytest.mark.parametrize("break_state", [False, True])
@@ -220,21 +222,21 @@ def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
     def fake_make_trainer(config, *arguments, **options):
         return trainer.Trainer(config, FakeProgram(config), *arguments, **options)
 
-    monkeypatch.setattr(trained, "make_trainer", fake_make_trainer)
-    values = trained.evaluate_run(path, episodes=7)
+    monkeypatch.setattr(restored_run, "make_trainer", fake_make_trainer)
+    values = restored_run.evaluate_run(path, episodes=7)
     assert values["eval/success"] == pytest.approx(reports[-1].metrics["eval/success"], rel=1e-5)
     assert [type(value) for value in values["eval/success"]] == [float, float]
     for suffix in (".gif", ".png", ".html"):
-        trained.play_run(path, tmp_path / f"out{suffix}", episodes=4)
+        restored_run.play_run(path, tmp_path / f"out{suffix}", episodes=4)
         assert (tmp_path / f"out{suffix}").stat().st_size > 1000
     with pytest.raises(RequestError, match="must end in"):
-        trained.play_run(path, tmp_path / "out.avi")
+        restored_run.play_run(path, tmp_path / "out.avi")
     (tmp_path / "empty").mkdir()
     with pytest.raises(RequestError, match="no run in"):
-        trained.evaluate_run(tmp_path / "empty")
+        restored_run.evaluate_run(tmp_path / "empty")
     RunFolder(tmp_path / "new").open(small_config())
     with pytest.raises(RequestError, match="no usable checkpoint"):
-        trained.evaluate_run(tmp_path / "new")
+        restored_run.evaluate_run(tmp_path / "new")
 
 
 @pytest.mark.slow
@@ -268,9 +270,9 @@ def test_the_script_runs(tmp_path, checkout, capsys, monkeypatch):
     assert len((checkout / "notebooks" / "train.py").read_text().splitlines()) < 40
     script["main"]("debug", "VisualReacher", str(tmp_path / "run"))
     assert "last evaluation" in capsys.readouterr().out
-    figures = trained.evaluate_run(tmp_path / "run")
+    figures = restored_run.evaluate_run(tmp_path / "run")
     assert len(figures["eval/success"]) == 1
-    trained.play_run(tmp_path / "run", tmp_path / "strip.png", episodes=8)  # as many as an evaluation: compiled already
+    restored_run.play_run(tmp_path / "run", tmp_path / "strip.png", episodes=8)  # as many as an evaluation: compiled already
     assert (tmp_path / "strip.png").exists()
 
 

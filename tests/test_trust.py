@@ -12,8 +12,9 @@ import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run import trained, trust
-from jaxrl_vis.run.folder import RunFolder, read_config
+from jaxrl_vis.run import trust
+from jaxrl_vis.run.storage.folder import RunFolder, read_config
+from jaxrl_vis.run.trained import restored_run
 
 EVIL = """
 from pathlib import Path
@@ -60,7 +61,12 @@ def test_a_strangers_code_does_not_run_without_a_word(stranger, capsys, command)
 
 
 def test_python_needs_a_word_as_well(stranger, tmp_path):
-    for use in (jaxrl_vis.load_policy, trained.evaluate_run, trained.open_run, lambda run: trained.play_run(run, "a.gif")):
+    for use in (
+        jaxrl_vis.load_policy,
+        restored_run.evaluate_run,
+        restored_run.open_run,
+        lambda run: restored_run.play_run(run, "a.gif"),
+    ):
         with pytest.raises(RequestError, match="runs code that is not of this project.*pass trust=True"):
             use("run")
     assert not Path("ran").exists()

@@ -14,14 +14,15 @@ from fake_program import FakeProgram, interrupted_at, small_config
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config
-from jaxrl_vis.run import recent, verification
-from jaxrl_vis.run.checkpoint import Checkpoints
-from jaxrl_vis.run.folder import read_config, read_record, read_run_id
-from jaxrl_vis.run.inspection import Expected, Findings, check_record, missing_rows, read_file
-from jaxrl_vis.run.metrics import RUN_ID
-from jaxrl_vis.run.sums import compare_sums, write_sums
+from jaxrl_vis.run.storage import recent
+from jaxrl_vis.run.storage.checkpoint import Checkpoints
+from jaxrl_vis.run.storage.folder import read_config, read_record, read_run_id
+from jaxrl_vis.run.storage.metrics import RUN_ID
+from jaxrl_vis.run.storage.sums import compare_sums, write_sums
 from jaxrl_vis.run.trainer import Trainer
-from jaxrl_vis.run.verification import Verification, verify
+from jaxrl_vis.run.verifying import verification
+from jaxrl_vis.run.verifying.inspection import Expected, Findings, check_record, missing_rows, read_file
+from jaxrl_vis.run.verifying.verification import Verification, verify
 
 
 def expected_in(path: Path) -> Expected:
