@@ -20,7 +20,7 @@ from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.storage.folder import read_config
 from jaxrl_vis.run.storage.recent import Recent
 
-FAKE = Path(__file__).with_name("fake_program.py")
+FAKE = Path(__file__).parents[1] / "fake_program.py"
 
 
 def start(run_dir: Path, environment: dict[str, str]) -> subprocess.Popen:

@@ -9,7 +9,7 @@ import pytest
 from jaxrl_vis.cli import all_commands
 from jaxrl_vis.cli.parsing import parse
 
-SCRIPT = runpy.run_path(str(Path(__file__).resolve().parents[1] / "benchmarks" / "install_smoke_test.py"))
+SCRIPT = runpy.run_path(str(Path(__file__).resolve().parents[2] / "benchmarks" / "install_smoke_test.py"))
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import scipy.ndimage
 
 from jaxrl_vis.learner.auxtasks import farneback
 
-REFERENCES = Path(__file__).parent / "data" / "optical_flow.npz"
+REFERENCES = Path(__file__).parents[1] / "data" / "optical_flow.npz"
 TASKS = ("VisualFetchReach", "VisualHandReach", "VisualFingerTurn")
 flow = jax.jit(farneback.flow)
 

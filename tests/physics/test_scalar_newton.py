@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_steps import Float32Numpy, arithmetic_of, columns
 
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
 from jaxrl_vis_envs.physics.scalar import line_search, scalar_model, scalar_newton, sparse_algebra, steps
 from jaxrl_vis_envs.physics.scalar.scalar_newton import Problem, Solution
-from tests.test_steps import Float32Numpy, arithmetic_of, columns
 
 DRY, CONE = 1, (4, 3)
 JOINTS, ITERATIONS = 4, 12

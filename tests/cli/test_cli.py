@@ -38,7 +38,7 @@ def one_line(capsys: pytest.CaptureFixture[str], status: int) -> str:
     return lines[0]
 
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 HELP = [[], ["phenotype"], *(name.split() for name in cli.all_commands())]
 
 

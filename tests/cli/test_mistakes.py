@@ -21,7 +21,7 @@ from jaxrl_vis_envs import State
 from jaxrl_vis_envs.adapters.brax import BraxEnv
 from jaxrl_vis_envs.adapters.gymnasium import GymnasiumEnv
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "mistakes.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "mistakes.md"
 ROWS = re.findall(r"^\| .*?`([^`]+)`.*? \| `([^`]+)` \| \[.*?\]\((\S+)\) \|$", DOCUMENT.read_text(), flags=re.MULTILINE)
 THREADS = re.compile(r"https://github\.com/(google/brax|DLR-RM/stable-baselines3|vwxyzjn/cleanrl)/issues/\d+")
 

@@ -69,7 +69,7 @@ def free_port() -> int:
 
 def start(run_dir: Path, count: int, devices: int, *options: str) -> list[subprocess.Popen]:
     """Processes of `two_processes`, with so many devices each."""
-    tests = Path(__file__).parent
+    tests = Path(__file__).parents[1]
     paths = (tests, tests.parent, tests.parent / "envs")
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths)), "XLA_FLAGS": flags}

@@ -22,7 +22,7 @@ from jaxrl_vis_envs.compiling import compilation
 from jaxrl_vis_envs.tasks.config import TaskConfig
 
 BATCH, STEPS = 32, 8
-SOURCES = pathlib.Path(__file__).resolve().parents[1] / "envs"
+SOURCES = pathlib.Path(__file__).resolve().parents[2] / "envs"
 SUBPROCESS_ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join((str(SOURCES), str(SOURCES.parent)))}
 TASKS = list(names.TASKS)
 HORIZONS = {"FetchReach": 50, "FingerTurn": 50, "HandReach": 50, "Reacher": 50, "SawyerReach": 25, "StalkReach": 50}

@@ -13,7 +13,7 @@ from benchmarks.claims.prose import Sentence
 from benchmarks.claims.records import Record, study
 from jaxrl_vis.errors import RequestError
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def record(name: str, *seeds: list[float]) -> Record:

@@ -115,7 +115,7 @@ def test_donated_buffers_are_reused():
 
 SHARDED = f"""
 import sys
-sys.path.insert(0, {__file__.rsplit("/", 1)[0]!r})
+sys.path[:0] = [{__file__.rsplit("/", 1)[0]!r}, {__file__.rsplit("/", 2)[0]!r}]
 import jax, numpy as np
 from test_render_transforms import image, setting
 import jaxrl_vis_envs

@@ -35,7 +35,7 @@ from jaxrl_vis.validation import validate
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What `several_devices` has found, on four devices of this CPU."""
-    tests = Path(__file__).parent
+    tests = Path(__file__).parents[1]
     paths = (tests, tests.parent, tests.parent / "envs")
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths)), "XLA_FLAGS": flags}

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from test_steps import columns, lowered_for_cuda, taken
 
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
@@ -15,7 +16,6 @@ from jaxrl_vis_envs.physics import mjx_model, scalar
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.physics.scalar import dynamics, link_frames, links, quaternions, scalar_model, steps_kernel
 from jaxrl_vis_envs.tasks.fetch_reach import FetchReach, VisualFetchReachConfig
-from tests.test_steps import columns, lowered_for_cuda, taken
 
 # Welds of two bodies that hang on one joint, on a mocap body and on the world; joints and geoms that mocap bodies carry; planes
 # that lean and that mocap bodies carry; at places and along axes that nothing folds away.

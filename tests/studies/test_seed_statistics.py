@@ -33,4 +33,4 @@ def test_intervals_cover_the_mean_about_as_often_as_they_say():
 
 def test_tables_of_the_target_decay_study_say_what_the_records_say():
     check = [sys.executable, "benchmarks/target_decay.py", "--check"]
-    assert subprocess.run(check, cwd=Path(__file__).parent.parent).returncode == 0
+    assert subprocess.run(check, cwd=Path(__file__).resolve().parents[2]).returncode == 0

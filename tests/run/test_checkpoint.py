@@ -19,7 +19,7 @@ from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 
-FAKE = Path(__file__).with_name("fake_program.py")
+FAKE = Path(__file__).parents[1] / "fake_program.py"
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from jaxrl_vis_envs.render import Scene, render, render_planes
 from jaxrl_vis_envs.render.mounts import Mount
 from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
-REFERENCES = pathlib.Path(__file__).parent / "data" / "render_references.npz"
+REFERENCES = pathlib.Path(__file__).parents[1] / "data" / "render_references.npz"
 POSES = ("geom_xpos", "geom_xmat", "cam_xpos", "cam_xmat", "xpos", "xmat", "site_xpos", "site_xmat")
 
 BALL_XML = """

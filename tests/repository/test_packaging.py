@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 # Folders and single files of jaxrl_vis. A folder imports from earlier rows only; files of one row do not import each other. A
 # file of a folder may have a row of its own.

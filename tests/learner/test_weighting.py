@@ -296,7 +296,7 @@ assert len(spread["x"].devices()) == 2
 assert_close(gradient(params, state, spread), gradient(params, state, batch))
 """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
-    path = os.pathsep.join((str(Path(__file__).parent), clean_environment["PYTHONPATH"]))
+    path = os.pathsep.join((str(Path(__file__).parents[1]), clean_environment["PYTHONPATH"]))
     environment = {**clean_environment, "PYTHONPATH": path, "XLA_FLAGS": flags}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

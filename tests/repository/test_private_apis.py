@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "private_apis.md"
 # Public by documentation, although their names begin like private ones.
 _OF_NAMED_TUPLES = {"_asdict", "_fields", "_make", "_replace", "_exit"}

@@ -9,7 +9,7 @@ import pytest
 from benchmarks import parity
 from benchmarks.tasks import environments, one_step
 
-DATA = pathlib.Path(__file__).parent / "data"
+DATA = pathlib.Path(__file__).parents[1] / "data"
 RECORDINGS = {
     "fetch_reach": "FetchReach",
     "fetch_reach_table": "FetchReach",  # benchmarks/record_originals.py FetchReach --seed 3 --lower .25

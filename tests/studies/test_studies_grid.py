@@ -159,7 +159,7 @@ def test_signals_end_the_cells_after_saving(
 ) -> None:
     code = f"""
 import sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[1])!r}]
 from pathlib import Path
 from test_studies_grid import CPU, Script, make_cell
 from jaxrl_vis.errors import Terminated
@@ -307,7 +307,7 @@ def test_devices_are_asked_for_in_a_process_of_their_own() -> None:
 
 def test_real_runs_are_trained_and_a_wrong_one_says_why(tmp_path: Path) -> None:
     """By processes of their own, on a task that compiles in a moment."""
-    own = {"env": "point_mass:PointMass", "env_folder": str(Path(__file__).parent), "env_steps": 80, "seeds": 1}
+    own = {"env": "point_mass:PointMass", "env_folder": str(Path(__file__).parents[1]), "env_steps": 80, "seeds": 1}
     own |= {"image_size": 8, "encoder_filters": (4,), "eval_episodes": 2}  # as in test_own_tasks: it is compiled once for both
     cells = [make_cell("wrong", **own, batch_size=0), make_cell("right", **own)]
     failures = run_cells(cells, tmp_path, lambda: CPU, say=lambda _: None)
