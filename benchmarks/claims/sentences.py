@@ -210,15 +210,18 @@ def _choices() -> Iterator[Sentence]:
         other: [c.verdict(claim(task, "balance"), claim(task, other), tasks[task]) for task in tasks]
         for other in ("none", "ol_aux_5")
     }
-    quote = "better than none on all three tasks, and level with OL-AUX-5 within these budgets"
-    holds = against["none"] == ["better"] * 3 and against["ol_aux_5"] == ["level"] * 3
+    quote = (
+        "better than none on all three tasks. OL-AUX-5 is better on the hand and level on the other two within these budgets"
+    )
+    by_task = dict(zip(tasks, against["ol_aux_5"], strict=True))
+    holds = against["none"] == ["better"] * 3 and by_task == {FETCH: "level", HAND: "worse", FINGER: "level"}
     yield Sentence(GUIDE, quote, claim(HAND, "balance").name, holds)
     quote = "over 2 M steps it is better than balancing on the hand"
     long = [claim(HAND, name, 2_000_000) for name in ("ol_aux_5", "balance")]
     yield Sentence(GUIDE, quote, long[0].name, c.verdict(*long, 2_000_000) == "better")
     alone = [c.verdict(claim(task, "inverse_dynamics"), claim(task, "ol_aux_5"), tasks[task]) for task in (FETCH, HAND, FINGER)]
-    quote = "is better than OL-AUX-5 with all five on FetchReach and the hand, level on the finger"
-    yield Sentence(GUIDE, quote, claim(HAND, "inverse_dynamics").name, alone == ["better", "better", "level"])
+    quote = "is better than OL-AUX-5 with all five on FetchReach and the hand, worse on the finger"
+    yield Sentence(GUIDE, quote, claim(HAND, "inverse_dynamics").name, alone == ["better", "better", "worse"])
     ours = {task: indicator.run(task, OURS) for task in (REACHER, FETCH, SAWYER)}
     oracle = {task: indicator.run(task, "oracle") for task in ours}
     nearer = [ours[task].median(metric=DISTANCE) < oracle[task].median(metric=DISTANCE) for task in (FETCH, SAWYER)]
