@@ -62,10 +62,11 @@ class GymnasiumPixels(gymnasium.Wrapper):
         return self._observe(own), reward, terminated, truncated, info
 
     def _observe(self, own: Any) -> Any:
-        images = self._render(self._inner.data.qpos) | self._goals
+        # Goal images are copied: callers keep, and may change, what an observation holds.
+        images = self._render(self._inner.data.qpos) | {name: image.copy() for name, image in self._goals.items()}
         layout = self._form.layout
         if layout == "image":
-            return np.asarray(self._form.joined(images))  # type: ignore[arg-type]
+            return np.array(self._form.joined(images))  # type: ignore[arg-type]
         if layout == "images":
             return images
         return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
@@ -77,7 +78,7 @@ class GymnasiumPixels(gymnasium.Wrapper):
         self._drawn.mocap_pos[:], self._drawn.mocap_quat[:] = data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self.views.mj_model, self._drawn)
         images = self._draw({name: np.asarray(getattr(self._drawn, name), np.float32) for name in _POSES})
-        return {name: np.asarray(image) for name, image in images.items()}
+        return {name: np.array(image) for name, image in images.items()}
 
     def _space(self) -> gymnasium.Space:
         """Return the space of observations."""

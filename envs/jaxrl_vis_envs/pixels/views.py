@@ -20,6 +20,7 @@ Cameras = Camera | Iterable[Camera] | Mapping[str, Camera]
 ImageSize = int | tuple[int, int]
 """Height and width in pixels, or one number for both."""
 
+
 class Views:
     """Function from the poses of one environment to its images from several cameras.
 
@@ -111,7 +112,7 @@ def named_cameras(mj_model: mujoco.MjModel, cameras: Cameras) -> dict[str, Camer
         ValueError: There are no cameras, or two of one name.
     """
     if isinstance(cameras, Mapping):
-        by_name: dict[str, Any] = dict(cameras)
+        by_name: dict[str, Any] = {str(name): camera for name, camera in cameras.items()}
     else:
         single = cameras is None or isinstance(cameras, str | int | np.integer | mujoco.MjvCamera)
         listed: list[Any] = [cameras] if single else list(cameras)  # type: ignore[arg-type]
