@@ -219,7 +219,7 @@ def test_brax_environments_under_brax_wrappers(backend: str) -> None:
 
 
 def test_observations_have_the_form_that_brax_vision_networks_take(playground: pixels.PixelEnv) -> None:
-    networks = make_ppo_networks_vision(playground.observation_size, playground.action_size, state_obs_key="state")
+    networks = make_ppo_networks_vision(playground.observation_size, playground.action_size)
     obs = jax.eval_shape(playground.reset, jax.random.PRNGKey(0)).obs
     zeros = jax.tree.map(lambda leaf: jnp.zeros((2, *leaf.shape), leaf.dtype), obs)
     network = networks.policy_network

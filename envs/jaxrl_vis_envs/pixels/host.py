@@ -28,24 +28,32 @@ class _Drawn:
         vars(self).update(arrays)
 
 
-class GymnasiumPixels(gymnasium.Wrapper):
+class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """Gymnasium wrapper whose observations are, or contain, images of a MuJoCo environment; see `wrap`.
 
     Poses are computed from the joint positions: those in the environment's data are older by one physics step.
+
+    Args:
+        env: The environment.
+        goal_image: Source of goal images, see `wrap`.
+        form: Fields of `Format`.
+        **options: Arguments of `Views`.
 
     Attributes:
         views: Cameras, outputs and scenes.
     """
 
-    def __init__(self, env: gymnasium.Env, views: Views, form: Format, goal_image: GoalImage = None) -> None:
-        super().__init__(env)
-        self.views = views
+    def __init__(self, env: gymnasium.Env, goal_image: GoalImage, form: dict[str, Any], **options: Any) -> None:
+        # Arguments, not objects made of them: Gymnasium stores them in the environment's spec, to make it again.
+        gymnasium.utils.RecordConstructorArgs.__init__(self, goal_image=goal_image, form=form, **options)
+        gymnasium.Wrapper.__init__(self, env)
+        self.views = views = Views(poses.find_model(env), **options)
         self._inner: Any = env.unwrapped
-        self._form, self._goal_image = form, goal_image
+        self._form, self._goal_image = Format(**form), goal_image
         self._names = formats.image_names(views.outputs)
         self._drawn = mujoco.MjData(views.mj_model)
         self._goals: dict[str, np.ndarray] = {}
-        self._draw = jax.jit(lambda arrays: form.images(views(_Drawn(arrays))))
+        self._draw = jax.jit(lambda arrays: self._form.images(views(_Drawn(arrays))))
         self.observation_space = self._space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

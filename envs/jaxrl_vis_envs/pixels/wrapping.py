@@ -76,11 +76,12 @@ def wrap(
         raise ValueError(f"step is for a mujoco.MjModel; {type(env).__name__} has its own")
     is_model = isinstance(env, mujoco.MjModel)
     mj_model = env if is_model else poses.find_model(env)
-    views = Views(mj_model, cameras, image_size, outputs, clip_range, **scene_options)
+    options = dict(cameras=cameras, image_size=image_size, outputs=outputs, clip_range=clip_range, **scene_options)
     if not is_model and isinstance(getattr(getattr(env, "unwrapped", None), "data", None), mujoco.MjData):
         from jaxrl_vis_envs.pixels.host import GymnasiumPixels
 
-        return GymnasiumPixels(env, views, Format(layout, dtype or "uint8", depth_range), goal_image)
+        return GymnasiumPixels(env, goal_image, dict(layout=layout, dtype=dtype or "uint8", depth_range=depth_range), **options)
+    views = Views(mj_model, **options)
     if is_model:
         from jaxrl_vis_envs.pixels.model_env import ModelEnv
 
