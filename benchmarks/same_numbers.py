@@ -36,10 +36,8 @@ RUNS: dict[str, tuple[tuple[str, ...], ...]] = {
         f"method_{name}": (("VisualReacher", *_DEBUG, "--method", name),)
         for name in ("autoencoder", "indicator", "indicator_balance_filter")
     },
-    **{
-        f"weighting_{name}": ((*_ALL_LOSSES, "--weighting", name),)
-        for name in ("none_log", "sum", "fixed", "balance", "cosine")
-    },
+    **{f"weighting_{name}": ((*_ALL_LOSSES, "--weighting", name),) for name in ("sum", "fixed", "balance", "cosine")},
+    "weighting_none_log": (("VisualReacher", *_DEBUG, "--weighting", "none_log"),),
     "weighting_ol_aux": ((*_ALL_LOSSES, "--weighting", "ol_aux"),),
     "weighting_ol_aux_ablation": ((*_ALL_LOSSES, "--weighting", "ol_aux_ablation"),),
     "resumed": (

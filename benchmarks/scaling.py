@@ -38,18 +38,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from jaxrl_vis import preset, processes
+from jaxrl_vis import preset
 from jaxrl_vis.bench.conditions import Watch
 from jaxrl_vis.bench.record import Measurement, to_record, write_json
 from jaxrl_vis.config import Config
-from jaxrl_vis.devices import enable_compilation_cache
+from jaxrl_vis.host import distributed
+from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.parallel.sharding import make_layout
 from jaxrl_vis.learner.parallel.shards import DATA
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.arrays import named_leaves
-from jaxrl_vis.run.checkpoint import FULL, Checkpoints
 from jaxrl_vis.run.compiled.programs import Programs
+from jaxrl_vis.run.storage.arrays import named_leaves
+from jaxrl_vis.run.storage.checkpoint import FULL, Checkpoints
 
 QUICK = {
     "image_size": 16,
@@ -292,7 +293,7 @@ def measure_as_process(timed: list[Timed], cycles: int) -> None:
     seconds = []
     for configuration in timed:
         configuration.compile()
-        processes.meet("compiled")
+        distributed.meet("compiled")
         seconds.append(configuration.run(cycles))
         configuration.loop = None
     print(json.dumps(seconds), flush=True)
@@ -330,7 +331,7 @@ def main() -> None:
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     enable_compilation_cache()
     if options.coordinator:
-        processes.start(processes.Rank(options.coordinator, 2, options.process_id))
+        distributed.start(distributed.Rank(options.coordinator, 2, options.process_id))
     began, there = time.perf_counter(), len(jax.devices())
     numbers = [count for count in options.devices or (2, 4, 8) if 1 < count <= there]
     if not numbers:

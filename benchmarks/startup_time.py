@@ -54,7 +54,7 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
 
     clock.lap("import jaxrl_vis")
     from jaxrl_vis import preset
-    from jaxrl_vis.devices import check_devices, enable_compilation_cache, start_devices
+    from jaxrl_vis.host.devices import check_devices, enable_compilation_cache, start_devices
     from jaxrl_vis.learner.environment import locate_env, make_env
     from jaxrl_vis.learner.train_step import make_train_step
     from jaxrl_vis.run.compiled.programs import Programs

@@ -19,9 +19,9 @@ from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.report.plots import show_steps
-from jaxrl_vis.run.folder import read_record
-from jaxrl_vis.run.metrics import read_rows
-from jaxrl_vis.studies.authors import mean_difference, released_curves
+from jaxrl_vis.run.storage.folder import read_record
+from jaxrl_vis.run.storage.metrics import read_rows
+from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
 
 PAGE = CHECKOUT / "docs/lab/target_decay.md"

@@ -16,9 +16,9 @@ __version__ = "0.1.0"
 # Public name -> the module that holds it, imported at first use.
 _HOMES = {
     "Config": "jaxrl_vis.config",
-    "Policy": "jaxrl_vis.run.policy",
+    "Policy": "jaxrl_vis.run.trained.policy",
     "RequestError": "jaxrl_vis.errors",
-    "load_policy": "jaxrl_vis.run.policy",
+    "load_policy": "jaxrl_vis.run.trained.policy",
     "preset": "jaxrl_vis.config",
     "Trainer": "jaxrl_vis.run.trainer",
     "make_trainer": "jaxrl_vis.run.trainer",
@@ -27,7 +27,7 @@ _HOMES = {
 if TYPE_CHECKING:
     from jaxrl_vis.config import Config, preset
     from jaxrl_vis.errors import RequestError
-    from jaxrl_vis.run.policy import Policy, load_policy
+    from jaxrl_vis.run.trained.policy import Policy, load_policy
     from jaxrl_vis.run.trainer import Trainer, make_trainer
 
 __all__ = ["Config", "Policy", "RequestError", "Trainer", "__version__", "load_policy", "make_trainer", "preset"]

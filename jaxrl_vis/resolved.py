@@ -5,8 +5,8 @@ import math
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.methods import METHODS, Method
-from jaxrl_vis.plugins import call, find
 
 
 @dataclasses.dataclass(frozen=True)

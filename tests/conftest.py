@@ -37,6 +37,9 @@ import hypothesis
 import jax
 import pytest
 
+# Test files share fixtures and small helpers across folders.
+sys.path.extend(str(folder) for folder in sorted(Path(__file__).parent.iterdir()) if folder.is_dir())
+
 # A script's shell lets what it starts in the background ignore Ctrl-C, which would be passed on to runs that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -22,9 +22,9 @@ from jaxrl_vis.learner.acting.rollout_parts import played_spec
 from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.memory.replay import make_replay
 from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE
-from jaxrl_vis.run import metrics
-from jaxrl_vis.run.checkpoint import Checkpoints
-from jaxrl_vis.run.folder import read_run_id
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.checkpoint import Checkpoints
+from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.types import Episodes, LoopState, NormalizerState, ReplayState, TrainState
 

@@ -1,4 +1,4 @@
-"""Makes tests/data/render_references.npz: what MuJoCo's own renderer draws, for tests/test_render.py to compare with.
+"""Makes tests/data/render_references.npz: what MuJoCo's own renderer draws, for tests/render/test_render.py to compare with.
 
 Needs a GL library; the test does not. Run from the repository root:
 

@@ -10,7 +10,7 @@ from jaxrl_vis.errors import RequestError
 
 def read_config(folder: Path) -> None:
     from jaxrl_vis.config import Config
-    from jaxrl_vis.run.folder import read_config, read_log, read_record
+    from jaxrl_vis.run.storage.folder import read_config, read_log, read_record
 
     record = read_record(folder)
     assert isinstance(record, dict)
@@ -19,7 +19,7 @@ def read_config(folder: Path) -> None:
 
 
 def read_rows(folder: Path) -> None:
-    from jaxrl_vis.run.metrics import read_rows, scalars
+    from jaxrl_vis.run.storage.metrics import read_rows, scalars
 
     for row in read_rows(folder / "metrics.jsonl"):
         assert type(row["iteration"]) is int and type(row["seed"]) is int

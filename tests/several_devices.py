@@ -17,9 +17,9 @@ from learners import train_iteration
 from jaxrl_vis.config import preset
 from jaxrl_vis.learner.parallel.sharding import DATA, Layout, Shards, Spec
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.run.arrays import named_leaves
-from jaxrl_vis.run.checkpoint import Checkpoints
 from jaxrl_vis.run.compiled.programs import Programs
+from jaxrl_vis.run.storage.arrays import named_leaves
+from jaxrl_vis.run.storage.checkpoint import Checkpoints
 
 ENV = probes.GoWhereTold()
 CONFIG = preset(

@@ -9,12 +9,13 @@ import os
 import sys
 from pathlib import Path
 
-from jaxrl_vis import cli, processes
+from jaxrl_vis import cli
+from jaxrl_vis.host import distributed
 
 
 def train(options) -> int:
     if options["count"] > 1:
-        processes.start(processes.Rank(options["coordinator"], options["count"], options["index"]), 60)
+        distributed.start(distributed.Rank(options["coordinator"], options["count"], options["index"]), 60)
     import jax
     import probe_environments as probes
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.claims.records import DISTANCE, SUCCESS, Record
 from jaxrl_vis.report.plots import show_steps
-from jaxrl_vis.studies.authors import mean_difference, released_curves
+from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
 
 SIGNIFICANT = 0.05

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.ledger.ablations import read_curves
 from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.run.folder import read_record
+from jaxrl_vis.run.storage.folder import read_record
 
 SUCCESS, DISTANCE = "eval/success", "eval/goal_distance"
 FIRST_FRESH_SEED = 100  # seeds below are used for tuning

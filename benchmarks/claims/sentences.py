@@ -12,7 +12,7 @@ from benchmarks.claims.indicator import OURS, REACHER, SAWYER
 from benchmarks.claims.ol_aux import LAB
 from benchmarks.claims.prose import Sentence
 from benchmarks.claims.records import DISTANCE, Record, ablation, learning, study
-from jaxrl_vis.studies.authors import mean_difference, released_curves
+from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
 
 DECAY, GUIDE, REWARDS = "docs/lab/target_decay.md", ol_aux.GUIDE, indicator.GUIDE

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from benchmarks.ledger import evidence, pages, readme_tables, staleness
 from benchmarks.ledger.records import CHECKOUT, RESULTS
-from jaxrl_vis import provenance
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host import provenance
 
 
 def complaints(results: Path, checkout: Path) -> list[str]:

@@ -14,9 +14,9 @@ from typing import Any
 
 from jaxrl_vis.bench.record import SCHEMA, read_json
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.run.command import training_command
-from jaxrl_vis.run.folder import RunFolder, read_config, read_record
+from jaxrl_vis.run.storage.folder import RunFolder, read_config, read_record
 from jaxrl_vis_envs.documents import parse_json
 
 FOLDER = "learning"

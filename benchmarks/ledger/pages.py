@@ -9,7 +9,7 @@ from benchmarks.ledger import ablations, readme_tables, render_table, scaling_ta
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.host.files import write_atomically
 
 Writer = Callable[[Path], str | None]
 """Function from the folder of records to a table in Markdown; None leaves the page's table as it is."""

@@ -79,7 +79,7 @@ def speed_table(results: Path) -> str:
 
 
 # Fields without an effect on learning: files on the disk, and the method of the same gradients.
-_NEUTRAL = ("checkpoint_interval", "full_checkpoint_interval", "aux_gradients")
+_NEUTRAL = ("checkpoint_interval", "full_checkpoint_interval")
 _LOGARITHMIC = ("actor_log",)
 
 

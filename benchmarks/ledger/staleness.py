@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.ledger.records import CHECKOUT, is_cpu_record, read_all
-from jaxrl_vis import provenance
+from jaxrl_vis.host import provenance
 
 _ENVS = "envs/jaxrl_vis_envs"
 _PHYSICS = tuple(f"{_ENVS}/{name}" for name in ("base.py", "goals.py", "compiling", "physics", "tasks/mjx_env.py"))

@@ -10,8 +10,8 @@ from jaxrl_vis import bench
 from jaxrl_vis.bench.record import user_folder
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.cli.checks import check_counts, check_env
-from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.report.outputs import check_writable
 
 _OPTIONS: dict[str, dict[str, Any]] = {

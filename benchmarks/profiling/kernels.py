@@ -24,8 +24,8 @@ import jax.numpy as jnp
 from jaxrl_vis import fields, preset
 from jaxrl_vis.bench.update import seed_keys, start
 from jaxrl_vis.config import Config
-from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.run.compiled.programs import rarely_collecting_garbage

@@ -24,7 +24,7 @@ import jaxrl_vis_envs
 from jaxrl_vis.bench.timing import compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.config import preset
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.networks.normalizer import Scaling

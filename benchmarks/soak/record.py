@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from benchmarks.soak.alone import ALONE
 from benchmarks.soak.faults import FAULTS
-from jaxrl_vis import provenance
+from jaxrl_vis.host import provenance
 
 PROMISES = {name: fault.promise for name, fault in (FAULTS | ALONE).items()}
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.stalks.worker_rate import Once, options, print_rate
-from jaxrl_vis.provenance import device_name
+from jaxrl_vis.host.provenance import device_name
 from jaxrl_vis.stalks.grasping.evaluation.scoring import Scene, draw_scene
 from jaxrl_vis.stalks.grasping.masks.painter import SHIPPED, Painter, read_weights
 from jaxrl_vis.stalks.grasping.perception.perceive import Perception, perceive

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.stalks.worker_rate import Once, options, print_rate, timed
-from jaxrl_vis.provenance import device_name
+from jaxrl_vis.host.provenance import device_name
 from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, reduce
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights

@@ -66,7 +66,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
 
 def keep_masks(options: argparse.Namespace) -> None:
     """Draws plots, and writes their masks."""
-    from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
+    from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 
     if options.workers > 1:
         share_accelerator()

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from jaxrl_vis.evaluation_pool import share_accelerator, worker_pool
+from jaxrl_vis.host.worker_pool import share_accelerator, worker_pool
 
 Once = Callable[[int], list[float]]
 """Does it once, with the input of that number, and says something of what came out."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from jaxrl_vis import fields
 from jaxrl_vis.cli.parsing import _describe_fields
 from jaxrl_vis.config import OF_IMAGES, OF_ORACLE, OF_TASK, PRESETS, Config
-from jaxrl_vis.run.folder import MAY_CHANGE
+from jaxrl_vis.run.storage.folder import MAY_CHANGE
 
 PAGE = Path(__file__).resolve().parents[1] / "configuration.md"
 BEGIN, END = "<!-- fields: begin -->\n", "<!-- fields: end -->\n"

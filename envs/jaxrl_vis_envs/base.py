@@ -7,9 +7,9 @@
 
 An environment object holds only constants (model, camera, configuration); a `State` holds everything that changes, so every
 method is a pure function that can be jitted, vmapped, scanned and differentiated, in forward and reverse mode. On a GPU,
-differentiate inside ``compiling.compilation.kernels(False)``, because the physics kernels define no derivatives. Episodes
-have a fixed length (`GoalEnv.horizon`), ``done`` is always 0, and nothing resets automatically, so the final observation is
-never lost.
+differentiate inside ``compiling.compilation.kernels(False)``, because the physics kernels define no derivatives. Episodes have
+a fixed length (`GoalEnv.horizon`), ``done`` is always 0, and nothing resets automatically, so the final observation is never
+lost.
 """
 
 import abc

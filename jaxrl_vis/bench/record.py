@@ -10,10 +10,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis import files, provenance
 from jaxrl_vis.bench.conditions import why_not_comparable
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import user_cache, write_atomically
+from jaxrl_vis.host import files, provenance
+from jaxrl_vis.host.files import user_cache, write_atomically
 
 SCHEMA = 1
 REVISION_DIGITS = 12

@@ -17,12 +17,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jaxrl_vis
-from jaxrl_vis import processes
 from jaxrl_vis.cli import bench, doctor, envs, eval, figure, play, sweep, train, verify
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
+from jaxrl_vis.host import distributed
+from jaxrl_vis.host.streams import SafeStream, detach_broken_streams, reserve_standard_files, safe_streams
 from jaxrl_vis.run.signals import Ending, signal_name
-from jaxrl_vis.streams import SafeStream, detach_broken_streams, reserve_standard_files, safe_streams
 
 DESCRIPTION = "Trains robots to reach goals given only as images."
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `jaxrl_vis.stalks`, see `all_commands`
@@ -106,7 +106,7 @@ def _run_with_status(words: Sequence[str], ending: Ending) -> int:
         if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # from wherever a path was first used
             print(f"{PROGRAM}: {str(error.filename)[:80]}... cannot be used ({error.strerror})", file=sys.stderr)
             return _STATUS[RequestError]
-        if not processes.are_several():
+        if not distributed.are_several():
             raise
         traceback.print_exc()
         print(
@@ -143,8 +143,8 @@ def entry() -> None:
     status = main(give_up=lambda number: os._exit(_ended_by(number)))
     detach_broken_streams()
     if status == _STATUS[RequestError]:
-        processes.leave_together()
-    if status > 128 or (status and processes.are_several()):
+        distributed.leave_together()
+    if status > 128 or (status and distributed.are_several()):
         os._exit(status)  # failed processes must not wait for each other
     sys.exit(status)
 

@@ -9,8 +9,8 @@ import tyro
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.config import Pixels
-from jaxrl_vis.devices import check_devices, claim_memory, count_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices
 from jaxrl_vis.methods import AuxTaskName, WeightingName
 from jaxrl_vis.report.outputs import check_writable
 

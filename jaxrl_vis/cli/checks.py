@@ -4,12 +4,12 @@ import sys
 from pathlib import Path
 
 from jaxrl_vis.cli.parsing import PROGRAM
-from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import check_path
+from jaxrl_vis.host.devices import check_devices
+from jaxrl_vis.host.files import check_path
 from jaxrl_vis.run import trust as trusting
-from jaxrl_vis.run.folder import read_config
 from jaxrl_vis.run.signals import shielded_children
+from jaxrl_vis.run.storage.folder import read_config
 
 
 def check_env(name: str, folder: str | None = None) -> None:

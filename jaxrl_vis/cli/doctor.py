@@ -10,6 +10,6 @@ class Doctor:
 
 def run(_: Doctor) -> int:
     """Checks the installation; returns 1 if something fails."""
-    from jaxrl_vis import doctor
+    from jaxrl_vis.host import doctor
 
     return doctor.main()

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import AlsoPositional
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.host.devices import check_devices
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
 from jaxrl_vis.cli.parsing import AlsoPositional
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.report.outputs import check_writable
 
 
@@ -32,7 +32,7 @@ def run(options: Eval) -> int:
     check_counts(episodes=options.episodes)
     if options.json is not None:
         check_writable(options.json, "--json")
-    from jaxrl_vis.run.trained import evaluate_run
+    from jaxrl_vis.run.trained.restored_run import evaluate_run
 
     figures = evaluate_run(options.run_dir, episodes=options.episodes, keep_programs=True, trust=trust)
     for name, per_seed in figures.items():

@@ -8,12 +8,12 @@ import tyro
 
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.config import PRESETS
-from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.report.outputs import check_figure, check_writable
 
 if TYPE_CHECKING:
-    from jaxrl_vis.studies.show import Request
+    from jaxrl_vis.studies.figures.show import Request
 
 FigureName = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
 UNFINISHED = 3
@@ -77,9 +77,9 @@ def run(options: Figure) -> int:
     for file in (out.with_suffix(".md"), out.with_suffix(".csv")):
         check_writable(file, "--out")
     # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
-    from jaxrl_vis.studies import figures
+    from jaxrl_vis.studies.figures import make
 
-    return 0 if figures.make_figure(_request(options, out)) else UNFINISHED
+    return 0 if make.make_figure(_request(options, out)) else UNFINISHED
 
 
 def _draw_quadratic(options: Figure) -> int:
@@ -104,10 +104,10 @@ def _request(options: Figure, out: Path) -> "Request":
     Raises:
         RequestError: An option is invalid.
     """
-    from jaxrl_vis.studies.figures import STUDIES
+    from jaxrl_vis.studies.engine.study import Scope
+    from jaxrl_vis.studies.figures.make import STUDIES
+    from jaxrl_vis.studies.figures.show import Request
     from jaxrl_vis.studies.ol_aux import FETCH, WEIGHTS, check_weights
-    from jaxrl_vis.studies.show import Request
-    from jaxrl_vis.studies.study import Scope
 
     study = STUDIES[options.figure]
     if options.quick and options.preset is not None:

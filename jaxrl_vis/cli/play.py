@@ -36,12 +36,12 @@ def run(options: Play) -> int:
         raise RequestError("--html shows the robot, --aux its images: give one of them")
     trust = may_run_code(options.run_dir, options.trust)
     out = options.out or options.run_dir / ("play.html" if options.html else "play_aux.gif" if options.aux else "play.gif")
-    from jaxrl_vis.run import play_auxiliary, trained
+    from jaxrl_vis.run.trained import play_auxiliary, restored_run
 
     if options.aux:
         play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes, trust=trust)
     else:
-        trained.play_run(
+        restored_run.play_run(
             options.run_dir,
             out,
             episodes=options.episodes,

@@ -12,8 +12,8 @@ from jaxrl_vis.cli.figure import UNFINISHED
 from jaxrl_vis.cli.parsing import DefaultText, FieldsOf
 from jaxrl_vis.cli.train import default_preset, describe_default
 from jaxrl_vis.config import PRESETS, Config
-from jaxrl_vis.devices import guess_accelerator
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.host.devices import guess_accelerator
 from jaxrl_vis.methods import MethodName
 from jaxrl_vis.report.outputs import check_writable
 
@@ -65,7 +65,7 @@ def run(options: Sweep) -> int:
     runs = options.runs or Path("runs") / "sweep"
     check_writable(runs, "--runs", folder=True)
     # Nothing below initialises JAX in this process: the accelerator's memory is for the runs.
-    from jaxrl_vis.studies.sweep import Request, run_sweep
+    from jaxrl_vis.studies.engine.sweep import Request, run_sweep
 
     request = Request(
         tasks=tuple(dict.fromkeys(tasks)),

@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from jaxrl_vis import processes
 from jaxrl_vis.cli.checks import check_counts, check_env, may_run_code
 from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
 from jaxrl_vis.config import PRESETS, Config, preset
-from jaxrl_vis.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.plugins import own_names
+from jaxrl_vis.host import distributed
+from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
+from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.run import loggers
-from jaxrl_vis.run.folder import check_there, default_folder, read_config
-from jaxrl_vis.run.loggers import LoggerName
+from jaxrl_vis.run.loggers import group
+from jaxrl_vis.run.loggers.group import LoggerName
+from jaxrl_vis.run.storage.folder import check_there, default_folder, read_config
 from jaxrl_vis.validation import validate
 
 
@@ -67,7 +67,7 @@ class Train:
     """Number of these processes."""
     process_id: int | None = None
     """Index of this process, from 0; the first one writes metrics and images."""
-    start_timeout: int = processes.START_S
+    start_timeout: int = distributed.START_S
     """Time that they wait for each other at the start, s."""
     trust: bool = False
     """With --resume: execute the run's own code without asking, if its task is module:Name and was started by somebody else."""
@@ -115,13 +115,13 @@ def run(options: Train) -> int:
     """Trains; reports are shown and saved by the trainer."""
     check_counts(start_timeout=options.start_timeout)
     claim_memory()
-    rank = processes.find_rank(options.coordinator, options.num_processes, options.process_id)
+    rank = distributed.find_rank(options.coordinator, options.num_processes, options.process_id)
     if rank is not None:
-        processes.start(rank, options.start_timeout)
+        distributed.start(rank, options.start_timeout)
         options = dataclasses.replace(options, devices=options.devices or "all")
     if options.resume and options.overwrite:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
-    loggers.check(options.log)
+    group.check(options.log)
     if options.run_dir is not None:
         check_there(options.run_dir, options.resume)
     if options.env is not None:

@@ -31,7 +31,7 @@ def run(options: Verify) -> int:
     check_run(options.run_dir)
     trust = may_run_code(options.run_dir, options.trust)
     check_counts(iterations=options.iterations)
-    from jaxrl_vis.run.verification import verify_run
+    from jaxrl_vis.run.verifying.verification import verify_run
 
     report = verify_run(options.run_dir, options.iterations, keep_programs=True, say=print, trust=trust)
     for title, lines in (("not verified", report.unverified), ("note", report.notes), ("elsewhere", report.elsewhere)):

@@ -4,9 +4,10 @@ import dataclasses
 from typing import Any
 
 import jaxrl_vis_envs
-from jaxrl_vis import fields, plugins
+from jaxrl_vis import fields
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.host import plugins
 from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.randomization import typical

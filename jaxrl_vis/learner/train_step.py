@@ -21,6 +21,7 @@ import jax.numpy as jnp
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config
+from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import iteration as iterations
 from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate
 from jaxrl_vis.learner.acting.rollout import Acting, Exploration, play
@@ -34,7 +35,6 @@ from jaxrl_vis.learner.memory.sampling import Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks, compute_dtype
 from jaxrl_vis.learner.parallel.sharding import Layout, make_layout
-from jaxrl_vis.plugins import call, find
 from jaxrl_vis.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis.validation import validate

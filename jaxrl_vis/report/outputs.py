@@ -4,7 +4,7 @@ import tempfile
 from pathlib import Path
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import check_path
+from jaxrl_vis.host.files import check_path
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.provenance import install_command
+from jaxrl_vis.host.provenance import install_command
 from jaxrl_vis.report.colours import depth_colours
 from jaxrl_vis.report.outputs import check_writable
 

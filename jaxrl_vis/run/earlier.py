@@ -7,11 +7,11 @@ from pathlib import Path
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run import metrics
-from jaxrl_vis.run.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.folder import RunFolder, read_run_id
-from jaxrl_vis.run.progress import Progress
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.storage.folder import RunFolder, read_run_id
+from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.types import LoopState
 
 

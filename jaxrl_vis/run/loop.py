@@ -8,8 +8,8 @@ Everything that can refuse a run (folder, lock, memory, checkpoints, compilation
 written or deleted. Metrics are on the disk before the checkpoint of the same iteration is, so a checkpoint never runs ahead of
 metrics.jsonl; and nothing is saved before the iteration's metrics were read and found finite.
 
-Of several processes (`jaxrl_vis.processes`) all train, evaluate and save; the first alone writes everything else. They look for
-signals at boundaries only, where they wait for each other anyway.
+Of several processes (`jaxrl_vis.host.distributed`) all train, evaluate and save; the first alone writes everything else. They
+look for signals at boundaries only, where they wait for each other anyway.
 """
 
 import contextlib
@@ -24,25 +24,26 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError
-from jaxrl_vis.run import earlier, metrics, trust
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
+from jaxrl_vis.host import distributed
+from jaxrl_vis.host.streams import reserve_standard_files, safe_streams
+from jaxrl_vis.run import earlier, trust
 from jaxrl_vis.run.compiled.memory import check_compiled, check_memory, fit_together
 from jaxrl_vis.run.compiled.pending import Pending
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.console import RunConsole, show_seconds, show_shares
-from jaxrl_vis.run.folder import RunFolder, read_record, read_run_id
 from jaxrl_vis.run.goodput import Goodput
-from jaxrl_vis.run.lock import FolderGoneError, Held
-from jaxrl_vis.run.loggers import Loggers
-from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.loggers.console import RunConsole, show_seconds, show_shares
+from jaxrl_vis.run.loggers.group import Loggers
 from jaxrl_vis.run.pace import Pace
-from jaxrl_vis.run.progress import Progress
-from jaxrl_vis.run.results import Results, describe
 from jaxrl_vis.run.saving import Saver, import_saving_libraries
 from jaxrl_vis.run.signals import Interruption
-from jaxrl_vis.streams import reserve_standard_files, safe_streams
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
+from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
+from jaxrl_vis.run.storage.lock import FolderGoneError, Held
+from jaxrl_vis.run.storage.metrics import PerSeed
+from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.trained.results import Results, describe
 from jaxrl_vis.types import LoopState
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
@@ -87,7 +88,7 @@ class RunLoop:
         self._on_begun = on_begun
         self._programs, self._folder = programs, folder
         self._config, self._program = programs.config, programs.program
-        self._writes = processes.is_first()
+        self._writes = distributed.is_first()
         self._console = RunConsole(quiet=not self._writes)
         self._say = self._console.say
         self._checkpoints = Checkpoints(folder.checkpoints, self._say)
@@ -123,7 +124,7 @@ class RunLoop:
         shapes, layout = self._programs.shapes, self._programs.layout
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
-        processes.meet("checked")  # before the first of them writes anything that the others would find
+        distributed.meet("checked")  # before the first of them writes anything that the others would find
         if goes_on:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with self._folder.lock(self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
@@ -191,7 +192,7 @@ class RunLoop:
         self._console.stop()
         if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may be another's, or gone
             return
-        if processes.are_several():
+        if distributed.are_several():
             self._is_left_alone = True  # whatever went wrong, the others may have ended, and saving would wait for them
             return
         with contextlib.suppress(Exception):
@@ -226,13 +227,13 @@ class RunLoop:
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
-        has_room = not processes.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
+        has_room = not distributed.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
             self._open(goes_on, overwrite)
             if trust.is_own(self._config):  # and here it runs
                 trust.trust(self._folder.path, self._config, was_trained_here=True)
-        processes.meet("opened")
+        distributed.meet("opened")
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
         self._on_begun()
@@ -243,7 +244,7 @@ class RunLoop:
                 self._checkpoints.recent.resume_from(self._recent_at)
                 self._goodput.begin(self._done, self._replay_lost)
                 self._begin_log(goes_on, damaged, foreign)
-        processes.meet("begun")
+        distributed.meet("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
@@ -319,7 +320,7 @@ class RunLoop:
             evaluation = self._is_due(config.eval_interval) or self._done == self._total
             light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
             recent = self._saver.is_recent_due(light)
-            if not (evaluation or light or full or recent or (interruption and not processes.are_several())):
+            if not (evaluation or light or full or recent or (interruption and not distributed.are_several())):
                 continue
             # Before the metrics are read, so that the device does not wait for the host meanwhile.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None

@@ -17,16 +17,16 @@ from collections.abc import Callable, Iterator
 import jax
 import numpy as np
 
-from jaxrl_vis import processes
 from jaxrl_vis.errors import NonFiniteError, StorageError
-from jaxrl_vis.run.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.host import distributed
 from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.folder import RunFolder
-from jaxrl_vis.run.metrics import PerSeed
-from jaxrl_vis.run.progress import Progress
-from jaxrl_vis.run.recent import is_cheap
 from jaxrl_vis.run.signals import Interruption
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.run.storage.folder import RunFolder
+from jaxrl_vis.run.storage.metrics import PerSeed
+from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.storage.recent import is_cheap
 from jaxrl_vis.types import LoopState
 
 
@@ -61,7 +61,7 @@ class Saver:
 
     def has(self, tier: str, iteration: int) -> bool:
         """Returns True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
-        return processes.any_process(iteration in self._checkpoints.iterations(tier))
+        return distributed.any_process(iteration in self._checkpoints.iterations(tier))
 
     def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Saves the learner in the background.
@@ -96,7 +96,7 @@ class Saver:
         return self._keeps_recent and self._checkpoints.recent.is_due(light)
 
     def recent(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Saves the state for resuming after a kill; see `jaxrl_vis.run.recent`.
+        """Saves the state for resuming after a kill; see `jaxrl_vis.run.storage.recent`.
 
         Raises:
             NonFiniteError, StorageError: As `light`.
@@ -117,7 +117,7 @@ class Saver:
         self._check()
         if not self._keeps_full:
             self._checkpoints.retire_full(has_ended=True)
-        if processes.is_first():
+        if distributed.is_first():
             self._checkpoints.recent.clear()
 
     def on_signal(self, loop: LoopState, iteration: int, progress: Progress, interruption: Interruption) -> None:
@@ -141,7 +141,7 @@ class Saver:
                 missing = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
                 self._say(f"the networks are saved, {missing}: {error}; {self.resume}")
                 return
-        if processes.is_first():
+        if distributed.is_first():
             self._checkpoints.recent.clear()
         self._say(f"saved; {self.resume}")
 
@@ -200,7 +200,7 @@ class Saver:
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
         simulated, dumped = None, "the state is distributed over several processes and is not dumped"
-        if not processes.are_several():
+        if not distributed.are_several():
             try:
                 dump(file, loop, values, leaves)
                 dumped = f"state dumped to {file}"

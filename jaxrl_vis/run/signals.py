@@ -19,8 +19,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
-from jaxrl_vis import processes
 from jaxrl_vis.errors import Terminated
+from jaxrl_vis.host import distributed
 
 _NAMES = (
     *("SIGHUP", "SIGINT", "SIGQUIT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGXCPU"),
@@ -141,7 +141,7 @@ class Interruption(_Handlers):
 
     def reached_any(self) -> bool:
         """Returns True if any process has received a signal, on which all then agree; a collective call."""
-        if number := processes.max_over_processes(self.signal or 0):
+        if number := distributed.max_over_processes(self.signal or 0):
             self.signal = number
         return bool(number)
 

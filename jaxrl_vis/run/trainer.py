@@ -5,7 +5,7 @@
     loop, metrics = trainer.train_iteration(loop)       # a rollout and gradient steps; what you do between two is up to you
     for report in trainer.run(): ...                    # or the whole thing: logs, evaluates, saves, draws
 
-What was trained is used by `jaxrl_vis.run.trained`.
+What was trained is used by `jaxrl_vis.run.trained.restored_run`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,17 +16,17 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.devices import check_devices, enable_compilation_cache, hush_cache, start_devices
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache, hush_cache, start_devices
+from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.streams import safe_streams
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.plugins import own_names
-from jaxrl_vis.run import loggers
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.folder import RunFolder, default_folder, read_log
+from jaxrl_vis.run.loggers import group
 from jaxrl_vis.run.loop import Report, RunLoop
 from jaxrl_vis.run.signals import shielded_children
-from jaxrl_vis.streams import safe_streams
+from jaxrl_vis.run.storage.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.types import LoopState, Metrics, TrainState
 from jaxrl_vis_envs.registry import is_built_in
 
@@ -39,7 +39,7 @@ class Trainer:
     Args:
         config: The run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
-        run_dir: Folder of the files of `run`; None: `jaxrl_vis.run.folder.default_folder`.
+        run_dir: Folder of the files of `run`; None: `jaxrl_vis.run.storage.folder.default_folder`.
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
         log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
@@ -71,7 +71,7 @@ class Trainer:
             self.folder.check(config, resume, overwrite)
         if log is None:
             log = read_log(self.folder.path) if resume else ()
-        loggers.check(log)
+        group.check(log)
         self._log = tuple(log)
 
     @property
@@ -187,7 +187,7 @@ def make_trainer(
     """
     if not isinstance(config, Config):
         raise RequestError(f"make_trainer takes a configuration, such as jaxrl_vis.preset('cpu'), not {config!r}")
-    loggers.check(log or ())
+    group.check(log or ())
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
     with safe_streams():  # libraries that print, or warn, as they are imported and compile

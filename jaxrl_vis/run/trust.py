@@ -16,9 +16,9 @@ from pathlib import Path
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import make_private, read_private, replacing, stranger_to, user_cache
-from jaxrl_vis.plugins import own_names
-from jaxrl_vis.run.folder import read_run_id
+from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to, user_cache
+from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
 _MOST = 2000  # runs that are stored; the oldest are deleted

@@ -12,7 +12,7 @@ from typing import Any
 
 import jaxrl_vis
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration

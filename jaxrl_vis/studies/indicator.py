@@ -11,7 +11,7 @@ Figure 5.1 can also be drawn for the two tasks from states, and for the hand and
 from typing import Any
 
 from jaxrl_vis.config import PRESETS
-from jaxrl_vis.studies.study import Family, Study, Variant
+from jaxrl_vis.studies.engine.study import Family, Study, Variant
 
 _OURS: dict[str, Any] = {"method": "indicator_balance_filter"}
 _ORACLE: dict[str, Any] = {"method": "oracle"}

@@ -14,7 +14,7 @@ from typing import Any
 from jaxrl_vis.config import OF_TASK, PRESETS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.methods import AuxTaskName
-from jaxrl_vis.studies.study import Family, Study, Variant
+from jaxrl_vis.studies.engine.study import Family, Study, Variant
 
 _AUX_COLOURS: dict[AuxTaskName, str] = {
     "forward_dynamics": "#3b5bdb",

@@ -10,7 +10,7 @@ import pytest
 from tiny_detector import TINY
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
-from jaxrl_vis.parameters import write_parameters
+from jaxrl_vis.host.weights_file import write_parameters
 from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals

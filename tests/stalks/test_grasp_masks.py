@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.errors import NonFiniteError, RequestError
-from jaxrl_vis.parameters import write_parameters
+from jaxrl_vis.host.weights_file import write_parameters
 from jaxrl_vis.stalks.grasping.masks.examples import Example
 from jaxrl_vis.stalks.grasping.masks.mask_training import Plan, crops, train
 from jaxrl_vis.stalks.grasping.masks.painter import Painter, Settings, read_weights, write_weights

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from jaxrl_vis import cli
-from jaxrl_vis.evaluation_pool import finite
+from jaxrl_vis.host.worker_pool import finite
 from jaxrl_vis.stalks.cli.options import PlantOptions
 from jaxrl_vis.stalks.grasping.evaluation.records import Conditions, evaluate_run
 from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summary

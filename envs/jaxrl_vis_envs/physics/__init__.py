@@ -1,10 +1,10 @@
 """Physics of the tasks: two engines for MuJoCo models, and kinematics.
 
     mjx_model           the MJX engine: loading a model and stepping it; `take_steps` and `simulate` choose between the engines
-    constraints         accelerations under constraints for the MJX engine: by `newton` for small trees, else by MJX's own
-    solver
+    constraints         accelerations under constraints for the MJX engine: by `newton`, or by MJX's own solver
     newton              a constraint solver for small trees in matrices, the fastest on CPUs
     kinematics          forward kinematics, all bodies at once
+    rotations           quaternions and frames, from a private module of MJX
     inverse_kinematics  joint angles that bring the last link of a chain to a pose
     scalar/             the scalar engine: a subset of MuJoCo in scalars, one GPU thread per episode
 

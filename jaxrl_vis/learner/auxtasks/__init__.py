@@ -13,9 +13,9 @@ and samples what the tasks of a run declare, and knows none of them by name.
 from collections.abc import Callable, Sequence
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner.auxtasks import autoencoder, egomotion, forward_dynamics, inverse_dynamics, optical_flow
 from jaxrl_vis.learner.auxtasks.task import RELEASE, AuxTask, Options, Spec, Transitions, View
-from jaxrl_vis.plugins import call, find
 
 __all__ = ["NAMES", "RELEASE", "AuxTask", "Options", "Spec", "Transitions", "View", "make"]
 

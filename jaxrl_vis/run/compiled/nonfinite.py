@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.run.arrays import named_leaves, to_host
-from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.storage.arrays import named_leaves, to_host
+from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.types import LoopState
 
 _MAX_EPISODES = 64

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.run.metrics import PerSeed
+from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.types import Metrics
 
 

@@ -17,20 +17,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis import processes
 from jaxrl_vis.config import Config
-from jaxrl_vis.devices import cache_fault, default_cache, enable_compilation_cache
+from jaxrl_vis.host import distributed
+from jaxrl_vis.host.devices import cache_fault, default_cache, enable_compilation_cache
 from jaxrl_vis.learner.acting.evaluate import Evaluation
 from jaxrl_vis.learner.acting.rollout import Exploration
 from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.train_step import JIT_OPTIONS
 from jaxrl_vis.report import videos
-from jaxrl_vis.run.arrays import to_host
 from jaxrl_vis.run.compiled.nonfinite import broken_leaves
 from jaxrl_vis.run.compiled.pending import Pending, stacked
 from jaxrl_vis.run.compiled.threaded_rollout import ThreadedRollout
 from jaxrl_vis.run.compiled.trace_cache import TraceCache, fingerprint
 from jaxrl_vis.run.signals import shield_this_thread
+from jaxrl_vis.run.storage.arrays import to_host
 from jaxrl_vis.types import LoopState, Metrics, TrainState
 from jaxrl_vis_envs.compiling.compilation import assume_kernels_compile, failed_kernels, tracing_for_default_device
 
@@ -180,7 +180,7 @@ class Programs:
 
     def _finish(self, names: Sequence[str], meanwhile: Callable[[], None]) -> None:
         """Do what can be done while XLA compiles."""
-        if "init" in names and not processes.are_several():
+        if "init" in names and not distributed.are_several():
             # Taking keys apart, as saving does, is a program, too.
             to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
         meanwhile()

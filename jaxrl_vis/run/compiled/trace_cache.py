@@ -30,12 +30,12 @@ from jax.extend.core import jaxpr_as_fun
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config
-from jaxrl_vis.files import make_private, read_private, replacing, stranger_to
+from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to
+from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.provenance import device_record, versions
 from jaxrl_vis.learner.acting.evaluate import Evaluation
 from jaxrl_vis.learner.acting.rollout import Exploration
 from jaxrl_vis.learner.iteration import Learned
-from jaxrl_vis.plugins import own_names
-from jaxrl_vis.provenance import device_record, versions
 from jaxrl_vis.types import Episodes
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_default_device, use_gpu_kernels

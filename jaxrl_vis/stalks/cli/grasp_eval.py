@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
-from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Record, RecordFile, share_accelerator
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.host.worker_pool import Record, RecordFile, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import EvaluationOptions, check_extra, check_masks
 
 if TYPE_CHECKING:
-    from jaxrl_vis.run.policy import Policy
+    from jaxrl_vis.run.trained.policy import Policy
 
 _MAX_WIND = 100.0  # mm
 _LOOPS: tuple[Literal["open", "again", "policy"], ...] = ("again",)
@@ -144,7 +144,7 @@ def _policy(options: Eval) -> "tuple[Policy | None, str]":
     """Return the policy of the loop that has one, and its name."""
     if options.policy is None:
         return None, ""
-    from jaxrl_vis.run.policy import load_policy
+    from jaxrl_vis.run.trained.policy import load_policy
     from jaxrl_vis.stalks.grasping.arm.policy_loop import check_policy
 
     policy = load_policy(options.policy, options.policy_seed)

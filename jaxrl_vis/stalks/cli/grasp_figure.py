@@ -4,8 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import ClassVar
 
-from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.report.outputs import check_figure, check_writable
 from jaxrl_vis.stalks.cli.grasp_eval import Eval, check_wind, evaluate
 from jaxrl_vis.stalks.cli.options import check_extra

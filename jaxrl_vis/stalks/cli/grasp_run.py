@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from jaxrl_vis.cli.parsing import AlsoPositional
-from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import CameraOptions, check_extra, check_masks, check_speed
 from jaxrl_vis.stalks.cli.phenotype_run import SKIPPED

@@ -3,7 +3,7 @@
 import dataclasses
 
 from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.devices import check_devices
+from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import SynthOptions, check_extra
 from jaxrl_vis.stalks.cli.phenotype_synth import write_synthetic

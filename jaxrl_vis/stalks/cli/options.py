@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.provenance import install_command
+from jaxrl_vis.host.provenance import install_command
 
 if TYPE_CHECKING:
     from jaxrl_vis_envs.plants import Calibration, Family

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Record, finite, share_accelerator
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.host.worker_pool import Record, finite, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import EvaluationOptions, check_extra, check_masks
 
@@ -115,7 +115,7 @@ _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_m
 
 def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
     """Print a line of Markdown for each factor that is shifted alone, and write the file."""
-    from jaxrl_vis.files import write_atomically
+    from jaxrl_vis.host.files import write_atomically
 
     if options.json is not None:
         about = {"synthetic": True, "finder": name, "method": options.method, "factors": finite(figures)}

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.report.outputs import FIGURE_SUFFIXES, check_writable
 from jaxrl_vis.stalks.cli.options import check_extra
 from jaxrl_vis.stalks.cli.phenotype_eval import Eval, evaluate

@@ -4,8 +4,8 @@ import dataclasses
 from typing import TYPE_CHECKING, Literal
 
 from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.devices import check_devices
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import SynthOptions, check_extra
 from jaxrl_vis.stalks.cli.progress import progress

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxrl_vis.cli.checks import check_counts
-from jaxrl_vis.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import map_unordered, share_accelerator
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import TrainingOptions, check_extra
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 from rich.progress import Task
 
-from jaxrl_vis.run.bar import FittingProgress
-from jaxrl_vis.streams import safe
+from jaxrl_vis.host.streams import safe
+from jaxrl_vis.run.loggers.bar import FittingProgress
 
 Done = Callable[[str, int, int], None]
 """Called with the name of a part, the number of units done, and their total."""

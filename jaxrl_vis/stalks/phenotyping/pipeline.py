@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 import jaxrl_vis
-from jaxrl_vis.evaluation_pool import UnorderedMap, worker_pool
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.worker_pool import UnorderedMap, worker_pool
 from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries, why_no_odometry

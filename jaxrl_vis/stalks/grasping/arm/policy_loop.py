@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxrl_vis_envs
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.policy import Policy
+from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.grasping.arm import control
 from jaxrl_vis.stalks.grasping.arm.approach import reachable
 from jaxrl_vis.stalks.grasping.arm.control import Gains, Timing

@@ -15,7 +15,7 @@ from typing import Literal
 import jax
 import numpy as np
 
-from jaxrl_vis.run.policy import Policy
+from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.grasping.arm import approach
 from jaxrl_vis.stalks.grasping.arm.choice import Choice, choose, choose_nearest, stalk_radii
 from jaxrl_vis.stalks.grasping.arm.policy_loop import HEIGHTS as POLICY_HEIGHTS

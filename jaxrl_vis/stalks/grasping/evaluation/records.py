@@ -14,9 +14,9 @@ import numpy as np
 import jaxrl_vis
 import jaxrl_vis.stalks.grasping
 import jaxrl_vis_envs.plants
-from jaxrl_vis.evaluation_pool import Record, RecordFile, code_digest, evaluate_all
-from jaxrl_vis.provenance import device_name
-from jaxrl_vis.run.policy import Policy
+from jaxrl_vis.host.provenance import device_name
+from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all
+from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, carry_out, plan
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score

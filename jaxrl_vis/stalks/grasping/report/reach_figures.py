@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.evaluation_pool import Record
+from jaxrl_vis.host.worker_pool import Record
 from jaxrl_vis.report.plots import FAINT, INK
 from jaxrl_vis.stalks.grasping.arm.approach import reachable
 from jaxrl_vis.stalks.grasping.arm.reach import reach

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis import fields
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.parameters import check_range, read_parameters, write_parameters
+from jaxrl_vis.host.weights_file import check_range, read_parameters, write_parameters
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 

@@ -17,8 +17,8 @@ import numpy as np
 import jaxrl_vis
 import jaxrl_vis.stalks.phenotyping
 import jaxrl_vis_envs.plants
-from jaxrl_vis.evaluation_pool import Record, RecordFile, code_digest, evaluate_all
-from jaxrl_vis.provenance import device_name, revision
+from jaxrl_vis.host.provenance import device_name, revision
+from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all
 from jaxrl_vis.stalks.digests import file_digest, value_digest
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisScore, score_plot, summary
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method

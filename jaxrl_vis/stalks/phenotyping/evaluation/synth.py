@@ -24,8 +24,8 @@ import numpy as np
 
 import jaxrl_vis
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
-from jaxrl_vis.spreadsheets import to_csv
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.spreadsheets import to_csv
 from jaxrl_vis.stalks.phenotyping.io.annotations import coco
 from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import SUFFIX, ImageFormat, write_image

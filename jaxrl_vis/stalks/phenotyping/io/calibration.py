@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
+from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis_envs.documents import read_text
 from jaxrl_vis_envs.plants import Calibration

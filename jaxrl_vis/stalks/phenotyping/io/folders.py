@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.spreadsheets import unescape_cell
+from jaxrl_vis.host.spreadsheets import unescape_cell
 from jaxrl_vis.stalks.phenotyping.io.names import check_length, readable
 from jaxrl_vis_envs.documents import read_text
 

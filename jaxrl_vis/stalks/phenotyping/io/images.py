@@ -6,7 +6,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from jaxrl_vis.files import replacing
+from jaxrl_vis.host.files import replacing
 from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG, plain_png, size_in
 
 ImageFormat = Literal["png", "tiff", "jpeg"]

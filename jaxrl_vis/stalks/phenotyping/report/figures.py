@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.files import write_atomically
-from jaxrl_vis.spreadsheets import to_csv
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.spreadsheets import to_csv
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PERSON_SD
 from jaxrl_vis_envs.documents import read_json
 

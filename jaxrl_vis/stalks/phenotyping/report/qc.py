@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jaxrl_vis.files import replacing
+from jaxrl_vis.host.files import replacing
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.report.overlay import overlay_scale

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.files import write_atomically
-from jaxrl_vis.spreadsheets import to_csv
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.spreadsheets import to_csv
 from jaxrl_vis.stalks.phenotyping.track.follow import Path as Driven
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.heights import StalkWidths, stalk_widths

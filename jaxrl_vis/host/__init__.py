@@ -1,0 +1,1 @@
+"""Computer and process around a run: devices, processes, files, provenance."""

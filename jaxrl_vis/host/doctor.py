@@ -1,0 +1,107 @@
+"""Self-test of an installation, with one line of output per check."""
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host import provenance
+from jaxrl_vis.host.devices import cache_fault, check_devices, enable_compilation_cache
+
+
+def versions() -> str:
+    """Returns the versions of Python and of the packages that matter."""
+    installed = provenance.versions()
+    # The checkout itself does not have to be installed.
+    missing = [name for name, version in installed.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
+    if missing:
+        raise ModuleNotFoundError(f"{', '.join(missing)} missing; install this project with `pip install .`")
+    return ", ".join(f"{name} {version}" for name, version in installed.items())
+
+
+def devices() -> str:
+    """Returns the platform and the device that JAX uses."""
+    check_devices()
+    return f"{provenance.device_record()['platform']}: {provenance.device_name()}"
+
+
+def memory() -> str:
+    """Returns the memory of the host and of the first device."""
+    import jax
+
+    host = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
+    text = f"host {host / 2**30:.1f} GiB" if host else "host unknown"
+    limit = (jax.devices()[0].memory_stats() or {}).get("bytes_limit")
+    return text + (f", device {limit / 2**30:.1f} GiB usable" if limit else "")
+
+
+def compilation_cache() -> str:
+    """Returns the folder of the compilation cache, or why there is none."""
+    import jax
+
+    folder = enable_compilation_cache()
+    fault = cache_fault()
+    if fault is None:
+        return folder
+    if not jax.config.jax_enable_compilation_cache:
+        return f"off, every run compiles again: {fault}"
+    raise PermissionError(fault)
+
+
+def physics_and_camera() -> str:
+    """Compiles and runs one control step, renders it, and checks that the image is neither empty nor equal to the goal
+    image.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    import jaxrl_vis_envs
+
+    env = jaxrl_vis_envs.make("VisualReacher", image_size=32)
+    start = time.perf_counter()
+
+    def step_once(key: jax.Array) -> tuple[jax.Array, Any]:
+        state = env.step(env.reset(key), jnp.full((env.action_size,), 0.5, jnp.float32))
+        return state.achieved_state, state.obs
+
+    position, obs = jaxrl_vis_envs.jit(step_once, runs_once=True)(jax.random.key(0))
+    if not bool(jnp.isfinite(position).all()):
+        raise FloatingPointError("the state after one physics step is not finite")
+    frame, goal = obs["observation"], obs["desired_goal"]
+    if int(frame.max()) == int(frame.min()):
+        raise ValueError("the image is empty")
+    if bool((frame == goal).all()):
+        raise ValueError("the image is equal to the goal image")
+    size = "x".join(map(str, frame.shape))
+    return f"one step of {env.name} and its {size} image in {time.perf_counter() - start:.1f} s, compilation included"
+
+
+CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
+    ("versions", versions),
+    ("devices", devices),
+    ("memory", memory),
+    ("compile cache", compilation_cache),
+    ("environment", physics_and_camera),
+)
+
+
+def main() -> int:
+    """Runs all checks, even after failures, and prints the results.
+
+    Returns:
+        0 if all checks pass; 1 if one fails; 2 if JAX is configured for a device that is not available, which stops the checks.
+    """
+    failures = 0
+    for name, check in CHECKS:
+        try:
+            verdict, text = "ok  ", check()
+        except RequestError as error:
+            print(f"FAIL  {name:14} {error}", flush=True)
+            return 2
+        except Exception as error:  # noqa: BLE001 - every failure is reported
+            failures += 1
+            verdict, text = "FAIL", f"{type(error).__name__}: {' '.join(str(error).split())}"
+        print(f"{verdict}  {name:14} {text}", flush=True)
+    print("all is well" if not failures else f"{failures} of {len(CHECKS)} checks failed")
+    return 1 if failures else 0

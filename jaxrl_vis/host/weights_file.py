@@ -1,0 +1,201 @@
+"""Network parameters in safetensors files, described by the file's metadata."""
+
+import json
+import math
+import reprlib
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import jax
+import numpy as np
+import safetensors
+from safetensors.numpy import save
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis_envs.documents import parse_json
+
+SUFFIX = ".safetensors"
+_ABOUT = "about"
+_KINDS = {"F16": np.float16, "F32": np.float32}
+# An array of 10 bits is three in the file: the upper 8 bits under its own name, and with these suffixes the lower 2 bits, four
+# numbers in a byte, and the factors of its last axis. A wheel's compression would make little of 10 bits in words of 16.
+_LOW, _SCALE = ".low", ".scale"
+_PLACES = np.array([0, 2, 4, 6], np.uint8)
+_LEVELS = 511
+_FEWEST_QUANTISED = 4096  # smaller arrays keep 16 bits: they cost nothing
+_LONGEST_HEADER = 1 << 20  # bytes; those of our networks have some 15,000
+
+Settings = TypeVar("Settings")
+
+
+def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16) -> None:
+    """Write parameters to a file, which is complete whenever it can be read.
+
+    Args:
+        path: The file, .safetensors.
+        params: Nested dictionaries of arrays.
+        about: What they are and where they come from; anything that JSON holds.
+        bits: Bits of a number. With 10, arrays of two axes or more and 4,096 numbers or more become integers from -511 to 511
+            and a factor for each index of the last axis, and the others keep 16.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    for name, leaf in _named(params).items():
+        array = np.asarray(leaf, np.float32)
+        if bits == 10 and array.ndim > 1 and array.size >= _FEWEST_QUANTISED:
+            arrays |= _quantised(name, array)
+        else:
+            arrays[name] = array.astype(np.float32 if bits == 32 else np.float16)
+    _write(path, arrays, about)
+
+
+def _quantised(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the three arrays, by name, that stand for an array float32 [..., C] with 10 bits a number."""
+    scale = np.abs(array).max(axis=tuple(range(array.ndim - 1))) / np.float32(_LEVELS)
+    levels = np.round(array / np.where(scale > 0, scale, 1)).astype(np.int16)
+    low = np.pad((levels & 3).ravel(), (0, -levels.size % 4)).reshape(-1, 4) << _PLACES
+    return {name: (levels >> 2).astype(np.int8), f"{name}{_LOW}": low.sum(axis=1).astype(np.uint8), f"{name}{_SCALE}": scale}
+
+
+def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the array float32 that the three stand for."""
+    lower = ((low[:, None] >> _PLACES) & 3).ravel()[: high.size].reshape(high.shape)
+    return (4 * high.astype(np.float32) + lower.astype(np.float32)) * scale
+
+
+def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
+    """Writes named arrays without conversion."""
+    whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
+
+
+def _named(params: Any) -> dict[str, Any]:
+    """Returns the leaves of nested dictionaries by path: ``detector/params/stem/kernel``."""
+    return {"/".join(str(part.key) for part in names): leaf for names, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
+
+
+def read_parameters(
+    path: Path, command: str, declare: Callable[[dict[str, Any]], tuple[Settings, Any]]
+) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
+    """Reads a file of `write_parameters`. Names, shapes and types are compared with the network's before any array is read.
+
+    Args:
+        path: The file.
+        command: Command that creates such files, for messages.
+        declare: Maps the file's description to settings and the parameters' shapes (nested dictionaries of objects with a
+            ``shape``); it may remove entries. It raises a RequestError that names the file, or a KeyError or ValueError if the
+            description is not that of a network.
+
+    Returns:
+        Parameters, float32; settings; and the rest of the description.
+
+    Raises:
+        RequestError: The file is missing, or holds no parameters or those of another network.
+    """
+    try:
+        if path.suffix.lower() == ".npz" and path.is_file():
+            raise RequestError(
+                f"{path} was written by an earlier version: convert it with `python -m jaxrl_vis.host.weights_file {path} "
+                f"{path.with_suffix(SUFFIX)}`, and pass the result"
+            )
+        _check_header(path)
+        with safetensors.safe_open(path, framework="numpy") as file:
+            about = parse_json((file.metadata() or {})[_ABOUT])
+            if not isinstance(about, dict):
+                raise ValueError(f"{_ABOUT} is no table")
+            settings, shapes = declare(about)
+            names = set(file.keys())
+            wanted = {name: tuple(leaf.shape) for name, leaf in _named(shapes).items()}
+            quantised = {name for name in wanted.keys() & names if file.get_slice(name).get_dtype() == "I8"}
+            kinds = dict.fromkeys(wanted, ("F16", "F32"))
+            for name in quantised:
+                wanted |= {f"{name}{_LOW}": (-(-math.prod(wanted[name]) // 4),), f"{name}{_SCALE}": wanted[name][-1:]}
+                kinds |= {name: ("I8",), f"{name}{_LOW}": ("U8",), f"{name}{_SCALE}": ("F32",)}
+            if names != wanted.keys():
+                raise RequestError(_other_network(path, f"{min(names ^ wanted.keys())} is missing or too many", command))
+            for name, shape in wanted.items():
+                part = file.get_slice(name)
+                if tuple(part.get_shape()) != shape or part.get_dtype() not in kinds[name]:
+                    raise RequestError(_other_network(path, f"{name} is not {shape} numbers of 10, 16 or 32 bits", command))
+            arrays = {name: file.get_tensor(name) for name in wanted}
+    except OSError as error:
+        raise RequestError(f"cannot read the weights {path}: {error.strerror or error}") from error
+    except (ValueError, KeyError, safetensors.SafetensorError) as error:
+        if isinstance(error, RequestError):
+            raise
+        raise RequestError(f"{path} holds no weights: name a file that `{command}` wrote") from error
+    # By NumPy: JAX would compile a program for each shape.
+    for name in quantised:
+        arrays[name] = _restored(arrays[name], arrays.pop(f"{name}{_LOW}"), arrays.pop(f"{name}{_SCALE}"))
+    unsound = next((name for name, array in arrays.items() if not np.isfinite(array).all()), None)
+    if unsound is not None:
+        raise RequestError(f"{path} holds numbers that are not finite ({unsound}): train the weights again with `{command}`")
+    params: dict[str, Any] = {}
+    for name, array in arrays.items():
+        place = params
+        *folders, last = name.split("/")
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        place[last] = array.astype(np.float32)
+    return jax.device_put(params), settings, about
+
+
+def _check_header(path: Path) -> None:
+    """Raises a ValueError if the header's size is inconsistent with the file or larger than that of any of our networks."""
+    size = path.stat().st_size
+    if not path.is_file():
+        raise ValueError("not a regular file")  # opening a pipe would block
+    with path.open("rb") as file:
+        if not 2 <= int.from_bytes(file.read(8), "little") <= min(_LONGEST_HEADER, size - 8):
+            raise ValueError("no header")
+
+
+def check_range(path: Path, name: str, values: tuple[float, ...], low: float, high: float, step: int = 1) -> None:
+    """Checks a setting of a network before it is used.
+
+    Args:
+        path: File that the setting was read from.
+        name: Name of the setting.
+        values: One number, or several.
+        low, high: Bounds of each number, inclusive.
+        step: Divisor of each number, for whole numbers.
+
+    Raises:
+        RequestError: The setting is out of range.
+    """
+    unfit = next((value for value in values if not low <= value <= high or (step > 1 and value % step)), None)
+    if unfit is not None or not 1 <= len(values) <= 16:
+        kind = f"multiples of {step} " if step > 1 else ""
+        shown = f"{len(values)} numbers" if unfit is None else reprlib.repr(unfit)  # a number may have hundreds of digits
+        raise RequestError(f"{path}: {name} of its network must be {kind}from {low:g} to {high:g}, 16 at most, not {shown}")
+
+
+def _other_network(path: Path, why: str, command: str) -> str:
+    return f"{path} holds weights of another network ({why}): train them again with `{command}`"
+
+
+def convert(old: Path, new: Path) -> None:
+    """Converts a .npz file of an earlier version to the current format, bit for bit.
+
+    Raises:
+        OSError: A file cannot be read or written.
+        ValueError: The file holds no weights.
+    """
+    with np.load(old, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    about = json.loads(arrays.pop(_ABOUT).tobytes())
+    if {array.dtype for array in arrays.values()} - {np.dtype(kind) for kind in _KINDS.values()}:
+        raise ValueError("weights have 16 or 32 bits")
+    _write(new, arrays, about)
+
+
+if __name__ == "__main__":
+    try:
+        convert(*map(Path, sys.argv[1:]))
+    except Exception as error:  # the old file may contain anything
+        sys.exit(f"cannot convert {' '.join(sys.argv[1:])}: {' '.join(str(error).split())}")

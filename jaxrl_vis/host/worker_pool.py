@@ -1,0 +1,316 @@
+"""Evaluation of many numbered items, such as synthetic plots, in parallel processes; those already evaluated are skipped.
+
+    records = RecordFile(path, about, summary)               # resumes the file if it has the same conditions
+    missing = [number for number in numbers if number not in records]
+    evaluate_all(function, missing, workers, records.add)    # function(number) -> record; records.add writes the file
+
+Records are JSON values. A record must depend on its number only, so that it is the same with any number of workers.
+"""
+
+import contextlib
+import functools
+import hashlib
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol, TypeVar
+
+from jaxrl_vis.errors import RequestError, WorkerError
+from jaxrl_vis.host.files import read_json, write_atomically
+from jaxrl_vis.run.signals import heed_parent_only, shielded_children
+from jaxrl_vis_envs.cores import num_cores
+
+Record = dict[str, Any]
+"""Result of the evaluation of one number."""
+A = TypeVar("A")
+T = TypeVar("T")
+
+# Variables that limit the threads of NumPy, SciPy, OpenCV and XLA in a process.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC")
+
+
+def evaluate_all(
+    evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, done: Callable[[int, Record], None]
+) -> None:
+    """Evaluates numbers in this process or in several.
+
+    Args:
+        evaluate: Maps a number to its record. With more than one worker it is pickled: a function at module level, or a
+            `functools.partial` of one.
+        numbers: Numbers to evaluate.
+        workers: Number of processes; 1 for this one. They share the machine's GPUs and cores.
+        done: Called in this process with a number and its record, in order of completion.
+
+    Raises:
+        WorkerError: A process was killed from outside, most likely because memory ran out.
+    """
+    numbers = list(numbers)
+    with worker_pool(min(workers, len(numbers))) as unordered_map:
+        for number, record in unordered_map(functools.partial(_numbered, evaluate), numbers):
+            done(number, record)
+
+
+def _numbered(evaluate: Callable[[int], Record], number: int) -> tuple[int, Record]:
+    return number, evaluate(number)
+
+
+def map_unordered(function: Callable[[A], T], arguments: Iterable[A], workers: int) -> Generator[T]:
+    """Maps a function over arguments, possibly endless, and yields the results in order of completion.
+
+    Args:
+        function: Maps an argument to its result. With more than one worker, both are pickled.
+        arguments: Arguments of the calls.
+        workers: Number of processes; 1 for this one. They are stopped with the iterator.
+
+    Raises:
+        WorkerError: A process was killed from outside, most likely because memory ran out.
+    """
+    with worker_pool(workers) as unordered_map:
+        yield from unordered_map(function, arguments)
+
+
+class UnorderedMap(Protocol):
+    """Map of a function over arguments in this process or in several, with results in order of completion."""
+
+    def __call__(self, function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]: ...  # noqa: D102
+
+
+@contextlib.contextmanager
+def worker_pool(workers: int) -> Iterator[UnorderedMap]:
+    """Context of worker processes that share the GPUs and cores; they are killed after an error, and whenever this process
+    ends.
+
+    Args:
+        workers: Number of processes; 1 or less for this one.
+
+    Raises:
+        WorkerError: One was killed from outside, most likely because memory ran out.
+    """
+    if workers < 2:
+        yield lambda function, arguments: map(function, arguments)
+        return
+    spawning = multiprocessing.get_context("spawn")
+    others = set(multiprocessing.active_children())
+    with shielded_children():  # starts multiprocessing's helper process
+        counter = spawning.Value("i", 0)
+    pool = ProcessPoolExecutor(workers, mp_context=spawning, initializer=_prepare, initargs=(counter, _environments(workers)))
+
+    def submit(function: Callable[[A], T], argument: A) -> Future[T]:
+        with shielded_children():  # may start a process, which only this one may end: see `_prepare`
+            return pool.submit(function, argument)
+
+    def unordered_map(function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]:
+        arguments = iter(arguments)
+        # Two submitted calls per worker, so that none waits for this process.
+        waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
+        while waiting:
+            ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            waiting |= {submit(function, argument) for argument in itertools.islice(arguments, len(ready))}
+            for result in ready:
+                yield result.result()
+
+    try:
+        yield unordered_map
+    except BrokenProcessPool as error:
+        raise WorkerError(
+            f"one of {workers} processes was killed from outside, most likely because memory ran out: use fewer --workers"
+        ) from error
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        children = set(multiprocessing.active_children()) - others
+        for child in children:
+            child.kill()
+        _wait_for(children, 5.0)
+        raise
+    pool.shutdown()
+
+
+def _wait_for(children: Collection[BaseProcess], seconds: float) -> None:
+    """Waits for children to end, up to a number of seconds.
+
+    `BaseProcess.join` may return too soon: the pool's own thread waits for its processes too, and the system reports the exit
+    of a process to only one of the two threads; the other treats it as running until the first has recorded it.
+    """
+    deadline = time.monotonic() + seconds
+    while any(child.is_alive() for child in children) and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def share_accelerator() -> None:
+    """Lets this process allocate GPU memory on demand, so that other processes can use the GPU; call it before using JAX."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+
+def _environments(workers: int) -> list[dict[str, str]]:
+    """Returns the environment variables of the workers: their GPU, if there are several, and their number of threads."""
+    import jax
+
+    from jaxrl_vis.host.devices import list_devices
+
+    devices = list_devices()
+    threads = dict.fromkeys(_THREADS, str(max(num_cores() // workers, 1)))
+    # Workers open no window; importing MuJoCo would start another process that looks for GLFW, and outlives its worker.
+    share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "disable")}
+    if cache := jax.config.jax_compilation_cache_dir:  # a program is compiled once for all
+        share["JAX_COMPILATION_CACHE_DIR"] = cache
+    return [{**threads, **share, **devices[index % len(devices)].environment} for index in range(workers)]
+
+
+def _end_with_parent() -> None:
+    """Waits for the parent process to end, for example when killed, then exits: its results are no longer needed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
+    """Initialises a worker process."""
+    heed_parent_only()  # a signal to the process group would otherwise interrupt parent and worker at once
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with counter.get_lock():
+        index = counter.value
+        counter.value += 1
+    variables = environments[index % len(environments)]
+    os.environ.update(variables)
+    try:
+        import cv2
+    except ImportError:
+        return
+    cv2.setNumThreads(int(variables[_THREADS[0]]))
+
+
+def code_digest(*packages: ModuleType, leave_out: tuple[str, ...] = ()) -> str:
+    """Computes a digest of the code that records come from: 12 hexadecimal digits.
+
+    Args:
+        packages: Packages whose files are included.
+        leave_out: Names of files and folders that affect no record.
+    """
+    digest = hashlib.sha256()
+    for package in packages:
+        folder = Path(str(package.__file__)).parent
+        for path in sorted(folder.rglob("*.py")):
+            name = path.relative_to(folder)
+            if not set(leave_out) & set(name.parts):
+                digest.update(name.as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+class RecordFile:
+    """JSON file of records: their conditions, their summary, and one line per number.
+
+    Attributes:
+        records: Records by number.
+    """
+
+    def __init__(self, path: Path | None, about: Mapping[str, Any], summary: Callable[[list[Record]], Mapping[str, Any]]):
+        """Reads the file, if it exists and was written under the same conditions.
+
+        Args:
+            path: The file; None to keep the records in memory only.
+            about: Conditions under which numbers are evaluated.
+            summary: Computes the summary of records in the order of their numbers.
+
+        Raises:
+            RequestError: The file has other conditions, or cannot be read.
+        """
+        self.records: dict[int, Record] = {}
+        self._path, self._about, self._summary = path, json.loads(json.dumps(finite(about))), summary
+        self._lines: dict[int, str] = {}
+        if path is not None and path.exists():
+            for record in _read(path, self._about):
+                self._keep(record["number"], record)
+            self._check(path)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self.records
+
+    def add(self, number: int, record: Record) -> None:
+        """Adds the record of a number, and writes the file."""
+        self.add_all({number: record})
+
+    def add_all(self, records: Mapping[int, Record]) -> None:
+        """Adds the records of several numbers, and writes the file once."""
+        for number, record in records.items():
+            self._keep(number, {"number": number, **record})
+        self.write()
+
+    def write(self) -> None:
+        """Writes the file."""
+        if self._path is None:
+            return
+        ordered = sorted(self.records)
+        figures = finite({**self._about, **self._summary([self.records[number] for number in ordered])})
+        head = json.dumps(figures, indent=2)
+        lines = ",\n".join(f"    {self._lines[number]}" for number in ordered)
+        write_atomically(self._path, f'{head[:-2]},\n  "each": [\n{lines}\n  ]\n}}\n')
+
+    def _check(self, path: Path) -> None:
+        """Raises a RequestError if the records that were read have been altered."""
+        try:
+            self._summary([self.records[number] for number in sorted(self.records)])
+        except Exception as error:  # computing with altered records may raise anything
+            raise RequestError(
+                f"{path} holds a damaged record ({type(error).__name__}: {error}): delete it, or name another file with --json"
+            ) from error
+
+    def _keep(self, number: int, record: Record) -> None:
+        record = finite(record)
+        # Results must not depend on whether a record was read from the file.
+        line = json.dumps(record, allow_nan=False)
+        self.records[number], self._lines[number] = json.loads(line), line
+
+
+def finite(value: Any) -> Any:
+    """Replaces non-finite numbers by None, at any depth, for JSON."""
+    if isinstance(value, Mapping):
+        return {name: finite(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
+    """Reads the records of a file.
+
+    Raises:
+        RequestError: The file has other conditions, or cannot be read.
+    """
+    mend = "delete it, or name another file with --json"
+    contents = read_json(path, mend=f"it holds no records to resume; {mend}")
+    records = contents.get("each")
+    if not isinstance(records, list) or not all(
+        isinstance(record, dict) and _is_count(record.get("number")) for record in records
+    ):
+        raise RequestError(f"{path} holds no records to resume: {mend}")
+    other = [name for name, value in about.items() if contents.get(name) != value]
+    if other:
+        name = other[0]
+        raise RequestError(
+            f"{path} holds records of another evaluation ({name}: {_short(contents.get(name))}, not {_short(about[name])}): "
+            "name another file with --json"
+        )
+    numbers = [record["number"] for record in records]
+    if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
+        raise RequestError(f"{path} holds number {twice[0]} twice: {mend}")
+    return records
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 60 else f"{text[:57]}..."

@@ -1,0 +1,1 @@
+"""Outputs of a run: terminal, TensorBoard, Weights & Biases."""

@@ -1,0 +1,123 @@
+"""Loggers (``--log tensorboard wandb``) of metrics.jsonl, the configuration, the curve and the video.
+
+metrics.jsonl remains the reference. At its start, a logger receives the rows that the file already has, and then every new row,
+so that a resumed run, or a logger added later, shows each evaluation once.
+
+A failing logger is reported in one line and not used again: training continues without it.
+"""
+
+import importlib.util
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.host.provenance import install_command
+from jaxrl_vis.run.storage.metrics import Row
+
+LoggerName = Literal["tensorboard", "wandb"]
+NAMES: tuple[str, ...] = get_args(LoggerName)
+
+_MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+_LEAVING_S = {True: 10.0, False: 60.0}  # seconds allowed for closing a logger: after a signal, and at the end of a run
+
+
+def check(names: Sequence[str]) -> None:
+    """Checks that loggers exist and that their libraries are installed, without importing them.
+
+    Raises:
+        RequestError: There is no such logger, or its library is missing.
+    """
+    for name in names:
+        if name not in _MODULES:
+            raise RequestError(f"unknown logger {name!r}{nearest(name, NAMES)}")
+        if importlib.util.find_spec(_MODULES[name]) is None:
+            raise RequestError(f"--log {name} needs {_MODULES[name]}: {install_command(name)}")
+
+
+class Logger(Protocol):
+    """Interface of a logger. Any method may raise any exception."""
+
+    def rows(self, rows: Sequence[Row]) -> None:
+        """Logs rows of metrics.jsonl."""
+
+    def image(self, name: str, file: Path, env_steps: int) -> None:
+        """Logs a .png or .gif drawn after ``env_steps`` steps."""
+
+    def close(self) -> None:
+        """Waits until everything is delivered."""
+
+
+class Loggers:
+    """Loggers of one run. Nothing is opened before `open`.
+
+    Args:
+        names: Names of the loggers, from `NAMES`.
+        folder: The run folder.
+        say: Called with one line about each failure.
+    """
+
+    def __init__(self, names: Sequence[str], folder: Path, say: Callable[[str], None]):
+        self._names, self._folder, self._say = tuple(dict.fromkeys(names)), folder, say
+        self._open: dict[str, Logger] = {}
+
+    def open(self, record: Mapping[str, Any], seeds: Sequence[int], rows: Sequence[Row]) -> None:
+        """Opens the loggers.
+
+        Args:
+            record: The contents of config.json.
+            seeds: The seeds of the run.
+            rows: Rows already in metrics.jsonl.
+        """
+        for name in self._names:
+
+            def begin(name: str = name) -> None:
+                self._open[name] = _OPEN[name](self._folder, record, seeds, self._say)
+                self._open[name].rows(rows)
+
+            self._try(name, begin)
+
+    def rows(self, rows: Sequence[Row]) -> None:
+        """Forwards rows to the loggers."""
+        for name, logger in list(self._open.items()):
+            self._try(name, lambda logger=logger: logger.rows(rows))
+
+    def image(self, name: str, file: Path, env_steps: int) -> None:
+        """Forwards an image to the loggers, if the file exists."""
+        if file.exists():
+            for logger_name, logger in list(self._open.items()):
+                self._try(logger_name, lambda logger=logger: logger.image(name, file, env_steps))
+
+    def close(self, in_a_hurry: bool = False) -> None:
+        """Closes the loggers, within a time limit: a library that waits for a network would otherwise never let the run end."""
+        for name in list(self._open):
+            logger = self._open.pop(name)
+            thread = threading.Thread(target=self._try, args=(name, logger.close), daemon=True)
+            thread.start()
+            thread.join(_LEAVING_S[in_a_hurry])
+            if thread.is_alive():
+                self._say(f"--log {name} has not sent everything yet and is not waited for; metrics.jsonl has it all")
+
+    def _try(self, name: str, act: Callable[[], None]) -> None:
+        try:
+            act()
+        except Exception as error:
+            self._open.pop(name, None)
+            description = " ".join(f"{type(error).__name__}: {error}".split())
+            self._say(f"--log {name} failed and is not used any more ({description[:200]}); metrics.jsonl has everything")
+
+
+def _open_tensorboard(folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
+    from jaxrl_vis.run.loggers.tensorboard import TensorBoard
+
+    return TensorBoard(folder, record, seeds)
+
+
+def _open_wandb(folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
+    from jaxrl_vis.run.loggers.weights_and_biases import WeightsAndBiases
+
+    return WeightsAndBiases(folder, record, seeds, say)
+
+
+_OPEN = {"tensorboard": _open_tensorboard, "wandb": _open_wandb}

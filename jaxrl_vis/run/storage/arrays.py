@@ -1,0 +1,173 @@
+"""Conversion of arrays for checkpoints and back: names, checksums, placement and comparison.
+
+With several processes, each writes its own parts, so checksums are combined from those of the parts.
+"""
+
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host import distributed
+from jaxrl_vis.learner.parallel.sharding import put_array
+
+Arrays = dict[str, np.ndarray]
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Returns the leaves of a pytree by name, such as ``actor.head.output.kernel``."""
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
+
+
+def to_host(tree: Any, copy: bool) -> Arrays:
+    """Converts the leaves of a pytree to NumPy arrays by name; typed keys to their words.
+
+    Args:
+        tree: Arrays on a device.
+        copy: False: on a CPU, return views of the device's memory. A view is valid only until the arrays are donated, and while
+            one exists, the next donation makes a copy.
+    """
+
+    def convert(leaf: jax.Array) -> np.ndarray:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        if copy or jax.default_backend() != "cpu":
+            return np.array(leaf)
+        try:
+            return np.from_dlpack(leaf)  # pyright: ignore[reportArgumentType]
+        except (BufferError, RuntimeError, TypeError):  # a dtype that NumPy lacks, or several devices
+            return np.array(leaf)
+
+    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
+
+
+def _checksum(array: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+
+
+def describe(arrays: dict[str, Any]) -> dict[str, list]:
+    """Describes arrays for a manifest: shape, dtype and checksum, by name."""
+    if distributed.are_several():
+        return _describe_parts(arrays)
+    return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
+
+
+def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
+    """Returns the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
+    if not distributed.are_several():
+        return to_host(tree, copy)
+    return {
+        name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        for name, leaf in named_leaves(tree).items()
+    }
+
+
+def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
+    """Describes arrays distributed over processes; the last number is the count of axes for `_row_checksum`."""
+    axes = {
+        name: max((n + 1 for n, on in enumerate(_partition_spec(array)) if on), default=0) for name, array in arrays.items()
+    }
+    sums = np.zeros(len(arrays), np.uint32)
+    for number, (name, array) in enumerate(arrays.items()):
+        for shard in array.addressable_shards:
+            if shard.replica_id == 0:
+                start = [part.start or 0 for part in shard.index[: axes[name]]]
+                sums[number] += np.uint32(_row_checksum(np.asarray(shard.data), axes[name], start))
+    totals = multihost_utils.process_allgather(sums).astype(np.uint64).sum(axis=0) % 2**32
+    return {
+        name: [list(array.shape), str(array.dtype), int(total), axes[name]]
+        for (name, array), total in zip(arrays.items(), totals, strict=True)
+    }
+
+
+def _partition_spec(array: jax.Array) -> Sequence[Any]:
+    return getattr(array.sharding, "spec", ())
+
+
+def _row_checksum(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
+    """Computes a checksum that is additive over parts: the sum of the rows' checksums, each seeded with the row's position.
+
+    Args:
+        array: A part of an array.
+        axes: Number of leading axes that index rows.
+        start: Position of the part along these axes; empty for a whole array.
+    """
+    total = 0
+    for index in np.ndindex(array.shape[:axes]):
+        place = np.add(index, start) if len(start) else np.asarray(index)
+        total += zlib.crc32(
+            np.ascontiguousarray(array[index]).reshape(-1).view(np.uint8).data, zlib.crc32(place.astype("<i8").tobytes())
+        )
+    return total % 2**32
+
+
+def is_intact(array: np.ndarray, described: list) -> bool:
+    """Returns True if an array matches its description in the manifest."""
+    _, _, checksum, *axes = described
+    return checksum == (_row_checksum(array, axes[0]) if axes else _checksum(array))
+
+
+def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
+    """Returns True for shapes [S, rollouts, E, ...] and [S, rollouts * E, ...] of the same episodes (`sharding.Layout`)."""
+    (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
+    return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
+
+
+def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
+    """Returns the restore target for orbax: an array on the first device, or one on the host to be distributed later."""
+    if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
+        return expected
+    return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))
+
+
+def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
+    """Returns the specs of the arrays that `to_host` makes, on the first device unless the leaves define a sharding."""
+    first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+
+    def convert(leaf: Any) -> jax.ShapeDtypeStruct:
+        device = getattr(leaf, "sharding", None) or first
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.eval_shape(jax.random.key_data, leaf)
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device)
+
+    return {name: convert(leaf) for name, leaf in named_leaves(tree).items()}
+
+
+def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
+    """Inverts `to_host`: builds a tree like ``template``, which also defines where its arrays are placed."""
+
+    def convert(path: Any, leaf: Any) -> jax.Array:
+        array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            # The default key type, as in `Trainer.run_keys`; another type has another number of words, which is detected
+            # earlier.
+            array = jax.random.wrap_key_data(jnp.asarray(array))
+        elif array.shape != leaf.shape:
+            array = array.reshape(leaf.shape)
+        if sharding is None:
+            return jnp.asarray(array)
+        return put_array(array, sharding)
+
+    return jax.tree.map_with_path(convert, template)
+
+
+def check_structure(where: Path, saved: dict[str, list], expected: dict[str, jax.ShapeDtypeStruct]) -> None:
+    """Raises RequestError, naming the first differences, if a checkpoint has other arrays than this program."""
+    differences = []
+    for name in sorted(set(saved) | set(expected)):
+        stored = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"
+        required = f"{expected[name].dtype}{list(expected[name].shape)}" if name in expected else "nothing"
+        if stored != required and name.startswith("replay.episodes.") and name in saved and name in expected:
+            if saved[name][1] == str(expected[name].dtype) and _is_folded(saved[name][0], expected[name].shape):
+                continue
+        if stored != required:
+            differences.append(f"{name} is {stored} there and {required} here")
+    if differences:
+        shown = "; ".join(differences[:3]) + (f"; and {len(differences) - 3} more" if len(differences) > 3 else "")
+        raise RequestError(f"{where} has another structure, so another version wrote it: {shown}; use that, or --overwrite")

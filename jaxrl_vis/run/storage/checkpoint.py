@@ -1,0 +1,409 @@
+"""Two tiers of orbax checkpoints: light ones often, full ones rarely.
+
+    checkpoints/light/<iteration>/   train         networks, targets, optimisers, statistics: enough for eval and play
+    checkpoints/full/<iteration>/    train, rest   with the replay, keys and iteration: for an exact resume
+    checkpoints/recent/                            the same against a kill, where it is cheap, see `recent`
+
+Each checkpoint has a manifest: names, shapes, dtypes and checksums of all arrays, and the host's progress. orbax makes a folder
+appear under its final name only when it is complete; the checksums detect later damage, such as a flipped byte, which would
+otherwise be restored silently. After the background write, SHA256SUMS (`sums`) is added for `verification`, also of data that
+is never restored. The newest two of each tier are kept.
+
+A run resumes from the newest valid checkpoint of all tiers; if several are equally new, from the full, the recent or the light
+one, in this order. Nothing newer is ever deleted: a damaged checkpoint is moved to checkpoints/damaged/, and one of another
+run, identified by the run's id in its manifest, to checkpoints/foreign/.
+"""
+
+import contextlib
+import dataclasses
+import itertools
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.host import distributed, streams
+from jaxrl_vis.host.files import read_json
+from jaxrl_vis.run.storage import hush, sums
+from jaxrl_vis.run.storage.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
+from jaxrl_vis.run.storage.manifest import FILE, READABLE, SCHEMA, is_manifest, progress_in
+from jaxrl_vis.run.storage.metrics import RUN_ID
+from jaxrl_vis.run.storage.recent import ANY_RUN, Recent, Unusable
+from jaxrl_vis.types import LoopState, TrainState
+
+if TYPE_CHECKING:  # orbax takes a fifth of this package's import time, so it is imported where it is used
+    import orbax.checkpoint as ocp
+
+LIGHT, FULL, RECENT = "light", "full", "recent"
+_PRECEDENCE = (FULL, RECENT, LIGHT)  # for resuming, among equally new ones
+_KEPT = 2
+_TIMEOUT_S = 10**9
+DAMAGED, FOREIGN = "damaged", "foreign"
+
+
+class _Damaged(Exception):
+    """Damaged checkpoint. The message gives the reason in a few words."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Restored:
+    """Contents of a checkpoint.
+
+    Attributes:
+        tier: `LIGHT`, `FULL` or `RECENT`.
+        iteration: Iterations completed.
+        train: The learner, [S, ...].
+        loop: The complete state; None from the light tier.
+        progress: Progress that was saved with it.
+    """
+
+    tier: str
+    iteration: int
+    train: TrainState
+    loop: LoopState | None
+    progress: dict[str, Any]
+
+
+def _free(path: Path) -> Path:
+    """Returns an unused path: ``path`` itself, or the first free one of path-2, path-3, ..."""
+    numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+    return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())
+
+
+def state_without_learner(loop: LoopState) -> dict[str, Any]:
+    """Returns the part of a loop state that full checkpoints have in addition to the learner."""
+    return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
+
+
+class Checkpoints:
+    """Checkpoints of one run. While open, orbax's own log is silenced: errors are raised, and reported in one line.
+
+    Args:
+        folder: Folder of the tiers; created by the first save.
+        say: Called with one line about each unusable checkpoint.
+        read_only: Never save: nothing is created or cleaned up.
+
+    Attributes:
+        run_id: Id of the run, None for one of an earlier version: other runs' checkpoints are ignored, except by
+            `set_foreign_aside`. `ANY_RUN`: all checkpoints.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        say: Callable[[str], None] = streams.say,
+        read_only: bool = False,
+        run_id: str | None = ANY_RUN,
+    ):
+        self._folder = folder.absolute()  # orbax refuses relative names
+        self._say = say
+        self._read_only = read_only
+        self.recent = Recent(self._folder / RECENT, say)
+        self.run_id = run_id
+        self._managers: dict[str, ocp.CheckpointManager] = {}
+        self._reported: set[tuple[str, int]] = set()  # damaged ones
+        self._unsummed: set[tuple[str, int]] = set()  # saved, perhaps still in the background, and without `sums`
+        self._unsilence: Callable[[], None] | None = None
+
+    @property
+    def run_id(self) -> str | None:
+        """Id of the run, see the class."""
+        return self.recent.run_id
+
+    @run_id.setter
+    def run_id(self, run_id: str | None) -> None:
+        self.recent.run_id = run_id
+
+    def _manager(self, tier: str) -> "ocp.CheckpointManager":
+        import orbax.checkpoint as ocp
+        from orbax.checkpoint.checkpoint_managers import LatestN
+        from orbax.checkpoint.options import AsyncOptions
+
+        if tier not in self._managers:
+            if self._unsilence is None:
+                self._unsilence = hush.silence_orbax()
+            # orbax measures timeouts with the system clock: a change of the clock could abort a good save. A single process
+            # waits for its own disk indefinitely; with several, one that hangs must be detected.
+            patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
+            options = ocp.CheckpointManagerOptions(
+                async_options=None if distributed.are_several() else patient,
+                preservation_policy=None if self._read_only else LatestN(_KEPT),
+                cleanup_tmp_directories=not self._read_only,
+                read_only=self._read_only,
+                create=not self._read_only,
+            )
+            self._managers[tier] = ocp.CheckpointManager(self._folder / tier, options=options)
+        return self._managers[tier]
+
+    def iterations(self, tier: str) -> list[int]:
+        """Returns the iterations of this run's checkpoints in a tier, ascending, including damaged ones."""
+        if tier == RECENT:
+            return self.recent.iterations()
+        return [iteration for iteration, is_ours in self._list(tier) if is_ours]
+
+    def _list(self, tier: str) -> list[tuple[int, bool]]:
+        """Returns the iterations of a tier's checkpoints, ascending, with True for those of this run."""
+        folder = self._folder / tier
+        if not folder.is_dir():
+            return []
+        names = [entry.name for entry in folder.iterdir() if entry.name.isdecimal() and entry.is_dir()]
+        return sorted((int(name), self._is_ours(folder / name)) for name in names)
+
+    def _is_ours(self, checkpoint: Path) -> bool:
+        """Returns True if a checkpoint's manifest has this run's id, or cannot be read: a damaged one may be this run's."""
+        try:
+            manifest = read_json(checkpoint / FILE)
+        except RequestError:
+            return True
+        return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
+
+    def newest(self) -> int | None:
+        """Returns the newest iteration from which the run could resume; None if there is none."""
+        return max((iteration for tier in _PRECEDENCE for iteration in self.iterations(tier)), default=None)
+
+    def save_light(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
+        """Copies the learner to the host and writes it in the background; ``train`` may be donated once this returns.
+
+        Args:
+            iteration: Iterations completed.
+            train: The learner, [S, ...].
+            progress: A JSON value.
+        """
+        self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
+
+    def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
+        """Writes the complete state and waits for the disk: an asynchronous copy of the replay would need memory for two."""
+        items = {"train": to_save(loop.train, copy=False), "rest": to_save(state_without_learner(loop), copy=False)}
+        self._save(FULL, iteration, items, progress)
+        self.wait()
+
+    def _save(self, tier: str, iteration: int, items: dict[str, Any], progress: dict[str, Any]) -> None:
+        import orbax.checkpoint as ocp
+
+        described = {name: describe(arrays) for name, arrays in items.items()}
+        run = {} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}
+        manifest = {"schema": SCHEMA, **run, "iteration": iteration, "items": described, "progress": progress}
+        arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
+        arguments["manifest"] = ocp.args.JsonSave(manifest)
+        if distributed.are_several():
+            self.wait()  # with two tiers written concurrently, processes would confuse one with the other
+        with self._writing(tier):
+            manager = self._manager(tier)
+            self._wait(tier)
+            if distributed.any_process(iteration in self.iterations(tier)):  # orbax would silently keep the old one
+                manager.delete(iteration)
+            if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
+                raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
+            self._unsummed.add((tier, iteration))
+
+    def _wait(self, tier: str) -> None:
+        """Waits until a tier is on the disk, including the checksums of its files."""
+        self._managers[tier].wait_until_finished()
+        for saved in [saved for saved in self._unsummed if saved[0] == tier]:
+            folder = self._folder / tier / str(saved[1])
+            if distributed.is_first() and folder.is_dir():
+                sums.write_sums(folder)
+            self._unsummed.discard(saved)
+
+    @contextlib.contextmanager
+    def _writing(self, tier: str) -> Iterator[None]:
+        """Converts orbax's exceptions on writing into a `StorageError`."""
+        try:
+            yield
+        except Exception as error:
+            # After a failed background write, a manager reports the error again and again: use a new one. Its threads keep
+            # failing for a while, so the process stays silent about them from here on.
+            self._managers.pop(tier, None)
+            self._unsilence = hush.stay_silent
+            text = " ".join(str(error).split())
+            shown = "no space left on the device" if "No space left" in text else f"{type(error).__name__}: {text[:160]}"
+            raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
+
+    def wait(self) -> None:
+        """Waits until everything is on the disk.
+
+        Raises:
+            StorageError: Something could not be written.
+        """
+        for tier in list(self._managers):
+            with self._writing(tier):
+                self._wait(tier)
+
+    def close(self) -> None:
+        """Waits for pending writes, then releases orbax's threads."""
+        for tier, manager in list(self._managers.items()):
+            with self._writing(tier):
+                self._wait(tier)
+                manager.close()
+        self._managers.clear()
+        if self._unsilence is not None:
+            self._unsilence()
+            self._unsilence = None
+
+    def retire_full(self, has_ended: bool = False) -> None:
+        """Deletes full checkpoints older than a light one that is safely on the disk: they are no longer needed for resuming.
+
+        Recent states that are not kept up to date any more go likewise.
+
+        Args:
+            has_ended: Also delete equally new ones: the run is complete.
+        """
+        newest = max(self.iterations(LIGHT), default=-1)
+        if distributed.is_first():
+            self.recent.retire(newest)
+        for iteration in self.iterations(FULL):
+            if iteration < newest + has_ended:
+                self._forget(FULL)
+                if distributed.is_first():
+                    shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
+
+    def set_aside_after(self, iteration: int) -> list[Path]:
+        """Moves checkpoints after ``iteration``, which are unusable, to checkpoints/damaged/.
+
+        Returns:
+            Where they are now.
+        """
+        tiers = {tier: self.iterations(tier) for tier in (LIGHT, FULL, RECENT)}
+        later = {tier: [number for number in iterations if number > iteration] for tier, iterations in tiers.items()}
+        return self._move(later, DAMAGED)
+
+    def set_foreign_aside(self) -> list[Path]:
+        """Moves checkpoints of other runs to checkpoints/foreign/, where they do not count towards the number that is kept.
+
+        Returns:
+            Where they are now.
+        """
+        foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL)}
+        moved = self._move(foreign, FOREIGN)
+        recent = _free(self._folder / FOREIGN / RECENT)
+        if distributed.is_first() and self.recent.set_foreign_aside(recent):
+            moved.append(recent)
+        return moved
+
+    def _move(self, iterations: dict[str, list[int]], folder: str) -> list[Path]:
+        moved = []
+        for tier, iteration in [(tier, iteration) for tier, numbers in iterations.items() for iteration in numbers]:
+            self._forget(tier)
+            moved.append(_free(self._folder / folder / f"{tier}-{iteration}"))
+            if distributed.is_first():
+                moved[-1].parent.mkdir(exist_ok=True)
+                if tier == RECENT:
+                    self.recent.set_aside(iteration, moved[-1])
+                    continue
+                (self._folder / tier / str(iteration)).rename(moved[-1])
+        return moved
+
+    def _forget(self, tier: str) -> None:
+        """Closes the tier's manager, which caches the folder's contents; the next use creates a new one."""
+        if tier in self._managers:
+            self._managers.pop(tier).close()
+
+    def restore_for_resume(self, template: LoopState) -> Restored | None:
+        """Restores the newest valid checkpoint of any tier, full before recent before light; None if there is none.
+
+        Args:
+            template: Shapes and dtypes of the loop state, as from `jax.eval_shape`.
+
+        Raises:
+            RequestError: A checkpoint has another structure.
+        """
+        return self._newest_good(template, with_rest=True)
+
+    def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
+        """Restores the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
+        return self._newest_good(template, with_rest=False, only=iteration)
+
+    def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
+        """Returns the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+
+        Raises:
+            RequestError: The checkpoint is damaged, or of another schema.
+        """
+        with self._damage_as_request_error(tier, iteration):
+            return self._manifest(tier, iteration)
+
+    def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
+        """Restores one checkpoint completely, and compares it with the checksums in its manifest.
+
+        Raises:
+            RequestError: The checkpoint is damaged, or has another structure.
+        """
+        iteration = manifest["iteration"]
+        with self._damage_as_request_error(tier, iteration):
+            return self._restored(tier, iteration, template, tier == FULL, manifest)
+
+    @contextlib.contextmanager
+    def _damage_as_request_error(self, tier: str, iteration: int) -> Iterator[None]:
+        try:
+            yield
+        except _Damaged as damage:
+            raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
+
+    def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
+        # A light checkpoint is smaller, and a recent one may be deleted by the run while it is read.
+        tiers = _PRECEDENCE if with_rest else (LIGHT, FULL)
+        candidates = [(iteration, tier) for tier in tiers for iteration in self.iterations(tier) if only in (None, iteration)]
+        for iteration, tier in sorted(candidates, key=lambda item: (-item[0], tiers.index(item[1]))):
+            try:
+                if tier == RECENT:
+                    return self._restore_recent(iteration, template)
+                return self._restore(tier, iteration, template, with_rest and tier == FULL)
+            except _Damaged as damage:
+                if (tier, iteration) not in self._reported:
+                    self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
+                self._reported.add((tier, iteration))
+        return None
+
+    def _restore_recent(self, iteration: int, template: LoopState) -> Restored:
+        try:
+            loop, progress = self.recent.restore(iteration, template)
+        except Unusable as error:
+            raise _Damaged(str(error)) from None
+        return Restored(RECENT, iteration, loop.train, loop, progress)
+
+    def _manifest(self, tier: str, iteration: int) -> dict[str, Any]:
+        import orbax.checkpoint as ocp
+
+        manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
+        if not is_manifest(manifest):
+            raise _Damaged("its manifest is incomplete")
+        if manifest["schema"] not in READABLE:
+            where = self._folder / tier / str(iteration)
+            raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
+        return manifest
+
+    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
+        return self._restored(tier, iteration, template, with_rest, self._manifest(tier, iteration))
+
+    def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
+        import orbax.checkpoint as ocp
+
+        templates = {"train": template.train} | ({"rest": state_without_learner(template)} if with_rest else {})
+        specs = {name: host_specs(tree) for name, tree in templates.items()}
+        where = self._folder / tier / str(iteration)
+        for name, spec in specs.items():
+            check_structure(where, manifest["items"].get(name, {}), spec)
+            specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
+        read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
+        trees = {}
+        for name, tree in templates.items():
+            for leaf_name, array in to_host(read[name], copy=False).items():
+                if not is_intact(array, manifest["items"][name][leaf_name]):
+                    raise _Damaged(f"wrong checksum of {leaf_name}")
+            trees[name] = rebuild(tree, read[name])
+        loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
+        return Restored(tier, iteration, trees["train"], loop, progress_in(manifest))
+
+    def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
+        import orbax.checkpoint as ocp
+
+        try:
+            manager = self._manager(tier)  # first, because `hushed` restores the hooks that it finds
+            with hush.hushed():
+                return manager.restore(iteration, args=ocp.args.Composite(**arguments))
+        # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
+        except Exception as error:
+            self._unsilence = hush.stay_silent  # as after a failed write: threads of this read may report errors later
+            text = " ".join(str(error).split())[:80]
+            raise _Damaged(f"{type(error).__name__}: {text}") from None

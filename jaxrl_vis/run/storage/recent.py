@@ -1,0 +1,313 @@
+"""Up-to-date state of a run on a CPU, for resuming after a kill: every frame is written only once.
+
+    checkpoints/recent/<iteration>.state     learner, keys, iteration, and the checksums of its rollouts
+    checkpoints/recent/<iteration>.rollout   the episodes collected in this iteration
+
+A rollout stays in the replay until the ring buffer overwrites it, so a state needs several files of earlier iterations and one
+new file: some milliseconds, where a full checkpoint writes the whole replay. That is worthwhile on a CPU, where reading the
+arrays costs nothing, for a replay of moderate size: `is_cheap`.
+
+Nothing is synced to the disk. A killed process leaves what it has written; a power cut may not, which the checksums detect, and
+the run then resumes from a light or a full checkpoint, which are synced. A file appears under its name only when it is
+complete. The newest two states are kept.
+"""
+
+import contextlib
+import json
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.learner.memory.replay import num_bytes
+from jaxrl_vis.run.storage.arrays import Arrays, check_structure, describe, host_specs, is_intact, rebuild, to_host
+from jaxrl_vis.run.storage.metrics import RUN_ID
+from jaxrl_vis.types import LoopState, ReplayState
+
+SCHEMA = 1
+ANY_RUN = "*"
+_KEPT = 2
+_MOST_BYTES = 2**30  # of a replay
+_SHARE = 0.03  # largest fraction of the time spent on saving: about every iteration of `cpu` on two cores
+_EPISODES = "replay.episodes."
+
+
+def is_cheap(replay: ReplayState) -> bool:
+    """Returns True if this replay (or one of these shapes) is cheap to keep up to date in files, in time and disk space."""
+    return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
+
+
+class Unusable(Exception):
+    """Damaged state, or one with a damaged rollout. The message gives the reason in a few words."""
+
+
+class Recent:
+    """Recent states of one run.
+
+    Args:
+        folder: Folder of the states; created by the first save.
+        say: Called with one line when there is no more space for them.
+
+    Attributes:
+        run_id: Id of the run, None for one without: other runs' states are ignored, except by `set_foreign_aside`. `ANY_RUN`:
+            all states.
+    """
+
+    def __init__(self, folder: Path, say: Callable[[str], None]):
+        self._folder, self._say = folder, say
+        self.run_id: str | None = ANY_RUN
+        self._rollouts: dict[int, int] = {}  # rollouts known to exist, and their checksums
+        self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
+
+    def is_due(self, in_any_case: bool) -> bool:
+        """Returns True if enough time has passed since the last save for saving to take only a small fraction of it.
+
+        Args:
+            in_any_case: Ignore the time.
+        """
+        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
+
+    def iterations(self) -> list[int]:
+        """Returns the iterations of this run's states, ascending, including damaged ones."""
+        return sorted(iteration for iteration in _numbers(self._folder, "state") if self._is_ours(iteration))
+
+    def _is_ours(self, iteration: int) -> bool:
+        """Returns True if a state's header has this run's id; one that cannot be read is damaged, and may be this run's."""
+        try:
+            return self.run_id in (ANY_RUN, self._header(iteration).get(RUN_ID))
+        except Unusable:
+            return True
+
+    def set_foreign_aside(self, to: Path) -> bool:
+        """Moves all files away if there is a state of another run; returns True if there was one."""
+        is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
+        if is_foreign:
+            to.parent.mkdir(exist_ok=True)
+            self._folder.rename(to)
+        return is_foreign
+
+    def save(
+        self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
+    ) -> None:
+        """Writes a state and its missing rollouts; if there is no space, this is reported, and nothing more is saved.
+
+        Args:
+            iteration: Iterations completed.
+            loop: The state, on one device.
+            num_envs: E, episodes that one iteration adds to the replay.
+            progress: A JSON value.
+            started: Start of the work for it, checks included (`time.monotonic`); None: now.
+        """
+        self._saved_at = time.monotonic() if started is None else started
+        try:
+            self._write(iteration, loop, num_envs, progress)
+        except OSError as error:
+            self._is_off = True
+            self._drop_unfinished()
+            self._say(
+                f"the replay is not kept up to date any more ({error.strerror or type(error).__name__}): "
+                "if this process is killed, the run goes on without it"
+            )
+        self._cost = time.monotonic() - self._saved_at
+
+    def _write(self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any]) -> None:
+        for folder in (self._folder.parent, self._folder):  # but not the run folder, which may have been moved
+            folder.mkdir(exist_ok=True)
+        replay = to_host({"replay": loop.replay}, copy=False)
+        episodes = {name: array for name, array in replay.items() if name.startswith(_EPISODES)}
+        arrays = to_host({"train": loop.train, "key": loop.key, "iteration": loop.iteration}, copy=False)
+        arrays["replay.size"] = replay["replay.size"]
+        num_rollouts = next(iter(episodes.values())).shape[1] // num_envs
+        stored = int(arrays["replay.size"].max()) // num_envs
+        rollouts = {}
+        for number in range(iteration - stored + 1, iteration + 1):
+            if number not in self._rollouts:
+                start = (number - 1) % num_rollouts * num_envs
+                self._rollouts[number] = self._write_rollout(
+                    number, {name: array[:, start : start + num_envs] for name, array in episodes.items()}
+                )
+            rollouts[number] = self._rollouts[number]
+        header = {
+            **{"schema": SCHEMA, "iteration": iteration, "items": describe(arrays)},
+            **({} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}),
+            "episodes": {name: [list(array.shape), str(array.dtype)] for name, array in episodes.items()},
+            **{"rollouts": {str(number): checksum for number, checksum in rollouts.items()}, "progress": progress},
+        }
+        text = json.dumps(header)
+        with _appearing(self._path(iteration, "state")) as file:
+            file.write(f"{zlib.crc32(text.encode()):08x} {text}\n".encode())
+            for array in arrays.values():
+                file.write(_bytes(array))
+        self._tidy()
+
+    def _write_rollout(self, number: int, parts: Arrays) -> int:
+        """Writes the episodes of one rollout, arrays [S, E, ...] one after the other; returns their checksum."""
+        checksum = 0
+        with _appearing(self._path(number, "rollout")) as file:
+            for part in parts.values():
+                contents = _bytes(part)
+                checksum = zlib.crc32(contents, checksum)
+                file.write(contents)
+        return checksum
+
+    def _tidy(self) -> None:
+        """Deletes all but the newest states, and older rollouts that these do not need."""
+        for number in self.iterations()[:-_KEPT]:
+            self._path(number, "state").unlink(missing_ok=True)
+        first = min(self._rollouts, default=0)
+        with contextlib.suppress(Unusable, IndexError):
+            first = min(self._header(self.iterations()[0])["rollouts"], key=int)
+        for number in _numbers(self._folder, "rollout"):
+            if number < int(first):
+                self._path(number, "rollout").unlink(missing_ok=True)
+        self._rollouts = {number: checksum for number, checksum in self._rollouts.items() if number >= int(first)}
+
+    def manifest(self, iteration: int) -> dict[str, Any]:
+        """Returns the manifest of a state: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and the run's id.
+
+        Raises:
+            Unusable: The state is damaged.
+        """
+        return self._header(iteration)
+
+    def restore(self, iteration: int, template: LoopState) -> tuple[LoopState, dict[str, Any]]:
+        """Restores a state, and the progress that was saved with it.
+
+        Args:
+            iteration: One of `iterations`.
+            template: Shapes and dtypes of the loop state.
+
+        Raises:
+            Unusable: The state is damaged, or a rollout of it is missing or damaged.
+            RequestError: The state has another structure.
+        """
+        header, path = self._header(iteration), self._path(iteration, "state")
+        tree = {name: getattr(template, name) for name in ("train", "replay", "key", "iteration")}
+        specs = host_specs(tree)
+        check_structure(path, header["items"] | header["episodes"], specs)
+        contents = self._read(path)
+        offset = contents.index(b"\n") + 1
+        arrays = {}
+        for name, described in header["items"].items():  # in the order in which they were written
+            arrays[name], offset = _array(contents, offset, specs[name].shape, specs[name].dtype)
+            if not is_intact(arrays[name], described):
+                raise Unusable(f"wrong checksum of {name}")
+        episodes = {name: np.zeros(shape, specs[name].dtype) for name, (shape, _) in header["episodes"].items()}
+        self._read_rollouts(header["rollouts"], episodes)
+        # Copies, because buffers owned by NumPy cannot be donated.
+        loop = LoopState(**rebuild(tree, {name: jnp.array(array) for name, array in (arrays | episodes).items()}))
+        return loop, header["progress"]
+
+    def _read_rollouts(self, checksums: dict[str, int], episodes: Arrays) -> None:
+        """Fills ``episodes``, arrays [S, N, ...], from the rollouts' files."""
+        num_episodes = next(iter(episodes.values())).shape[1]
+        for number, checksum in checksums.items():
+            contents = self._read(self._path(int(number), "rollout"))
+            if zlib.crc32(contents) != checksum:
+                raise Unusable(f"wrong checksum of rollout {number}")
+            size = sum(array.nbytes for array in episodes.values()) // num_episodes  # of one episode per seed
+            num_envs = len(contents) // size
+            start, offset = (int(number) - 1) % (num_episodes // num_envs) * num_envs, 0
+            for array in episodes.values():
+                shape = (len(array), num_envs, *array.shape[2:])
+                array[:, start : start + num_envs], offset = _array(contents, offset, shape, array.dtype)
+
+    def resume_from(self, iteration: int | None) -> None:
+        """Prepares for resuming from the state of an iteration, and deletes later rollouts; None: from none, so deletes all."""
+        if iteration is None:
+            self.clear()
+            return
+        self._rollouts = {int(number): checksum for number, checksum in self._header(iteration)["rollouts"].items()}
+        for number in _numbers(self._folder, "rollout"):
+            if number > iteration:
+                self._path(number, "rollout").unlink(missing_ok=True)
+
+    def _drop_unfinished(self) -> None:
+        """Deletes what belongs to no state. The states stay: nothing newer may ever find room."""
+        newest = max(self.iterations(), default=0)
+        with contextlib.suppress(OSError):
+            for file in self._folder.iterdir():
+                if file.suffix == ".tmp" or (file.suffix == ".rollout" and file.stem.isdigit() and int(file.stem) > newest):
+                    file.unlink(missing_ok=True)
+
+    def retire(self, newest: int) -> None:
+        """Deletes everything if no more states are saved and a checkpoint of iteration ``newest`` has overtaken them."""
+        if self._is_off and newest >= max(self.iterations(), default=0):
+            self.clear()
+
+    def clear(self) -> None:
+        """Deletes all states: a full checkpoint replaces them, or the run has ended."""
+        self._rollouts = {}
+        with contextlib.suppress(OSError):
+            for file in self._folder.iterdir():
+                if file.suffix in (".state", ".rollout", ".tmp"):
+                    file.unlink(missing_ok=True)
+            self._folder.rmdir()
+
+    def set_aside(self, iteration: int, to: Path) -> None:
+        """Moves the state of an iteration."""
+        self._path(iteration, "state").replace(to)
+
+    def _header(self, iteration: int) -> dict[str, Any]:
+        try:
+            with self._path(iteration, "state").open("rb") as file:
+                checksum, _, text = file.readline().rstrip(b"\n").partition(b" ")
+            if int(checksum, 16) != zlib.crc32(text):
+                raise Unusable("wrong checksum of its first line")
+            header = json.loads(text)
+        except (OSError, ValueError) as error:
+            raise Unusable(f"{type(error).__name__}: its first line") from None
+        if header["schema"] != SCHEMA:
+            raise Unusable(f"it is of schema {header['schema']}, not {SCHEMA}")
+        return header
+
+    def _read(self, path: Path) -> bytes:
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise Unusable(f"{path.name}: {error.strerror or type(error).__name__}") from None
+
+    def _path(self, iteration: int, kind: str) -> Path:
+        return self._folder / f"{iteration}.{kind}"
+
+
+def names_of_others(folder: Path) -> list[str]:
+    """Returns the names of foreign files in a folder of recent states; empty if there is no folder."""
+    kinds = (".state", ".rollout")
+    entries = folder.iterdir() if folder.is_dir() else ()
+    bare = {entry.name: Path(entry.name.removesuffix(".tmp")) for entry in entries}
+    return sorted(name for name, path in bare.items() if not (path.suffix in kinds and path.stem.isdigit()))
+
+
+def _numbers(folder: Path, kind: str) -> list[int]:
+    try:
+        return [int(file.stem) for file in folder.iterdir() if file.suffix == f".{kind}" and file.stem.isdigit()]
+    except OSError:
+        return []
+
+
+@contextlib.contextmanager
+def _appearing(path: Path) -> Iterator[IO[bytes]]:
+    """Opens a file that gets its name when it is complete. It is not synced to the disk, see the module."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as file:
+        yield file
+    temporary.replace(path)
+
+
+def _bytes(array: np.ndarray) -> memoryview:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+
+
+def _array(contents: bytes, offset: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
+    """Returns the array of a shape that begins at an offset, and the offset of its end."""
+    count = int(np.prod(shape))
+    end = offset + count * np.dtype(dtype).itemsize
+    if end > len(contents):
+        raise Unusable("it ends too early")
+    return np.frombuffer(contents, dtype, count, offset).reshape(shape), end

@@ -1,0 +1,130 @@
+"""Trained policies as functions.
+
+policy = load_policy("runs/mine")
+action = policy(observation, goal)              # one environment: planar [C, H, W] uint8, or [S] float32
+actions = jax.vmap(policy)(observations, goals) # many
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import enable_compilation_cache
+from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
+from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis_envs.base import GoalEnv
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Policy:
+    """Trained actor without exploration, including normalisation. Create it with `load_policy`; call it, vmap it, scan it.
+
+    Attributes:
+        env: The environment of its training, with the image size and all other options of the run.
+        config: The configuration of the run.
+        seed: Seed of the run that trained it.
+        iteration: Iteration of its checkpoint.
+        parameters: Parameters of the policy, from `Algorithm.policy_params`.
+    """
+
+    env: GoalEnv
+    config: Config
+    seed: int
+    iteration: int
+    parameters: PolicyParams = dataclasses.field(repr=False)
+    _algorithm: Algorithm = dataclasses.field(repr=False)
+
+    @property
+    def env_name(self) -> str:
+        """Name of the environment, as in `jaxrl_vis_envs.make`."""
+        return self.config.env
+
+    @property
+    def observation_spec(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of an observation, and of a goal: [C, H, W] uint8 or [S] float32."""
+        return self.env.observation_spec
+
+    @property
+    def action_size(self) -> int:
+        """A, the size of an action."""
+        return self.env.action_size
+
+    def __call__(self, observation: Any, goal: Any) -> jax.Array:
+        """Computes an action.
+
+        Args:
+            observation: Output of `GoalEnv.observe`: planar [C, H, W] uint8, or [S] float32 for state tasks.
+            goal: ``obs["desired_goal"]``, in the same form.
+
+        Returns:
+            [A] float32 in [-1, 1].
+
+        Raises:
+            RequestError: A shape or a dtype does not match.
+        """
+        self._check("observation", observation)
+        self._check("goal", goal)
+        return self._act(self.parameters, observation, goal)
+
+    @functools.cached_property
+    def _act(self) -> Any:
+        algorithm = self._algorithm
+
+        def act(parameters: PolicyParams, observation: jax.Array, goal: jax.Array) -> jax.Array:
+            observations, goals = (jnp.asarray(array, self.observation_spec.dtype)[None] for array in (observation, goal))
+            return algorithm.act(parameters, observations, algorithm.aim(parameters, goals))[0]
+
+        return jax.jit(act)
+
+    def _check(self, name: str, value: Any) -> None:
+        """Raises a RequestError unless ``value`` has the form of an observation."""
+        spec = self.observation_spec
+        shape, wanted = np.shape(value), tuple(spec.shape)
+        if shape != wanted:
+            mend = ""
+            if shape[1:] == wanted:
+                mend = ": jax.vmap(policy) takes a batch"
+            elif len(wanted) == 3 and shape == (*wanted[1:], wanted[0]):
+                mend = f": images are planar here, so move the channels first, np.moveaxis({name}, -1, 0)"
+            elif len(wanted) == 3 and name == "goal" and shape == (wanted[0] // self.env.frame_stack, *wanted[1:]):
+                mend = f": repeat the goal's image {self.env.frame_stack} times, as policy.env.as_goal does"
+            raise RequestError(f"{self.env_name}: {name} must have the shape {wanted}, not {shape}{mend}")
+        dtype = np.dtype(getattr(value, "dtype", None) or np.asarray(value).dtype)
+        if spec.dtype == jnp.uint8:
+            if dtype != np.uint8:
+                raise RequestError(f"{self.env_name}: {name} must be uint8 from 0 to 255, not {dtype}")
+        elif not jnp.issubdtype(dtype, jnp.floating):
+            raise RequestError(f"{self.env_name}: {name} must be {spec.dtype}, not {dtype}")
+
+
+def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None, trust: bool = False) -> Policy:
+    """Loads the policy of a run, on any platform that JAX supports.
+
+    Args:
+        run_dir: The run folder.
+        seed: Seed, for a run with several; None: the first.
+        checkpoint: Iteration of an existing checkpoint; None: the newest valid one.
+        trust: Allow the run's own code, which a task ``module:Name`` executes; not needed for runs that were trained here.
+
+    Raises:
+        RequestError: There is no run, no such seed or checkpoint, or no usable one; or its task is not available here, or is
+            untrusted code.
+    """
+    trainer = open_run(run_dir, trust=trust)
+    seed = trainer.config.seed if seed is None else seed
+    if seed not in trainer.seeds:
+        trained = f"seed {trainer.seeds[0]}" if len(trainer.seeds) == 1 else f"seeds {trainer.seeds[0]} to {trainer.seeds[-1]}"
+        raise RequestError(f"the run in {run_dir} has trained no seed {seed}, only {trained}")
+    restored = load(trainer, run_dir, checkpoint)
+    enable_compilation_cache()
+    index, algorithm = trainer.seeds.index(seed), trainer.program.algorithm
+    train = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), restored.train)
+    parameters = algorithm.policy_params(train.agent, train.statistics)
+    return Policy(trainer.env, trainer.config, seed, restored.iteration, parameters, algorithm)

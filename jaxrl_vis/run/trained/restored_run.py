@@ -1,0 +1,125 @@
+"""Use of trained runs: evaluating them again, and playing episodes."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.acting.evaluate import num_recorded
+from jaxrl_vis.report import videos, viewer
+from jaxrl_vis.run.compiled.memory import check_compiled
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.storage.folder import read_config, read_run_id
+from jaxrl_vis.run.trainer import Trainer, make_trainer
+from jaxrl_vis.run.trust import check as check_trusted
+
+
+def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
+    """Creates the trainer of a run on one device, with changed fields of its configuration; its folder is not modified.
+
+    Args:
+        run_dir: The run folder.
+        keep_programs: As in `make_trainer`; programs traced by the training are reused.
+        trust: Allow the run's own code, if its task is not one of this project (`jaxrl_vis.run.trust`).
+        **changes: Fields of `Config`.
+
+    Raises:
+        RequestError: There is no run, its code is not trusted, or its trainer cannot be created any more.
+    """
+    saved = read_config(Path(run_dir))
+    check_trusted(Path(run_dir), saved, trust)
+    config = saved.replace(devices=1, data_devices=None, **changes)
+    return make_trainer(config, keep_programs=keep_programs)
+
+
+def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -> Restored:
+    """Loads a saved learner of a run.
+
+    Args:
+        trainer: From `open_run`.
+        run_dir: The run folder.
+        checkpoint: Iteration of the checkpoint; None: the newest valid one.
+
+    Raises:
+        RequestError: There is no such checkpoint, or no usable one.
+    """
+    checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True, run_id=read_run_id(Path(run_dir)))
+    saved = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
+    if checkpoint is not None and saved and checkpoint not in saved:
+        available = ", ".join(map(str, saved))
+        raise RequestError(f"the run in {run_dir} has no checkpoint of iteration {checkpoint}, only of {available}")
+    try:
+        restored = checkpoints.restore_train(trainer.shapes, checkpoint)
+    finally:
+        checkpoints.close()
+    if restored is None and saved and checkpoint is not None:
+        raise RequestError(f"checkpoint {checkpoint} of the run in {run_dir} is damaged: leave it out for the newest good one")
+    if restored is None:
+        raise RequestError(f"the run in {run_dir} has no usable checkpoint: train it first")
+    return restored
+
+
+def evaluate_run(
+    run_dir: Path | str, episodes: int | None = None, keep_programs: bool = False, trust: bool = False
+) -> dict[str, list[float]]:
+    """Evaluates the newest valid checkpoint of a run.
+
+    Args:
+        run_dir: The run folder.
+        episodes: Number of episodes; None: as during training.
+        keep_programs, trust: As of `open_run`.
+
+    Returns:
+        ``eval/success``, ``eval/goal_distance`` etc.: one number per seed.
+
+    Raises:
+        RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
+    """
+    trainer = open_run(run_dir, keep_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
+    restored = load(trainer, run_dir)
+    check_compiled(trainer.programs.of_evaluation(), already_there=True)
+    values = jax.device_get(trainer.evaluate(restored.train))
+    return {name: [float(number) for number in value] for name, value in values.items()}
+
+
+def play_run(
+    run_dir: Path | str,
+    out: Path | str,
+    episodes: int = 6,
+    three_dimensional: bool = False,
+    keep_programs: bool = False,
+    trust: bool = False,
+) -> None:
+    """Plays episodes with the first seed of a run's newest valid checkpoint, and writes a video.
+
+    Args:
+        run_dir: The run folder.
+        out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``), .html or .png.
+        episodes: Number of episodes.
+        three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
+            variants.
+        keep_programs, trust: As of `open_run`.
+
+    Raises:
+        RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
+    """
+    out = Path(out)
+    (viewer.check_page if three_dimensional else videos.check_output)(out)
+    trainer = open_run(run_dir, keep_programs, trust, eval_episodes=num_recorded(max(1, episodes)))
+    programs = trainer.programs
+    if not (programs.shows_images or three_dimensional):
+        raise RequestError(f"{trainer.config.env} shows the robot no images: play a run on a Visual task, or with --html")
+    train = load(trainer, run_dir).train
+    if three_dimensional:
+        viewer.write_page(programs.program, train, programs.evaluation_key, max(1, episodes), out)
+        return
+    parts, count = [], 0
+    while count < episodes:
+        _, recorded = programs.evaluate(train, jax.random.fold_in(programs.evaluation_key, count) if parts else None)
+        parts.append(videos.first_seed(recorded))
+        count += len(parts[-1].success)
+    joined = videos.EpisodeImages(
+        *(np.concatenate([getattr(part, name) for part in parts])[:episodes] for name in ("frames", "goals", "success"))
+    )
+    videos.write_video(joined, out, programs.image_seconds, max_episodes=episodes)

@@ -1,0 +1,71 @@
+"""Presentation of a run: the curve, and at the end a video and a summary. Only the first process makes them."""
+
+from collections.abc import Callable
+from typing import Any
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.report import videos
+from jaxrl_vis.run.compiled.programs import Programs
+from jaxrl_vis.run.loggers.console import show_seconds
+from jaxrl_vis.run.loggers.group import Loggers
+from jaxrl_vis.run.storage.folder import RunFolder
+from jaxrl_vis.run.storage.progress import Progress
+
+
+def describe(config: Config) -> str:
+    """Summarises a configuration in a few words: method, preset and seeds."""
+    seeds = f"seed {config.seed}" if config.seeds == 1 else f"seeds {config.seed} to {config.seed + config.seeds - 1}"
+    return f"{config.method}, preset {config.preset}, {seeds}"
+
+
+class Results:
+    """Images that a run writes in addition to its metrics and checkpoints.
+
+    Args:
+        programs: Programs of the run.
+        folder: Folder of the files.
+        loggers: Loggers that also receive the images.
+        say: Prints a line.
+    """
+
+    def __init__(self, programs: Programs, folder: RunFolder, loggers: Loggers, say: Callable[[str], None]):
+        self._programs, self._folder, self._loggers, self._say = programs, folder, loggers, say
+
+    def show(self, done: int, progress_now: Callable[[], Progress], recorded: dict[str, Any]) -> None:
+        """Draws the results of a finished run, and prints a summary.
+
+        Args:
+            done: Iterations completed.
+            progress_now: Returns the progress, with times up to the call.
+            recorded: Images of the last evaluation, see `evaluate.make_evaluate`; unused if there are none.
+        """
+        self.draw_curve(done)
+        if self._programs.shows_images:
+            videos.write_video(videos.first_seed(recorded), self._folder.video, self._programs.image_seconds)
+            self._loggers.image("video", self._folder.video, self._env_steps(done))
+        rows = [row for row in self._folder.rows() if row["iteration"] == done and row.get("eval/success") is not None]
+        success = ", ".join(f"seed {row['seed']}: {row['eval/success']:.3f}" for row in rows)
+        written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
+        progress = progress_now()
+        compiling = show_seconds(progress.compile_s)
+        self._say(f"success at the end: {success}; {show_seconds(progress.wall_s)}, of which {compiling} compiling")
+        self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
+
+    def draw_curve(self, done: int) -> None:
+        """Draws the evaluations up to ``done`` iterations."""
+        from jaxrl_vis.report import plots
+
+        config, env = self._programs.config, self._programs.env
+        plots.plot_run(
+            self._folder.rows(),
+            self._folder.curve,
+            title=config.env,
+            subtitle=f"{describe(config)}, {config.eval_episodes} episodes per evaluation"
+            + ("; thick: median, band: middle half" if config.seeds > 1 else ""),
+            unit=env.distance_unit,
+            threshold=env.threshold,
+        )
+        self._loggers.image("curve", self._folder.curve, self._env_steps(done))
+
+    def _env_steps(self, done: int) -> int:
+        return done * self._programs.program.steps_per_iteration

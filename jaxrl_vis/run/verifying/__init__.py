@@ -1,0 +1,1 @@
+"""Verification of a run's files and numbers."""

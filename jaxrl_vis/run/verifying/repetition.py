@@ -1,0 +1,250 @@
+"""Repetition of a run's iterations, and comparison with its rows and checkpoints; see `verification`."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from jaxrl_vis.run.compiled.programs import Programs
+from jaxrl_vis.run.loop import GUARD
+from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage.arrays import is_intact, to_host
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, state_without_learner
+from jaxrl_vis.run.storage.manifest import progress_in
+from jaxrl_vis.run.storage.metrics import RUN_ID, PerSeed
+from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.verifying.inspection import Expected, Findings, listed
+from jaxrl_vis.types import LoopState
+
+NOT_REPEATED = (RUN_ID, "time/", "resume/")
+"""Prefixes of the names of values that no repetition can reproduce."""
+
+Row = dict[str, Any]
+
+_OTHER_BEGINS = 20
+
+
+@dataclasses.dataclass
+class Verification(Findings):
+    """Findings about a run folder, and results of repeating its iterations.
+
+    Attributes:
+        rows, numbers: Rows and numbers that were repeated, equal or not.
+        checkpoints: Names of the checkpoints that were compared with a repetition.
+        differences: Lines about rows and checkpoints that differ from the repetition; also among the problems.
+        largest: The largest relative difference of a number.
+        unverified: Lines about parts that were not repeated, and why.
+        elsewhere: Differences of this machine or its software from the run's, for which bit equality is not guaranteed.
+    """
+
+    rows: int = 0
+    numbers: int = 0
+    checkpoints: list[str] = dataclasses.field(default_factory=list)
+    differences: list[str] = dataclasses.field(default_factory=list)
+    largest: float = 0.0
+    unverified: list[str] = dataclasses.field(default_factory=list)
+    elsewhere: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def is_equal(self) -> bool:
+        """True if something was repeated, all of it is equal, and nothing is missing, damaged or another run's."""
+        return self.rows > 0 and not self.problems
+
+
+class Repeater:
+    """Repeats parts of one run.
+
+    Args:
+        programs: Programs of the run.
+        expected: Conditions on its rows.
+        rows: Rows of its file.
+        manifests: Manifests of its checkpoints, by tier and iteration.
+        report: Receives the results.
+        say: Called with a line about each step.
+
+    Attributes:
+        repeated: Iterations whose rows were compared.
+        without_evaluation: Iterations without an evaluation, as inferred from the means of the next one.
+    """
+
+    def __init__(
+        self,
+        programs: Programs,
+        expected: Expected,
+        rows: Sequence[Row],
+        manifests: Mapping[tuple[str, int], dict[str, Any]],
+        report: Verification,
+        say: Callable[[str], None],
+    ):
+        self._programs, self._expected, self._rows = programs, expected, rows
+        self._manifests, self._report, self._say = manifests, report, say
+        self.repeated: set[int] = set()
+        self.without_evaluation: set[int] = set()
+
+    def repeat(self, name: str, begin: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]) -> None:
+        """Repeats iterations and compares the results.
+
+        Args:
+            name: Name of the starting point, for messages.
+            begin: Iterations completed at the start.
+            progress: Progress of the host at the start.
+            loop: State at the start; donated.
+            compared_iterations: Iterations whose rows are compared, ascending; the repetition ends at the last one.
+        """
+        self._say(f"repeating iterations {begin + 1} to {compared_iterations[-1]} from {name} ...")
+        history = {begin - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
+        if begin in compared_iterations:
+            self._compare(name, begin, loop, history)
+        for iteration in range(begin + 1, compared_iterations[-1] + 1):
+            loop, values = self._programs.train_iteration(loop)
+            read = self._programs.pending(values).read_per_seed(len(self._expected.seeds))
+            broken = [key for key, counts in read.items() if key.startswith(GUARD) and any(counts)]
+            if broken:
+                self._differ(f"iteration {iteration}: the repetition from {name} meets non-finite numbers")
+                return
+            history[iteration] = {key: per_seed for key, per_seed in read.items() if not key.startswith(GUARD)}
+            if iteration in compared_iterations:
+                self._compare(name, iteration, loop, history)
+            self._compare_checkpoints(iteration, progress.replay_lost_at, loop)
+
+    def _differ(self, line: str) -> None:
+        self._report.differences.append(line)
+        self._report.problems.append(line)
+        self._say(f"  {line}")
+
+    def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
+        """Compares the rows of an iteration with the repetition."""
+        there = [row for row in self._rows if row["iteration"] == iteration]
+        outcome, _ = self._programs.evaluate(loop.train)
+        evaluated = self._programs.pending(outcome).read_per_seed(len(self._expected.seeds))
+        best: list[tuple[int, str, Any, Any]] | None = None
+        for begin in self._begins(iteration, history):
+            made = self._repeated_rows(iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)])
+            differences = [
+                (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
+            ]
+            if best is None:
+                best, numbers = differences, sum(len(_compared(row)) for row in there)
+            if not differences:
+                if best:
+                    self.without_evaluation.update(range(begin + 1, iteration))
+                    self._report.notes.append(
+                        f"iteration {iteration} has means since iteration {begin}: eval_interval had another value then"
+                    )
+                best = differences
+                break
+        assert best is not None
+        if iteration not in self.repeated:
+            self.repeated.add(iteration)
+            self._report.rows += len(there)
+            self._report.numbers += numbers
+        if best:
+            self._report_differences(name, iteration, best)
+        else:
+            seeds = "1 seed" if len(there) == 1 else f"{len(there)} seeds"
+            self._say(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
+
+    def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
+        self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
+        shown = listed(f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences)
+        hint = ""
+        if all(key.startswith("eval/") for _, key, _, _ in differences):
+            hint = " (or eval_episodes had another value then)"
+        self._differ(f"iteration {iteration}, from {name}: {shown}{hint}")
+
+    def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
+        """Lists candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
+        interval, earliest = self._expected.eval_interval, min(history, default=iteration + 1) - 1
+        scheduled = max((iteration - 1) // interval * interval, earliest)
+        evaluated = sorted({row["iteration"] for row in self._rows if earliest <= row["iteration"] < iteration}, reverse=True)
+        return list(dict.fromkeys([scheduled, *evaluated[:_OTHER_BEGINS], earliest]))
+
+    def _repeated_rows(self, iteration: int, evaluated: PerSeed, history: Sequence[PerSeed]) -> dict[int, Row]:
+        """Makes the rows that a run writes for an iteration, by seed, without the columns that are not repeated."""
+        counts = {
+            "iteration": iteration,
+            "updates": iteration * self._expected.updates,
+            "env_steps": iteration * self._expected.env_steps,
+        }
+        means = metrics.with_precision(metrics.average_metrics(history))
+        return {row["seed"]: row for row in metrics.make_rows(self._expected.seeds, counts, evaluated | means)}
+
+    def _compare_checkpoints(self, iteration: int, mark: int | None, loop: LoopState) -> None:
+        """Compares the state with checkpoints of the same iteration by their checksums."""
+        for tier in (LIGHT, FULL, RECENT):
+            manifest = self._manifests.get((tier, iteration))
+            if manifest is None or saved_progress(manifest).replay_lost_at != mark:
+                continue
+            differing = []
+            for described, tree in _saved(tier, manifest, loop):
+                arrays = to_host(tree, copy=False)
+                differing += [
+                    leaf
+                    for leaf, array in arrays.items()
+                    if leaf not in described
+                    or (list(array.shape) == described[leaf][0] and not is_intact(array, described[leaf]))
+                ]
+                del arrays  # a view would make the next donation a copy
+            if (checkpoint := f"{tier}/{iteration}") not in self._report.checkpoints:
+                self._report.checkpoints.append(checkpoint)
+            if differing:
+                self._differ(f"checkpoint {tier}/{iteration} differs from the repetition: {listed(differing)} differ")
+            else:
+                self._say(f"  checkpoint {tier}/{iteration}: equal")
+
+
+def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
+    """Yields pairs of a manifest's items and the arrays that they describe."""
+    items = manifest["items"]
+    if tier == RECENT:
+        state = {"train": loop.train, "key": loop.key, "iteration": loop.iteration, "replay": {"size": loop.replay.size}}
+        yield items, state
+        return
+    yield items.get("train", {}), loop.train
+    if tier == FULL:
+        yield items.get("rest", {}), state_without_learner(loop)
+
+
+def saved_progress(manifest: Mapping[str, Any]) -> Progress:
+    """Returns the host's progress saved with a checkpoint."""
+    return Progress.from_dict(progress_in(manifest))
+
+
+def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
+    """Returns True if a manifest has the host's progress, with the right types.
+
+    Args:
+        manifest: Manifest of a checkpoint.
+        seeds: Number of seeds of the run.
+    """
+    try:
+        progress = saved_progress(manifest)
+        names = {name for values in progress.since_evaluation for name in values}
+        figures = [number for values in progress.since_evaluation for name in names for number in values[name]]
+        counts = [len(row) for values in progress.since_evaluation for row in values.values()]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return False
+    is_mark = progress.replay_lost_at is None or isinstance(progress.replay_lost_at, int)
+    is_history = all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}
+    return is_mark and is_history and isinstance(progress.evaluation_due, bool)
+
+
+def _compared(row: Mapping[str, Any]) -> Row:
+    return {name: value for name, value in row.items() if not name.startswith(NOT_REPEATED)}
+
+
+def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yields names whose values are not written identically, with both values."""
+    compared = _compared(row)
+    for name in dict.fromkeys([*compared, *made]):
+        value, again = compared.get(name, "nothing"), made.get(name, "nothing")
+        if json.dumps(value) != json.dumps(again):
+            yield name, value, again
+
+
+def _relative(value: Any, again: Any) -> float:
+    """Returns the difference of two numbers relative to the larger one; infinite if one is not a number."""
+    if not (isinstance(value, int | float) and isinstance(again, int | float)):
+        return math.inf
+    return abs(value - again) / max(abs(value), abs(again)) if value != again else 0.0

@@ -1,0 +1,1 @@
+"""Engine of studies: a grid of runs, its cells, schedulers and results."""

@@ -1,0 +1,136 @@
+"""Elements of studies: variants of a configuration, tasks and seeds. The studies: `indicator`, `ol_aux`."""
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jaxrl_vis.config import Config, preset
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.studies.engine.cells import Cell, split_seeds
+from jaxrl_vis.validation import validate
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """Variant of a configuration: a line of a figure.
+
+    Attributes:
+        label: Label in the figure.
+        changes: Fields of `Config` that define it.
+        colour: Colour of its line.
+    """
+
+    label: str
+    changes: Mapping[str, Any]
+    colour: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """Family of studies on one subject, which share their run folders.
+
+    Attributes:
+        name: Name of the subject, and of the folder of its run folders.
+        variants: Variants for figures, by name.
+        tasks: Environments of the subject.
+        preset: Default preset of the runs.
+        of_task: (preset, environment) -> fields of `Config` that differ from the preset.
+        longest: Preset -> environment -> largest number of environment steps, for presets that need smaller budgets than the
+            thesis.
+        quick: Changes of the preset ``cpu`` for `figure --quick`.
+    """
+
+    name: str
+    variants: Mapping[str, Variant]
+    tasks: tuple[str, ...]
+    preset: str
+    of_task: Mapping[tuple[str, str], Mapping[str, Any]]
+    longest: Mapping[str, Mapping[str, int]]
+    quick: Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Definition of a figure.
+
+    Attributes:
+        family: Family of the study.
+        title: The figure's first line.
+        variants: Its lines, in the order of the legend; names of `Family.variants`.
+        steps: Environment -> environment steps of each run; these are the default tasks of the figure.
+        shorter: (environment, variant) -> environment steps of shorter runs.
+        extra: Variants that are trained for the tables only.
+        others: Environment -> environment steps of optional tasks.
+    """
+
+    family: Family
+    title: str
+    variants: tuple[str, ...]
+    steps: Mapping[str, int]
+    shorter: Mapping[tuple[str, str], int] = dataclasses.field(default_factory=dict)
+    extra: tuple[str, ...] = ()
+    others: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scope:
+    """Scope of a study's runs.
+
+    Attributes:
+        preset: Preset of every run.
+        seed: First seed.
+        seeds: Number of seeds.
+        seeds_per_run: Largest number of seeds in one program; None: all.
+        env_steps: Budget of every run; None: the study's own.
+        changes: Fields of `Config` to change in every run.
+    """
+
+    preset: str = "paper"
+    seed: int = 0
+    seeds: int = 5
+    seeds_per_run: int | None = None
+    env_steps: int | None = None
+    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+Cells = dict[tuple[str, str], list[Cell]]
+"""(environment, variant) -> the cells that make it, one for each group of seeds."""
+
+# `debug` makes 4 gradient steps per iteration, which OL-AUX-5 does not divide.
+_OF_PRESET: dict[str, dict[str, Any]] = {"debug": {"updates_per_iteration": 5}}
+_LONGEST = 1_500_000  # environment steps of a task without a budget in the study
+
+
+def make_cells(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
+    """Makes the cells of a study, task after task.
+
+    Raises:
+        RequestError: There is no such task or variant, or a configuration is invalid.
+    """
+    for task in tasks:
+        if task not in study.family.tasks:
+            raise RequestError(f"unknown task {task!r}{nearest(task, list(study.family.tasks))}")
+    for variant in variants:
+        if variant not in study.family.variants:
+            raise RequestError(f"unknown method {variant!r}{nearest(variant, list(study.family.variants))}")
+    return {(task, variant): _cells(study, task, variant, scope) for task in tasks for variant in variants}
+
+
+def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
+    config = preset(scope.preset, env=task, seed=scope.seed, seeds=scope.seeds)
+    config = config.replace(**_OF_PRESET.get(scope.preset, {}), **study.family.of_task.get((scope.preset, task), {}))
+    config = config.replace(env_steps=_budget(study, task, variant, scope, config))
+    changed = config.replace(**study.family.variants[variant].changes).replace(**scope.changes)
+    options = (re.sub(r"[^\w=.-]", "_", option) for option in changed.env_options)  # for a folder's name
+    family = "-".join((task, variant, scope.preset, *options))
+    return split_seeds(Cell(family, validate(changed)), scope.seeds_per_run or scope.seeds)
+
+
+def _budget(study: Study, task: str, variant: str, scope: Scope, config: Config) -> int:
+    if scope.env_steps is not None:
+        return scope.env_steps
+    steps = study.shorter.get((task, variant), {**study.others, **study.steps}.get(task, _LONGEST))
+    if scope.preset == study.family.preset:
+        return steps
+    return min(steps, study.family.longest.get(scope.preset, {}).get(task, config.env_steps))

@@ -1,0 +1,143 @@
+"""Tables of a figure, as Markdown and CSV: steps to levels of success, and speed-ups over a baseline."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from scipy.stats import spearmanr
+
+from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.studies.engine.results import Line, final, mean_success, mean_weight, reached
+
+BASELINE = "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """Line with its label in tables.
+
+    Attributes:
+        label: Label of its method.
+        line: The line.
+        source: Origin of the results: ``here``, or their publisher.
+    """
+
+    label: str
+    line: Line
+    source: str = "here"
+
+
+def steps_table(
+    lines: Mapping[str, Sequence[Named]], levels: Mapping[str, Sequence[float]]
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Tabulates steps to each level, and speed-ups over the baseline of the same source.
+
+    Args:
+        lines: Task -> its lines.
+        levels: Task -> levels of success.
+
+    Returns:
+        Lines of Markdown, one table per task; and rows for `spreadsheets.to_csv`.
+    """
+    text: list[str] = []
+    rows: list[dict[str, Any]] = []
+    for task, named in lines.items():
+        common = min(entry.line.end for entry in named)
+        heads = [part for level in levels[task] for part in (f"steps to {level:g}", "speed-up")]
+        columns = ["method", *heads, f"mean success to {show_steps(common)}", "success at the end"]
+        text += [f"### {task}", "", table_row(columns), table_row(["---"] * len(columns))]
+        for entry in named:
+            base = next((b.line for b in named if b.line.variant == BASELINE and b.source == entry.source), None)
+            text.append(table_row(_cells(entry, base, levels[task], common)))
+            rows += _csv_rows(entry, base, levels[task], common)
+        text.append("")
+    return text, rows
+
+
+def _label(named: Named) -> str:
+    return named.label if named.source == "here" else f"{named.label} ({named.source})"
+
+
+def _cells(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[str]:
+    cells = [_label(named)]
+    for level in levels:
+        result = reached(named.line, level)
+        is_base = base is None or named.line.variant == BASELINE
+        cells += [str(result), "" if base is None or is_base else result.ratio(reached(base, level))]
+    low, median, high = final(named.line)
+    end = f"{median:.2f}" if len(named.line.seeds) == 1 else f"{median:.2f} ({low:.2f} to {high:.2f})"
+    return [*cells, f"{mean_success(named.line, common):.3f}", end]
+
+
+def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: int) -> list[dict[str, Any]]:
+    rows = []
+    for level in levels:
+        result = reached(named.line, level)
+        rows.append(
+            {
+                "task": named.line.task,
+                "method": named.line.variant,
+                "source": named.source,
+                "seeds": len(named.line.seeds),
+                "level": level,
+                "steps": result.steps,
+                "steps_25": result.low,
+                "steps_75": result.high,
+                "budget": result.budget,
+                "speed_up": "" if base is None or named.line.variant == BASELINE else result.ratio(reached(base, level)),
+                "mean_success": round(mean_success(named.line, common), 4),
+                "mean_success_to": common,
+                "final_success": round(final(named.line)[1], 4),
+            }
+        )
+    return rows
+
+
+def weights_table(
+    weighted: Mapping[str, Line], alone: Mapping[tuple[str, str], Line], bases: Mapping[str, Line], names: Mapping[str, str]
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Tabulates mean weights of auxiliary losses with the gain of each one alone, and their rank correlation (Spearman's).
+
+    The gain is the difference of mean success to the run without auxiliary losses, up to the shorter run's end.
+
+    Args:
+        weighted: Task -> the run with all losses.
+        alone: (task, auxiliary loss) -> the run with only that loss, if it exists.
+        bases: Task -> the run without auxiliary losses, if it exists.
+        names: Auxiliary loss -> its label.
+    """
+    text: list[str] = []
+    rows: list[dict[str, Any]] = []
+    for task, line in weighted.items():
+        text += [f"### {task}", "", table_row(["auxiliary loss", "mean weight", "gain alone"]), table_row(["---"] * 3)]
+        weights, gains = [], []
+        for name, label in names.items():
+            weight, gain = mean_weight(line, name), _gain(alone.get((task, name)), bases.get(task))
+            text.append(table_row([label, f"{weight:.3f}", "not there yet" if gain is None else f"{gain:+.3f}"]))
+            rows.append({"task": task, "auxiliary_loss": name, "mean_weight": weight, "gain_alone": gain})
+            if gain is not None:
+                weights.append(weight)
+                gains.append(gain)
+        text += ["", _correlation(weights, gains, len(names)), ""]
+    return text, rows
+
+
+def _gain(alone: Line | None, base: Line | None) -> float | None:
+    if alone is None or base is None:
+        return None
+    common = min(alone.end, base.end)
+    return mean_success(alone, common) - mean_success(base, common)
+
+
+def _correlation(weights: Sequence[float], gains: Sequence[float], wanted: int) -> str:
+    if len(gains) < wanted:
+        return "Rank correlation of mean weight and gain alone: not known before all runs of figure 5.5 are there."
+    if len(set(weights)) < 2 or len(set(gains)) < 2:
+        return "Rank correlation of mean weight and gain alone: not defined, since all are equal."
+    rho = float(spearmanr(weights, gains).statistic)
+    return f"Rank correlation of mean weight and gain alone: {rho:+.2f} (of {len(gains)} losses)."
+
+
+def table_row(cells: Sequence[str]) -> str:
+    """Formats a row of a Markdown table."""
+    return "| " + " | ".join(cells) + " |"

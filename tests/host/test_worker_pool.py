@@ -1,0 +1,209 @@
+"""Numbers evaluated in processes side by side, and the file that keeps what came of them."""
+
+import functools
+import itertools
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from jaxrl_vis.errors import RequestError, Terminated, WorkerError
+from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all, map_unordered
+from jaxrl_vis.run import signals
+
+
+def squared(offset: int, number: int) -> Record:
+    return {"square": number * number + offset, "process": os.getpid(), "threads": os.environ.get("OMP_NUM_THREADS")}
+
+
+def broken(number: int) -> Record:
+    if number == 2:
+        raise ValueError(f"number {number} is broken")
+    return {"square": number * number}
+
+
+def slow(number: int) -> Record:
+    time.sleep(100 if number else 0)
+    return {}
+
+
+def killed(number: int) -> Record:
+    os._exit(9)
+
+
+def signalled(number: int) -> Record:
+    """Signals itself, as somebody would who signals the whole group of processes."""
+    for item in signals.SIGNALS:
+        subprocess.run(["kill", f"-{item}", str(os.getpid())], check=True)
+    return {"ignored": sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))}
+
+
+def total(records: list[Record]) -> Record:
+    return {"total": sum(record["square"] for record in records), "nothing": float("nan")}
+
+
+def test_results_are_the_same_in_one_process_and_in_several():
+    results: list[dict[int, Record]] = [{}, {}]
+    for workers, into in zip((1, 2), results):
+        evaluate_all(functools.partial(squared, 7), range(6), workers, into.__setitem__)
+    one, two = results
+    assert {number: record["square"] for number, record in one.items()} == {number: number**2 + 7 for number in range(6)}
+    assert {number: record["square"] for number, record in two.items()} == {number: number**2 + 7 for number in range(6)}
+    assert {record["process"] for record in one.values()} == {os.getpid()}
+    assert os.getpid() not in {record["process"] for record in two.values()}
+    assert all(int(record["threads"]) >= 1 for record in two.values())
+
+
+def test_what_goes_wrong_in_a_process_is_told():
+    results: dict[int, Record] = {}
+    with pytest.raises(ValueError, match="number 2 is broken"):
+        evaluate_all(broken, range(3), 2, results.__setitem__)
+    with pytest.raises(WorkerError, match="was killed from outside"):
+        evaluate_all(killed, range(3), 2, results.__setitem__)
+
+
+def test_signals_to_the_whole_group_do_not_reach_processes():
+    """Workers ignore signals to the process group: only their parent ends them."""
+    results: dict[int, Record] = {}
+    evaluate_all(signalled, range(2), 2, results.__setitem__)
+    assert all(set(record["ignored"]) >= set(signals.SIGNALS) for record in results.values()) and len(results) == 2
+
+
+def test_a_signal_to_the_one_that_started_them_ends_processes():
+    before = set(multiprocessing.active_children())
+    started = time.monotonic()
+    with signals.Ending() as ending, pytest.raises(Terminated):
+        for _ in map_unordered(slow, itertools.count(), 2):
+            signal.raise_signal(signal.SIGTERM)
+    assert ending.signal == signal.SIGTERM and not set(multiprocessing.active_children()) - before
+    assert time.monotonic() - started < 60
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_endless_numbers_are_taken_as_they_are_needed(workers: int):
+    before = set(multiprocessing.active_children())
+    results = map_unordered(functools.partial(squared, 1), itertools.count(), workers)
+    some = [record["square"] for record in itertools.islice(results, 5)]
+    results.close()
+    assert set(some) <= {number**2 + 1 for number in range(12)} and len(set(some)) == 5
+    assert workers == 2 or some == [1, 2, 5, 10, 17]
+    assert not set(multiprocessing.active_children()) - before
+
+
+def test_what_goes_wrong_with_endless_numbers_is_told():
+    with pytest.raises(ValueError, match="number 2 is broken"):
+        list(map_unordered(broken, itertools.count(), 2))
+    with pytest.raises(WorkerError, match="was killed from outside"):
+        list(map_unordered(killed, itertools.count(), 2))
+
+
+def test_processes_end_with_the_one_that_started_them_however_that_ends(tmp_path: Path, clean_environment: dict[str, str]):
+    script = tmp_path / "evaluation.py"
+    script.write_text(
+        "import os, time\n"
+        "from pathlib import Path\n"
+        "from jaxrl_vis.host.worker_pool import map_unordered\n"
+        "def work(number):\n"
+        "    Path(__file__).with_name(f'{number}.part').write_text(str(os.getpid()))\n"
+        "    Path(__file__).with_name(f'{number}.part').rename(Path(__file__).with_name(f'{number}.pid'))\n"
+        "    time.sleep(120)\n"
+        "if __name__ == '__main__':\n"
+        "    list(map_unordered(work, range(2), 2))\n"
+    )
+    started = subprocess.Popen([sys.executable, script], env=clean_environment)
+    try:
+        wait_until(lambda: len(list(tmp_path.glob("*.pid"))) == 2, 60.0)
+    finally:
+        started.kill()
+        started.wait()
+    workers = [int(path.read_text()) for path in tmp_path.glob("*.pid")]
+    wait_until(lambda: not any(runs(worker) for worker in workers), 10.0)
+
+
+def wait_until(holds: Callable[[], bool], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, "it did not come to that in time"
+        time.sleep(0.05)
+
+
+def runs(process: int) -> bool:
+    """Returns True if a process runs; an ended one may still be listed."""
+    try:
+        os.kill(process, 0)
+        status = Path(f"/proc/{process}/stat")
+        return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")
+    except (ProcessLookupError, FileNotFoundError):
+        return False
+
+
+def test_a_file_goes_on_where_it_was_and_holds_one_evaluation(tmp_path: Path):
+    path, about = tmp_path / "kept.json", {"family": "training", "method": "default"}
+    records = RecordFile(path, about, total)
+    records.add(3, {"square": 9, "room": float("inf")})
+    records.add(1, {"square": 1, "room": 0.5})
+    again = RecordFile(path, about, total)
+    assert (
+        again.records
+        == records.records
+        == {1: {"number": 1, "square": 1, "room": 0.5}, 3: {"number": 3, "square": 9, "room": None}}
+    )
+    again.add_all({2: {"square": 4}})
+    results = json.loads(path.read_text())
+    assert results["total"] == 14 and results["nothing"] is None and results["family"] == "training"
+    assert [item["number"] for item in results["each"]] == [1, 2, 3]
+    with pytest.raises(RequestError, match='another evaluation \\(method: "default", not "thesis"\\)'):
+        RecordFile(path, {**about, "method": "thesis"}, total)
+    path.write_text("{}")
+    with pytest.raises(RequestError, match="holds no records to resume"):
+        RecordFile(path, about, total)
+    in_memory = RecordFile(None, about, total)
+    in_memory.add(1, {"square": 1})
+    assert 1 in in_memory and 2 not in in_memory
+
+
+def test_other_code_is_told_apart(tmp_path: Path):
+    package = ModuleType("package")
+    package.__file__ = str(tmp_path / "__init__.py")
+    (tmp_path / "training").mkdir()
+    for name in ("__init__.py", "look.py", "training/fit.py"):
+        (tmp_path / name).write_text("1")
+    before = code_digest(package, leave_out=("training",))
+    (tmp_path / "training/fit.py").write_text("2")
+    assert code_digest(package, leave_out=("training",)) == before != code_digest(package)
+    (tmp_path / "look.py").write_text("2")
+    assert code_digest(package, leave_out=("training",)) != before
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        '{"number": 3}, {"number": 3}',
+        '{"number": "3"}',
+        '{"number": null}',
+        '{"number": true}',
+        '{"number": -1}',
+        '{"number": 1e400}',
+        "3",
+        '{"number": 3, "square": "text"}',
+        '{"number": 3, "square": null}',
+        '{"number": 3, "square": ' + "[" * 10**5,
+    ],
+)
+def test_records_that_somebody_has_changed_are_one_line(tmp_path: Path, item: str):
+    path = tmp_path / "kept.json"
+    records = RecordFile(path, {}, total)
+    records.add(3, {"square": 9})
+    before = json.dumps(json.loads(path.read_text())["each"])[1:-1]
+    path.write_text(path.read_text().replace("\n    " + before, "\n    " + item))
+    with pytest.raises(RequestError, match="delete it, or name another file with --json") as refused:
+        RecordFile(path, {}, total)
+    assert "\n" not in str(refused.value) and str(path) in str(refused.value)

@@ -1,0 +1,103 @@
+"""Recordings of the original environments (tests/data), played through ours by benchmarks/parity.py."""
+
+import functools
+import pathlib
+
+import numpy as np
+import pytest
+
+from benchmarks import parity
+from benchmarks.tasks import environments, one_step
+
+DATA = pathlib.Path(__file__).parents[1] / "data"
+RECORDINGS = {
+    "fetch_reach": "FetchReach",
+    "fetch_reach_table": "FetchReach",  # benchmarks/record_originals.py FetchReach --seed 3 --lower .25
+    "finger": "FingerTurn",
+    "hand_reach": "HandReach",
+    "reacher": "Reacher",
+}
+
+
+def test_every_comparison_has_a_recording():
+    assert sorted(parity.COMPARISONS) == sorted(set(RECORDINGS.values()))
+
+
+@functools.cache
+def compared(name: str) -> list[parity.Figure]:
+    with np.load(DATA / f"{name}.npz") as recording:
+        # What two substeps do has no bound, but another program to compile.
+        return parity.compare(RECORDINGS[name], {key: recording[key] for key in recording if not key.endswith("nsub2")})
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_tasks_follow_the_recordings_of_their_originals(name):
+    figures = compared(name)
+    for figure in figures:
+        print(figure)
+    assert any(figure.bound is not None for figure in figures)
+    assert not [figure for figure in figures if figure.is_broken]
+
+
+@pytest.mark.parametrize("name", ["fetch_reach", "fetch_reach_table"])
+def test_most_of_the_fetch_recordings_count(name):
+    figures = {figure.name: figure.value for figure in compared(name)}
+    assert figures["share of the recording that counts (near the start)"] > 0.5
+
+
+def test_contacts_matter_to_the_hand():
+    figures = {figure.name: figure.value for figure in compared("hand_reach")}
+    for finger in ("ring finger", "little finger"):
+        name = f"{finger}: 95th percentile of the error"
+        assert figures[f"without contacts, {name}"] > max(3 * figures[name], 0.008)
+
+
+def test_a_step_of_the_fetch_robot():
+    """Against C MuJoCo less a term of welds that MJX lacks, and against C MuJoCo as it is."""
+    env = environments.make("FetchReach")
+    states = one_step.fetch_states(env)
+    less = one_step.mujoco_step(env.mj_model, states, weld_term=False)
+    assert (less.contacts == 0).sum() > 100
+    assert (less.contacts == 2).sum() > 30
+    converged = one_step.our_step(env, states, "more")
+    multiples = one_step.in_bounds(converged, less.qvel)
+    assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"
+    # With the task's own four iterations, all but a few of the states in contact.
+    assert (one_step.in_bounds(one_step.our_step(env, states, "task"), less.qvel) <= 1.0).mean() > 0.97
+    # The term itself, as docs/tasks.md has it: some 1 % of the greatest velocity, and at most 5 %.
+    as_it_is = one_step.in_bounds(converged, one_step.mujoco_step(env.mj_model, states, weld_term=True).qvel)
+    assert 10 < np.median(as_it_is) < 130 and as_it_is.max() < 520
+
+
+def test_a_step_of_the_reacher_is_that_of_mujoco():
+    env = environments.make("Reacher")
+    states = one_step.reacher_states(env)
+    assert (np.abs(states.qpos[:, 1]) > 3.0).sum() > 30
+    theirs = one_step.mujoco_step(env.mj_model, states, weld_term=True)
+    multiples = one_step.in_bounds(one_step.our_step(env, states, "task"), theirs.qvel)
+    assert multiples.max() <= 1.0, f"{np.sort(multiples)[-10:]}"
+
+
+def test_a_drifting_reacher_is_found_out(tmp_path, capsys):
+    recording = dict(np.load(DATA / "reacher.npz"))
+    recording["qpos_rad"] = recording["qpos_rad"] + 0.011 * (np.arange(51) > 0)[:, None]
+    np.savez(tmp_path / "drifting.npz", **recording)
+    assert parity.main(["VisualReacher", str(tmp_path / "drifting.npz")]) == 1
+    assert capsys.readouterr().out.count("BROKEN") == 1
+
+
+def test_a_recording_that_is_not_a_number_breaks_its_bounds():
+    assert parity.Figure("error", float("nan"), "m", 1.0).is_broken
+
+
+def test_nothing_to_compare(tmp_path, capsys):
+    np.savez(tmp_path / "empty.npz", actions=np.zeros((1, 2, 4)))
+    np.savez(tmp_path / "short.npz", actions=np.zeros((1, 2, 4)), grip_pos_m=np.zeros((1, 2, 3)))
+    for arguments, complaint in (
+        (["FetchReach", str(tmp_path / "empty.npz")], "lacks grip_pos_m"),
+        (["FetchReach", str(tmp_path / "short.npz")], "must begin with the shape"),
+        (["Swimmer", str(tmp_path / "empty.npz")], "choose one of"),
+        (["FetchReach", str(tmp_path / "missing.npz")], "No such file"),
+    ):
+        assert parity.main(arguments) == 2
+        assert complaint in capsys.readouterr().err

@@ -1,0 +1,64 @@
+"""Notebooks run from top to bottom on the smallest settings, and are committed without outputs."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
+
+# Figures, and videos of a whole run as a page shows them wherever the notebook is read.
+SHOWN = {
+    "01_quickstart": (3, 1),  # start and goal; the curve; an episode of the policy
+    "02_new_environment": (2, 1),  # start and goals; the curve
+    "03_indicator_rewards": (3, 0),  # which frames count as equal; curves; diagnostics
+    "04_auxiliary_losses": (1, 0),  # errors and weights
+    "05_phenotyping": (3, 0),  # a pair; its overlay; widths against the truth
+    "06_grasping": (2, 0),  # a pair and its mask; stalks and grasp points from above
+}
+SAID = {
+    "05_phenotyping": ("overlays (plots: 1, pairs skipped: 0)", "synthetic: 8 stalks were counted, 8 are there"),
+    "01_quickstart": ("of goals reached at the end", "of 64 goals reached"),
+    "02_new_environment": ("of goals reached at the end", "eval/success"),  # `eval` finds the task by what the run folder says
+    "03_indicator_rewards": ("oracle  ", "indicator_balance_filter", "of goals reached"),
+    "04_auxiliary_losses": ("OL-AUX-5           error on unseen inputs",),
+    "06_grasping": ("3 pairs of 256 x 256 pixels", "default                      stitches off by", "of the thesis"),
+}
+
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_outputs_are_stripped(path: Path) -> None:
+    for cell in nbformat.read(path, as_version=4).cells:
+        if cell.cell_type == "code":
+            assert not cell.outputs
+            assert cell.execution_count is None
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(path: Path, tmp_path: Path, clean_environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", clean_environment["PYTHONPATH"])
+    monkeypatch.setenv("JAXRL_VIS_NOTEBOOK_FAST", "1")
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
+    startup = tmp_path / "ipython/profile_default/startup"
+    startup.mkdir(parents=True)
+    (startup / "garbage.py").write_text("import gc\ngc.set_threshold(100_000, 20, 20)\n")  # as in conftest.py
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel shows figures in the notebook
+    assert os.environ["JAX_PLATFORMS"] == "cpu"
+    notebook = nbformat.read(path, as_version=4)
+    client = nbclient.NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    )
+    client.execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    shown = [(kind, data) for output in outputs for kind, data in output.get("data", {}).items()]
+    figures = sum(kind == "image/png" for kind, _ in shown)
+    text = "".join(output.get("text", "") for output in outputs)
+    videos = sum(kind == "text/html" and "data:image/gif;base64," in data for kind, data in shown)
+    assert (figures, videos) == SHOWN[path.stem]
+    for said in SAID[path.stem]:
+        assert said in text
+    if path.stem == "02_new_environment":
+        assert (tmp_path / "puck_push.py").exists()

@@ -1,0 +1,36 @@
+"""Statistics over seeds against values that can be counted by hand, and against their own promises."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
+
+
+def test_the_interquartile_mean_leaves_out_the_outer_quarters_of_all_scores():
+    assert interquartile_mean([np.array([0.0, 4.0, 5.0, 100.0])]) == 4.5
+    assert interquartile_mean([np.array([-50.0, 1.0]), np.array([2.0, 90.0])]) == 1.5
+
+
+def test_the_permutation_test_counts_assignments():
+    # Of the 252 ways to divide ten seeds into two fives, two are as extreme as complete separation.
+    separated = permutation_p_value(np.arange(5.0), np.arange(5.0) + 10.0)
+    assert separated == pytest.approx(2 / 252)
+    assert permutation_p_value(np.arange(5.0), np.arange(5.0)) == 1.0
+    with pytest.raises(ValueError, match="at most ten"):
+        permutation_p_value(np.zeros(11), np.zeros(11))
+
+
+def test_intervals_cover_the_mean_about_as_often_as_they_say():
+    random = np.random.default_rng(1)
+    trials = [bootstrap_interval([random.normal(size=10), random.normal(size=10)], seed=trial) for trial in range(80)]
+    assert 0.85 <= np.mean([low <= 0.0 <= high for low, high in trials]) <= 1.0
+    assert bootstrap_interval([np.ones(5)]) == (1.0, 1.0)
+
+
+def test_tables_of_the_target_decay_study_say_what_the_records_say():
+    check = [sys.executable, "benchmarks/target_decay.py", "--check"]
+    assert subprocess.run(check, cwd=Path(__file__).resolve().parents[2]).returncode == 0

@@ -1,0 +1,26 @@
+"""Figures of several runs, as they are drawn."""
+
+import itertools
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from jaxrl_vis.studies.figures.drawing import Curve, Panel, compose
+from jaxrl_vis.studies.figures.make import STUDIES
+
+
+@pytest.mark.parametrize("figure", list(STUDIES))
+def test_no_text_of_a_figure_is_cut(figure: str) -> None:
+    """The title of `cameras` once ran out of a figure of one column."""
+    study = STUDIES[figure]
+    steps, values = np.array([10_000, 100_000]), np.ones((1, 2))
+    curves = [Curve(study.family.variants[name].label, "#000000", steps, values) for name in study.variants]
+    panel = Panel("VisualFetchReach: dropped negatives that were false", curves)
+    subtitle = "preset fast, one gradient step per 25 environment steps; seeds 0 to 4; line: median, band: 25 to 75 %"
+    composed = compose([[panel]], f"{study.title} (figure {figure})", subtitle)
+    FigureCanvasAgg(composed).draw()
+    lines = [text.get_window_extent() for text in composed.texts]
+    boxes = [*lines, composed.legends[0].get_window_extent(), composed.axes[0].get_tightbbox()]
+    assert all(box.x0 >= 0.0 and box.x1 <= composed.bbox.x1 for box in boxes)
+    assert all(above.y0 >= below.y1 for above, below in itertools.pairwise(lines))  # and no line lies on the next
