@@ -218,6 +218,23 @@ def test_brax_environments_under_brax_wrappers(backend: str) -> None:
     assert_same_colours(state.obs["pixels/free/goal"][0], truth(env.views.mj_model, [0.0, 0.0], -1))
 
 
+def test_brax_wrapper_for_domain_randomization_is_followed() -> None:
+    env = pixels.wrap(training.EpisodeWrapper(brax.envs.get_environment("inverted_pendulum"), 5, 1), image_size=SIZE)
+    system = env.sys
+
+    def randomize(system: Any) -> tuple[Any, Any]:
+        green = jnp.full_like(system.geom_rgba, 0.0).at[:, 1:].set(1.0).at[:, 2].set(0.0)
+        axes = jax.tree.map(lambda leaf: None, system).tree_replace({"geom_rgba": 0})
+        return system.tree_replace({"geom_rgba": jnp.stack([system.geom_rgba, green])}), axes
+
+    wrapped = training.DomainRandomizationVmapWrapper(env, randomize)
+    images = jaxrl_vis_envs.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2)).obs["pixels/free"]
+    assert env.env.unwrapped.sys is system
+    assert_same_colours(images[0], truth(env.views.mj_model, jnp.zeros(2), -1))
+    shown = np.asarray(images[1]).reshape(-1, 3)
+    assert (shown[:, 1] > 0.1).any() and shown[shown[:, 1] > 0.1][:, [0, 2]].max() < 0.1
+
+
 def test_observations_have_the_form_that_brax_vision_networks_take(playground: pixels.PixelEnv) -> None:
     networks = make_ppo_networks_vision(playground.observation_size, playground.action_size)
     obs = jax.eval_shape(playground.reset, jax.random.PRNGKey(0)).obs

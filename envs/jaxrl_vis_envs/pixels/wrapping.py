@@ -195,7 +195,8 @@ class PixelEnv:
         return getattr(self.env, name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        setattr(self if name in vars(self) else self.env, name, value)
+        # On the innermost environment, which steps with it, and not on a wrapper around that.
+        setattr(self if name in vars(self) else getattr(self.env, "unwrapped", self.env), name, value)
 
 
 def _replace(state: Any, **changes: Any) -> Any:
