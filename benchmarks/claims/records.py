@@ -132,8 +132,10 @@ def study(family: str, stem: str, fresh: bool = False, budget: int = 0) -> Recor
         # The study of target networks ran the release's decay with fresh seeds, which is the same configuration.
         candidates = {**_folders("target_decay", f"{stem}-decay0.98"), **folders}
         long_enough = {first: folder for first, folder in candidates.items() if _read_run(folder).end >= budget}
-        folders = {first: folder for first, folder in long_enough.items() if first >= FIRST_FRESH_SEED} or folders
-    folders = {first: folder for first, folder in folders.items() if fresh or first < FIRST_FRESH_SEED}
+        fresh_folders = {first: folder for first, folder in long_enough.items() if first >= FIRST_FRESH_SEED}
+        if fresh_folders:
+            return _joined(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(fresh_folders.items())))
+    folders = {first: folder for first, folder in folders.items() if first < FIRST_FRESH_SEED}
     if not folders:
         raise LookupError(f"no run {stem} with seeds is kept in {RESULTS / 'studies' / family}")
     return _joined(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(folders.items())))

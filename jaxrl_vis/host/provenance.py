@@ -22,7 +22,7 @@ PACKAGES = ("jaxrl-vis", "jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "flax
 NOT_INSTALLED = "not installed"
 """Version that `versions` reports for a missing package."""
 
-CHECKOUT = Path(__file__).resolve().parents[1]
+CHECKOUT = Path(__file__).resolve().parents[2]
 """Folder that holds both packages: the checkout, or site-packages for an installed copy."""
 
 # Files that results can depend on. Changed records and run folders do not make a checkout dirty.

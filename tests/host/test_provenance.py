@@ -65,7 +65,7 @@ def test_a_missing_library_is_said_not_raised(monkeypatch: pytest.MonkeyPatch) -
 def test_provenance_loads_no_jax(clean_environment: dict[str, str]) -> None:
     code = """
 import sys
-from jaxrl_vis import provenance
+from jaxrl_vis.host import provenance
 provenance.versions()
 provenance.revision()
 assert "jax" not in sys.modules

@@ -69,7 +69,7 @@ from pathlib import Path
 def refuse(*_):
     raise OSError(errno.ENOSYS, "none")
 fcntl.flock = refuse
-from jaxrl_vis.run import lock
+from jaxrl_vis.run.storage import lock
 lock.LEASE_S, lock.HEARTBEAT_S = 1.0, 0.15
 with lock.run_lock(Path({str(tmp_path)!r})):
     os.kill(os.getpid(), signal.SIGKILL)
