@@ -21,7 +21,7 @@ from jaxrl_vis.host import provenance
 _ENVS = "envs/jaxrl_vis_envs"
 _PHYSICS = tuple(f"{_ENVS}/{name}" for name in ("base.py", "goals.py", "compiling", "physics", "tasks/mjx_env.py"))
 _RENDERER = (f"{_ENVS}/render",)
-_IMAGES = (*_RENDERER, f"{_ENVS}/pixels.py")
+_IMAGES = (*_RENDERER, f"{_ENVS}/pixels/observations.py")
 _TASK = (f"{_ENVS}/tasks/{{task}}.py", f"{_ENVS}/tasks/assets/{{task}}.xml")
 _LEARNER = ("jaxrl_vis/learner", "jaxrl_vis/config.py", "jaxrl_vis/methods.py")
 _TIMING = "jaxrl_vis/bench/timing.py"

@@ -10,8 +10,9 @@ Modules, in the order in which data passes through them; each imports only from 
 
     mounts       poses of cameras and lights, from the poses of bodies
     model/       reads an `mujoco.MjModel` into NumPy arrays: colours, lights, lens, triangles, texture atlas
+    viewpoint    camera pose and lens, intrinsic matrix, points from depths
     scene        `Scene`, a pytree of all that; `outputs`: the requested and the returned planes
-    camera       camera pose and pixel rays
+    camera       pixel rays, and spheres in view
     pixel/       the per-pixel mathematics in plain JAX, for every backend: unit shapes and lights once per environment;
                  nearest object per pixel; its depth, normal, texture and colour
     cpu/, gpu/   the same image, faster: in passes over tiles on a CPU, in one kernel on an NVIDIA GPU

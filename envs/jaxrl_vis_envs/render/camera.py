@@ -1,4 +1,4 @@
-"""Camera pose and pixel rays.
+"""Pixel rays, and spheres in view.
 
 All geometry is expressed in the camera's frame (OpenGL's: x right, y up, looking along -z). A ray is ``start + t * direction``
 with a direction whose z is -1, so the ray parameter t is the planar depth in metres and needs no conversion. A perspective
@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.render import mounts
 from jaxrl_vis_envs.render.scene import Scene
-
-_DEGREES = np.pi / 180.0
+from jaxrl_vis_envs.render.viewpoint import barrier as barrier
+from jaxrl_vis_envs.render.viewpoint import camera_pose as camera_pose
+from jaxrl_vis_envs.render.viewpoint import lens as lens
 
 
 class Rays(NamedTuple):
@@ -28,76 +28,6 @@ class Rays(NamedTuple):
 
     u: jax.Array
     v: jax.Array
-
-
-def camera_pose(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Compute the pose of the scene's camera in the world.
-
-    Args:
-        scene: The scene.
-        data: `mjx.Data`, `mujoco.MjData` or any object with the body poses that `mounts.mount_position` reads. A camera fixed
-            to the world needs none.
-
-    Returns:
-        Position [3] float32 in metres, rotation [3, 3] float32 whose columns are the camera's axes, and a flag ([] bool) that
-        both are finite. A non-finite pose is replaced by the identity.
-    """
-    # Without the barrier, XLA would constant-fold a fixed pose into later operations, which rounds differently.
-    fixed = barrier((scene.camera_position, scene.camera_axes))
-    bodies = mounts.Bodies(scene.body_mass, scene.body_parents)
-    position, frame = mounts.mount_position(bodies, data, scene.camera_mount, fixed[0])
-    rotation = fixed[1]
-    # Not matrix products, which accelerators would compute at low precision.
-    if scene.camera_mount.aims:
-        rotation = mounts.look_at(position, mounts.target_position(bodies, data, scene.camera_mount))
-    elif frame is not None:
-        rotation = jnp.sum(frame[:, :, None] * rotation[None], axis=1)
-    position = position + jnp.sum(rotation * scene.camera_shift, axis=1)
-    rotation = jnp.sum(rotation[:, :, None] * _rotation(scene.camera_turn)[None], axis=1)
-    finite = jnp.all(jnp.isfinite(position)) & jnp.all(jnp.isfinite(rotation))
-    position = jnp.where(finite, position, 0.0)
-    rotation = jnp.where(finite, rotation, jnp.eye(3, dtype=jnp.float32))
-    return position, rotation, finite
-
-
-@jax.custom_jvp
-def barrier(tree: Any) -> Any:
-    """Prevent XLA from recomputing a value for every use. JAX 0.11 cannot transpose its own barrier."""
-    return jax.lax.optimization_barrier(tree)
-
-
-@barrier.defjvp
-def _barrier_tangents(primals: tuple, tangents: tuple) -> tuple:
-    return barrier(*primals), tangents[0]
-
-
-def _rotation(vector: jax.Array) -> jax.Array:
-    """Convert a rotation vector [3] (rad) to a matrix [3, 3], with the correct gradient at 0."""
-    square = jnp.sum(vector * vector)
-    small = square < 1e-8
-    angle = jnp.sqrt(jnp.where(small, 1.0, square))
-    sine = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
-    cosine = jnp.where(small, 0.5, (1.0 - jnp.cos(angle)) / (angle * angle))
-    x, y, z = vector[0], vector[1], vector[2]
-    zero = jnp.zeros_like(x)
-    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    identity = jnp.eye(3, dtype=jnp.float32)
-    return identity + sine * cross + cosine * (vector[:, None] * vector[None, :] - square * identity)
-
-
-def lens(scene: Scene) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Compute the image's extent on the plane at depth 1 m (or at any depth, if orthographic).
-
-    Returns:
-        Centre u, centre v, half width and half height, each [] float32 (m).
-    """
-    zero = jnp.zeros((), jnp.float32)
-    if scene.projection == "intrinsic":
-        middle = scene.principal / scene.focal
-        half = 0.5 * scene.sensor / scene.focal
-        return middle[0], -middle[1], half[0], half[1]
-    half_height = 0.5 * scene.fovy if scene.projection == "orthographic" else jnp.tan(scene.fovy * (0.5 * _DEGREES))
-    return zero, zero, half_height * (scene.width / scene.height), half_height
 
 
 def pixel_rays(scene: Scene, rows: np.ndarray, columns: np.ndarray) -> Rays:

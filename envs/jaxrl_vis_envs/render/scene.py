@@ -14,7 +14,7 @@ import jax
 import mujoco
 import numpy as np
 
-from jaxrl_vis_envs.render import mounts
+from jaxrl_vis_envs.render import mounts, viewpoint
 from jaxrl_vis_envs.render.model import cameras, meshes, reading, textures
 
 
@@ -254,3 +254,44 @@ class Scene:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+    def intrinsics(self) -> jax.Array:
+        """Compute the camera's intrinsic matrix in OpenCV's convention, in pixels.
+
+        Pixel centres are at whole numbers: (0, 0) is the centre of the top left pixel. A function of the leaves ``fovy``,
+        ``focal``, ``principal`` and ``sensor``, hence traceable.
+
+        Returns:
+            [3, 3] float32.
+
+        Raises:
+            ValueError: The camera is orthographic.
+        """
+        return viewpoint.intrinsic_matrix(self)
+
+    def extrinsics(self, data: Any) -> jax.Array:
+        """Compute the transform from the world's frame to the camera's in OpenCV's convention (x right, y down, z ahead).
+
+        Args:
+            data: Poses of one environment, as in `render`.
+
+        Returns:
+            [4, 4] float32, m.
+        """
+        return viewpoint.extrinsic_matrix(self, data)
+
+    def points(self, depth: jax.Array, data: Any = None) -> jax.Array:
+        """Compute the point that each pixel of a depth image shows: a point cloud in the order of the pixels.
+
+        Args:
+            depth: [H, W], planar depth in m, as in `Frame`. Pixels of the sky are points on the far plane.
+            data: Poses of the same environment, for points in the world's frame; None for the camera's frame in OpenCV's
+                convention (x right, y down, z ahead).
+
+        Returns:
+            [H, W, 3] float32, m.
+
+        Raises:
+            ValueError: ``depth`` is not one image of the scene's size.
+        """
+        return viewpoint.depth_points(self, depth, data)

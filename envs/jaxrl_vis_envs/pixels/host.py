@@ -1,0 +1,114 @@
+"""Images for Gymnasium environments of MuJoCo, which run on the host; made by `jaxrl_vis_envs.pixels.wrap`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+
+try:
+    import gymnasium
+except ImportError as error:
+    raise ImportError("images for Gymnasium's environments need it: pip install 'jaxrl-vis[gymnasium]'") from error
+
+from jaxrl_vis_envs.pixels import formats, poses
+from jaxrl_vis_envs.pixels.formats import Format, GoalImage
+from jaxrl_vis_envs.pixels.views import Views
+
+_POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "xpos", "xmat", "xipos")
+# Bounds of observations other than colours and encoded depths.
+_BOUNDS = {"segmentation": (-1, np.iinfo(np.int32).max), "bodies": (-1, np.iinfo(np.int32).max), "normals": (-1.0, 1.0)}
+
+
+class _Drawn:
+    """Poses as attributes, as the renderer reads them."""
+
+    def __init__(self, arrays: dict[str, jax.Array]) -> None:
+        vars(self).update(arrays)
+
+
+class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
+    """Gymnasium wrapper whose observations are, or contain, images of a MuJoCo environment; see `wrap`.
+
+    Poses are computed from the joint positions: those in the environment's data are older by one physics step.
+
+    Args:
+        env: The environment.
+        goal_image: Source of goal images, see `wrap`.
+        form: Fields of `Format`.
+        **options: Arguments of `Views`.
+
+    Attributes:
+        views: Cameras, outputs and scenes.
+    """
+
+    def __init__(self, env: gymnasium.Env, goal_image: GoalImage, form: dict[str, Any], **options: Any) -> None:
+        # Arguments, not objects made of them: Gymnasium stores them in the environment's spec, to make it again.
+        gymnasium.utils.RecordConstructorArgs.__init__(self, goal_image=goal_image, form=form, **options)
+        gymnasium.Wrapper.__init__(self, env)
+        self.views = views = Views(poses.find_model(env), **options)
+        self._inner: Any = env.unwrapped
+        self._form, self._goal_image = Format(**form), goal_image
+        self._names = formats.image_names(views.outputs)
+        self._drawn = mujoco.MjData(views.mj_model)
+        self._goals: dict[str, np.ndarray] = {}
+        self._draw = jax.jit(lambda arrays: self._form.images(views(_Drawn(arrays))))
+        self.observation_space = self._space()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, and render the goal image, if there is one."""
+        own, info = self.env.reset(seed=seed, options=options)
+        if self._goal_image is not None:
+            goal = poses.joint_positions(poses.physics_data(formats.goal_poses(self._goal_image, self.unwrapped)))
+            self._goals = {name + formats.GOAL: image for name, image in self._render(np.asarray(goal)).items()}
+        return self._observe(own), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the wrapped environment, and render."""
+        own, reward, terminated, truncated, info = self.env.step(action)
+        return self._observe(own), reward, terminated, truncated, info
+
+    def _observe(self, own: Any) -> Any:
+        # Goal images are copied: callers keep, and may change, what an observation holds.
+        images = self._render(self._inner.data.qpos) | {name: image.copy() for name, image in self._goals.items()}
+        layout = self._form.layout
+        if layout == "image":
+            return np.array(self._form.joined(images))  # type: ignore[arg-type]
+        if layout == "images":
+            return images
+        return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
+
+    def _render(self, qpos: np.ndarray) -> dict[str, np.ndarray]:
+        """Render the images at joint positions [nq], with the environment's present mocap poses."""
+        data = self._inner.data
+        self._drawn.qpos[:] = qpos
+        self._drawn.mocap_pos[:], self._drawn.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+        mujoco.mj_kinematics(self.views.mj_model, self._drawn)
+        images = self._draw({name: np.asarray(getattr(self._drawn, name), np.float32) for name in _POSES})
+        return {name: np.array(image) for name, image in images.items()}
+
+    def _space(self) -> gymnasium.Space:
+        """Return the space of observations."""
+        self._drawn.qpos[:] = self.views.mj_model.qpos0
+        images = self._render(self._drawn.qpos)
+        spaces: dict[str, gymnasium.Space] = {}
+        chosen = [output for outputs in self.views.outputs.values() for output in outputs]
+        far = {name: float(scene.zfar) for name, scene in self.views.scenes.items()}
+        cameras = [name for name, outputs in self.views.outputs.items() for _ in outputs]
+        for name, output, camera in zip(self._names, chosen, cameras, strict=True):
+            image = images[name]
+            share = output == "rgb" or (output == "depth" and self._form.depth_range is not None)
+            low, high = (0, 255 if image.dtype == np.uint8 else 1) if share else _BOUNDS.get(output, (0.0, far[camera]))
+            spaces[name] = gymnasium.spaces.Box(low, high, image.shape, image.dtype.type)
+        if self._goal_image is not None:
+            spaces |= {name + formats.GOAL: space for name, space in spaces.items()}
+        if self._form.layout == "image":
+            low, high = (
+                self._form.joined({name: getattr(box, end) for name, box in spaces.items()}) for end in ("low", "high")
+            )
+            return gymnasium.spaces.Box(np.asarray(low), np.asarray(high), dtype=np.dtype(self._form.dtype).type)
+        if self._form.layout == "dict":
+            own = self.env.observation_space
+            spaces = (dict(own.spaces) if isinstance(own, gymnasium.spaces.Dict) else {"state": own}) | spaces
+        return gymnasium.spaces.Dict(spaces)

@@ -1,0 +1,128 @@
+"""Poses of environments of other libraries: from their states, by forward kinematics of their MuJoCo models."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.render import Scene
+
+# Fields of a model that poses depend on.
+_KINEMATIC = (
+    *("qpos0", "jnt_pos", "jnt_axis", "body_pos", "body_quat", "body_ipos", "body_iquat"),
+    *("geom_pos", "geom_quat", "site_pos", "site_quat"),
+)
+_STATES = ("data", "pipeline_state")
+
+
+class Poses:
+    """Function from the state of an environment to the poses of its bodies, geoms and sites.
+
+    Poses are computed from joint positions (and mocap poses). Those in a state are not used: after `mjx.step` they are older
+    than the joint positions by one physics step, and physics engines other than MJX have none of geoms.
+
+    Args:
+        mj_model: The environment's model.
+    """
+
+    def __init__(self, mj_model: mujoco.MjModel) -> None:
+        self._model = mjx_model.put_model(mj_model)
+        self._data = mjx_model.still_data(mj_model)
+
+    def __call__(self, state: Any, model: Any = None) -> mjx.Data:
+        """Compute the poses of one environment.
+
+        Args:
+            state: State of an environment with ``data`` (MuJoCo Playground) or ``pipeline_state`` (brax); or physics data with
+                ``qpos`` or brax's ``q``; or joint positions [nq].
+            model: Model with the environment's present geometry, if it is randomised: `mjx.Model`, or brax's System.
+
+        Raises:
+            ValueError: ``state`` has no joint positions, or those of several environments or of another model.
+        """
+        data = physics_data(state)
+        qpos = joint_positions(data)
+        if qpos.shape != self._data.qpos.shape:
+            raise ValueError(f"joint positions of one environment have the shape {self._data.qpos.shape}, got {qpos.shape}")
+        changes: dict[str, Any] = {"qpos": jnp.asarray(qpos, self._data.qpos.dtype)}
+        if self._model.nmocap and hasattr(data, "mocap_pos"):
+            changes |= {"mocap_pos": data.mocap_pos, "mocap_quat": data.mocap_quat}
+        own = self._model
+        if model is not None:
+            own = own.replace(**{name: getattr(model, name) for name in _KINEMATIC})
+        with jax.default_matmul_precision("highest"):
+            return mjx_model.kinematics(own, self._data.replace(**changes))
+
+
+def physics_data(state: Any) -> Any:
+    """Return the physics data in a state of an environment: its ``data`` or ``pipeline_state``, or ``state`` itself."""
+    for name in _STATES:
+        data = getattr(state, name, None)
+        if hasattr(data, "qpos") or hasattr(data, "q"):
+            return data
+    return state
+
+
+def joint_positions(data: Any) -> Any:
+    """Return the joint positions in physics data: ``qpos``, brax's ``q``, or ``data`` itself if it is an array.
+
+    Raises:
+        ValueError: There are none.
+    """
+    for name in ("qpos", "q"):
+        if hasattr(data, name):
+            return getattr(data, name)
+    if isinstance(data, jax.Array | np.ndarray):
+        return data
+    raise ValueError(
+        f"joint positions are read from state.data, state.pipeline_state or physics data; a {type(data).__name__} has none"
+    )
+
+
+def find_model(env: Any) -> mujoco.MjModel:
+    """Return the MuJoCo model of an environment: ``mj_model``, ``sys.mj_model`` or ``model``, also of what it wraps.
+
+    Raises:
+        ValueError: It has none.
+    """
+    for owner in (env, getattr(env, "unwrapped", None)):
+        for holder, name in ((owner, "mj_model"), (getattr(owner, "sys", None), "mj_model"), (owner, "model")):
+            model = getattr(holder, name, None)
+            if isinstance(model, mujoco.MjModel):
+                return model
+    raise ValueError(
+        f"{type(env).__name__} has no MuJoCo model as mj_model (MuJoCo Playground), sys.mj_model (brax) or model (Gymnasium)"
+    )
+
+
+def traced_model(env: Any) -> Any:
+    """Return the model that an environment steps with at present, an `mjx.Model` or brax's System; None if it has none.
+
+    Wrappers for domain randomisation replace it while they trace the environment.
+    """
+    inner = getattr(env, "unwrapped", env)
+    for name in ("sys", "_mjx_model", "mjx_model"):
+        model = getattr(inner, name, None)
+        if hasattr(model, "body_pos"):
+            return model
+    return None
+
+
+def randomized_scene(scene: Scene, model: Any, mj_model: mujoco.MjModel) -> Scene:
+    """Return ``scene`` with the sizes and colours of geoms of a randomised model.
+
+    Args:
+        scene: Scene of ``mj_model``.
+        model: `mjx.Model` or brax's System.
+        mj_model: The model before randomisation.
+    """
+    count = mj_model.ngeom
+    # By differences, because sizes in a scene are not all those of the model: infinite planes have a large one.
+    size = scene.size.at[:count].add(model.geom_size - jnp.asarray(mj_model.geom_size, jnp.float32))
+    changed = jnp.any(model.geom_rgba != jnp.asarray(mj_model.geom_rgba, jnp.float32), axis=1, keepdims=True)
+    rgba = scene.rgba.at[:count].set(jnp.where(changed, model.geom_rgba, scene.rgba[:count]))
+    return scene.replace(size=size, rgba=rgba)
