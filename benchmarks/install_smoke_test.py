@@ -49,7 +49,7 @@ class Shell:
     failures: list[str] = dataclasses.field(default_factory=list)
 
     def type(self, words: str, status: int = 0, shows: str = "", **variables: str) -> str:
-        """Runs a command line, prints what came of it, and returns its output.
+        """Run a command line, print what came of it, and return its output.
 
         Args:
             words: The command line.
@@ -242,7 +242,7 @@ def notebooks(shell: Shell, python: Path, whole: bool) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the transcript; 1 where anything was not as expected."""
+    """Print the transcript; 1 where anything was not as expected."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--python", nargs="+", default=["python3.12", "python3.13"], help="names or paths of interpreters")
     parser.add_argument("--ways", nargs="+", choices=("wheel", "clone", "notebooks"), default=["wheel", "clone", "notebooks"])

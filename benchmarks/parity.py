@@ -50,7 +50,7 @@ class NothingToCompareError(ValueError):
 
 
 def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Plays N sequences of T actions.
+    """Play N sequences of T actions.
 
     Returns:
         qpos [N, T, nq] and the achieved states [N, T, G] after each action.
@@ -176,7 +176,7 @@ def _take(recording: Recording, *keys: str) -> list[np.ndarray]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the errors: 0 within all bounds, 1 where one is broken, 2 where the request was wrong."""
+    """Print the errors: 0 within all bounds, 1 where one is broken, 2 where the request was wrong."""
     parser = argparse.ArgumentParser(description="Compares a task with a recording of its original.")
     parser.add_argument("env", help=f"one of {', '.join(COMPARISONS)}")
     parser.add_argument("file", help="the recording, .npz")

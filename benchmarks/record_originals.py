@@ -124,7 +124,7 @@ RECORDERS = {
 
 
 def main() -> int:
-    """Writes the recording."""
+    """Write the recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", choices=RECORDERS)
     parser.add_argument("file")

@@ -52,7 +52,7 @@ COLUMNS = {
 
 
 def compare(name: str, poses: int, size: int) -> dict[str, Any]:
-    """Draws one model with both renderers and measures: the model's row."""
+    """Draw one model with both renderers and measures: the model's row."""
     entry = render_models.MODELS[name]
     device = jax.devices()[0].device_kind
     row: dict[str, Any] = {"model": name, "source": entry.source, "poses": poses, "size": size, "device": device}
@@ -130,7 +130,7 @@ def read_rows(file: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    """Compares the models that were named, or all."""
+    """Compare the models that were named, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named; or the path of one folder of models")
     parser.add_argument("--poses", type=int, default=200)

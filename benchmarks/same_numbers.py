@@ -50,7 +50,7 @@ RUNS: dict[str, tuple[tuple[str, ...], ...]] = {
 
 
 def train(name: str, folder: Path) -> list[dict[str, Any]]:
-    """Trains one of `RUNS`; its rows without times and ids.
+    """Train one of `RUNS`; its rows without times and ids.
 
     Raises:
         RuntimeError: A command failed.
@@ -78,7 +78,7 @@ def differences(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> li
 
 
 def main() -> int:
-    """Reads the command line and does what it asks for."""
+    """Read the command line and do what it asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", type=Path, help="file for the numbers of this revision")
     parser.add_argument("--compare", type=Path, help="file of another revision's numbers")

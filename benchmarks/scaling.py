@@ -111,7 +111,7 @@ class Timed:
         return seconds
 
     def compile(self) -> None:
-        """Compiles its programs, or finds them in the compile cache."""
+        """Compile its programs, or find them in the compile cache."""
         self.programs.compiled("init")
         self.programs.of_training()
         if self.evaluates:
@@ -119,7 +119,7 @@ class Timed:
 
 
 def compile_all(everything: list[Timed]) -> float:
-    """Fills the compile cache by a process for each configuration, side by side, and reads it; the seconds it took.
+    """Fill the compile cache by a process for each configuration, side by side, and read it; the seconds it took.
 
     Raises:
         SystemExit: One of the processes failed; what it printed stands before.
@@ -165,7 +165,7 @@ def words(tree: Any) -> dict[str, bytes]:
 
 
 def check_resume(saved: Timed, others: list[Config], env: Any, single: Timed) -> list[str]:
-    """Saves a loop state, restores it for other numbers of devices, and compares all bytes; a line for each."""
+    """Save a loop state, restore it for other numbers of devices, and compare all bytes; a line for each."""
     lines = []
     with tempfile.TemporaryDirectory() as folder:
         checkpoints = Checkpoints(Path(folder))
@@ -300,7 +300,7 @@ def measure_as_process(timed: list[Timed], cycles: int) -> None:
 
 
 def write_records(file: Path | None, watch: Watch, measurements: list[Measurement]) -> None:
-    """Writes what has been measured so far, if there is a file for it."""
+    """Write what has been measured so far, if there is a file for it."""
     if file is not None:
         conditions = watch.conditions()
         write_json(file, [to_record(measurement, conditions) for measurement in measurements])
@@ -314,7 +314,7 @@ HEAD = (
 
 
 def main() -> None:
-    """Reads the command line, measures, prints a table, and keeps records."""
+    """Read the command line, measures, print a table, and keep records."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, nargs="+", help="numbers of devices; 2, 4 and 8 if there are so many")
     parser.add_argument("--env", default="VisualFetchReach")

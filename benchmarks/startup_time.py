@@ -39,7 +39,7 @@ class Clock:
         self._wall, self._processor = float(os.environ.get(STARTED, time.time())), 0.0
 
     def lap(self, name: str) -> None:
-        """Ends a lap and starts the next."""
+        """End a lap and start the next."""
         wall, processor = time.time(), time.process_time()
         self.laps[name] = round(wall - self._wall, 3), round(processor - self._processor, 3)
         self._wall, self._processor = time.time(), time.process_time()
@@ -129,7 +129,7 @@ def measured(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tu
 
 
 def show(mode: str, laps: dict[str, tuple[float, float]]) -> None:
-    """Prints a table."""
+    """Print a table."""
     print(f"{mode:32}{'wall-clock s':>14}{'processor s':>14}")
     total = [sum(seconds) for seconds in zip(*laps.values(), strict=True)]
     for name, (wall, processor) in [*laps.items(), ("total", total)]:
@@ -137,7 +137,7 @@ def show(mode: str, laps: dict[str, tuple[float, float]]) -> None:
 
 
 def main() -> None:
-    """Measures, prints, and writes a file if asked to."""
+    """Measure, print, and write a file if asked to."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("env", nargs="?", default="VisualFetchReach")
     parser.add_argument("--preset")

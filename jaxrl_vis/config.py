@@ -193,7 +193,7 @@ class Config:
     """Iterations between full checkpoints (with the replay, for an exact resume). 0: only when a run is interrupted."""
 
     def replace(self, **changes: Any) -> Self:
-        """Returns a copy with some fields changed.
+        """Return a copy with some fields changed.
 
         Raises:
             RequestError: A name is not a field.
@@ -301,7 +301,7 @@ OF_IMAGES = ("random_shift", "relabel_probability", "balance_probability")
 
 
 def preset(name: str, **overrides: Any) -> Config:
-    """Returns a preset with some fields changed.
+    """Return a preset with some fields changed.
 
     Args:
         name: ``paper``, ``fast``, ``cpu`` or ``debug`` (`PRESETS`). Some have task-specific values.
@@ -327,7 +327,7 @@ def preset(name: str, **overrides: Any) -> Config:
 
 
 def data_devices_of(config: Config) -> int:
-    """Returns the number of devices that share one learner, with the default of ``data_devices`` filled in."""
+    """Return the number of devices that share one learner, with the default of ``data_devices`` filled in."""
     if config.data_devices is not None:
         return config.data_devices
     return config.devices if config.seeds == 1 else 1
@@ -338,7 +338,7 @@ _REMOVED = ("aux_gradients",)  # gradients are the same up to rounding, however 
 
 
 def config_from_dict(values: Mapping[str, Any]) -> Config:
-    """Reads a saved configuration: `dataclasses.asdict` after a round trip through JSON, which turns tuples into lists.
+    """Read a saved configuration: `dataclasses.asdict` after a round trip through JSON, which turns tuples into lists.
 
     Fields saved under an earlier name are recognised; missing fields take their defaults.
 

@@ -79,7 +79,7 @@ def names_parts(hint: Any) -> bool:
 
 
 def is_known(hint: Any) -> bool:
-    """Returns True if values with this annotation can be checked and parsed."""
+    """Return True if values with this annotation can be checked and parsed."""
     try:
         one, _, _ = unwrap(hint)
     except (ValueError, IndexError):  # a union of several kinds, an empty tuple
@@ -96,7 +96,7 @@ def choices(hint: Any) -> tuple[str, ...]:
 
 
 def check(label: str, hint: Any, value: Any) -> Any:
-    """Checks a value and converts it to its field's type: lists to tuples, whole numbers to floats.
+    """Check a value and convert it to its field's type: lists to tuples, whole numbers to floats.
 
     Args:
         label: Name of the field in error messages.
@@ -134,7 +134,7 @@ def check(label: str, hint: Any, value: Any) -> Any:
 
 
 def read(label: str, hint: Any, words: Sequence[str]) -> Any:
-    """Parses the words of a command line.
+    """Parse the words of a command line.
 
     Args:
         label: Name of the option in error messages.
@@ -173,13 +173,13 @@ def _refuse(label: str, one: Any, value: Any) -> NoReturn:
 
 
 def _quote(value: Any) -> str:
-    """Formats a value for a one-line message."""
+    """Format a value for a one-line message."""
     text = repr(value)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def _suggestion(one: Any, value: Any) -> str:
-    """Suggests the integer spelling of a whole number written otherwise, such as 1e6."""
+    """Suggest the integer spelling of a whole number written otherwise, such as 1e6."""
     try:
         number = float(value) if one is int and not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):

@@ -37,7 +37,7 @@ class Resolved:
 
 
 def resolve(config: Config, horizon: int) -> Resolved:
-    """Fills in the defaults that depend on the method and the horizon.
+    """Fill in the defaults that depend on the method and the horizon.
 
     The filter's band is R- + gamma R+/(1-gamma) < q0 < R+/(1-gamma) (thesis, section 5.1.4); its middle is the default. A
     critic that starts at or above q0 would drop every negative before it has learned from one, and so never come down. With

@@ -20,7 +20,7 @@ class Replaceable:
     """Mixin that gives a frozen dataclass a ``replace`` method."""
 
     def replace(self, **changes: Any) -> Self:
-        """Returns a copy with some fields changed."""
+        """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
 

@@ -32,7 +32,7 @@ _AT_LEAST_0 = (
 
 
 def validate(config: Config) -> Config:
-    """Returns ``config`` if it is valid by itself; constraints that depend on the environment are checked elsewhere.
+    """Return ``config`` if it is valid by itself; constraints that depend on the environment are checked elsewhere.
 
     Raises:
         RequestError: A field is of the wrong type or out of range. The message names the field and its value.
@@ -80,12 +80,12 @@ def validate(config: Config) -> Config:
 
 
 def _is_set(config: Config, name: str) -> bool:
-    """Returns True if a field differs from its default."""
+    """Return True if a field differs from its default."""
     return getattr(config, name) != next(field.default for field in dataclasses.fields(Config) if field.name == name)
 
 
 def _validate_auxiliary(config: Config) -> None:
-    """Raises a RequestError for an option of another weighting, or one of auxiliary tasks without any tasks."""
+    """Raise a RequestError for an option of another weighting, or one of auxiliary tasks without any tasks."""
     for name, weightings in _OF_WEIGHTINGS.items():
         if _is_set(config, name) and config.weighting not in weightings:
             raise RequestError(
@@ -97,7 +97,7 @@ def _validate_auxiliary(config: Config) -> None:
 
 
 def _validate_devices(config: Config) -> None:
-    """Raises a RequestError if the devices cannot be divided among seeds, environments or batches."""
+    """Raise a RequestError if the devices cannot be divided among seeds, environments or batches."""
     devices, along_data = config.devices, data_devices_of(config)
     if along_data < 1:
         raise RequestError(f"data_devices must be at least 1, not {along_data}")
@@ -119,7 +119,7 @@ def _validate_devices(config: Config) -> None:
 
 
 def _validate_reward(config: Config) -> None:
-    """Raises a RequestError for reward options that do not fit the method or contradict each other."""
+    """Raise a RequestError for reward options that do not fit the method or contradict each other."""
     kind = METHODS[config.method].reward if config.method in METHODS else "own"  # a function of transitions
     errors = {name: getattr(config, name) > 0.0 for name in ("reward_noise", *_FALSE_REWARDS)}
     reads_states = {"n_step": config.n_step > 1, "trivial_goals": config.trivial_goals < 1.0, **errors}

@@ -58,7 +58,7 @@ def counted(events: list[tuple[float, float, str]]) -> tuple[collections.Counter
 
 
 def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: bool) -> None:
-    """Prints where a call spends its time, per one of its ``turns``, and the kernels of one of them ``in_order``."""
+    """Print where a call spends its time, per one of its ``turns``, and the kernels of one of them ``in_order``."""
     call()
     seconds = []
     for _ in range(3):
@@ -81,7 +81,7 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
 
 
 def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, Any]) -> None:
-    """Compiles the parts with compiler options and reports each."""
+    """Compile the parts with compiler options and report each."""
     parts: list[str] = asked.parts
     hlo: Path | None = asked.hlo
     loop, keys = start(program), seed_keys(program, 2)
@@ -149,7 +149,7 @@ def parse_config(options: argparse.Namespace) -> Config:
 
 
 def main() -> int:
-    """Reads the command line and prints the tables."""
+    """Read the command line and print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("task", nargs="?", default="VisualFetchReach", help="the environment")
     parser.add_argument("--preset", default="fast", help="of the run")

@@ -40,7 +40,7 @@ def reset(env: Any, count: int) -> Any:
 
 
 def report_speed(name: str, env: Any, count: int) -> None:
-    """Prints the speed of ``count`` environments side by side, and the kernels that take most of the time."""
+    """Print the speed of ``count`` environments side by side, and the kernels that take most of the time."""
     states, key = jax.block_until_ready(reset(env, count)), jax.random.key(1)
     began = time.perf_counter()
     program = jaxrl_vis_envs.jit(rollout(env, count, STEPS)).lower(states, key).compile()
@@ -69,7 +69,7 @@ def report_speed(name: str, env: Any, count: int) -> None:
 
 
 def report_deviation(name: str, env: Any) -> None:
-    """Prints how far a control step on the GPU is from one on a CPU."""
+    """Print how far a control step on the GPU is from one on a CPU."""
     data = jaxrl_vis_envs.jit(rollout(env, COMPARED, 5))(reset(env, COMPARED), jax.random.key(3)).data
     actions = jax.random.uniform(jax.random.key(4), (COMPARED, env.action_size), minval=-1.0, maxval=1.0)
     here = jaxrl_vis_envs.jit(jax.vmap(env.act))(data, actions)
@@ -86,7 +86,7 @@ def report_deviation(name: str, env: Any) -> None:
 
 
 def main() -> int:
-    """Reads the command line and does what it asks for."""
+    """Read the command line and do what it asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", default=["FingerTurn", "HandReach", "FetchReach"])
     parser.add_argument("--counts", nargs="+", type=int, default=[500, 8192], help="environments side by side")

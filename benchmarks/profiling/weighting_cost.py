@@ -131,7 +131,7 @@ def time_step(problem: Problem, weighting: Weighting, way: str) -> tuple[float, 
 
 
 def main() -> int:
-    """Reads the command line and prints a table."""
+    """Read the command line and print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--losses", type=int, nargs="+", default=[5, 10], help="numbers of auxiliary losses")
     parser.add_argument(

@@ -103,7 +103,7 @@ def sheet(names: list[str], columns: int = 2) -> Image.Image:
 
 
 def main() -> None:
-    """Makes the sheets that were named, or all."""
+    """Make the sheets that were named, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sheets", nargs="*", metavar="SHEET", help=f"all if none is named: {', '.join(sheets())}")
     FOLDER.mkdir(parents=True, exist_ok=True)

@@ -82,7 +82,7 @@ class Measures:
 
 
 def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
-    """Compares two images of NumPy arrays; where ``hidden`` [H, W] is true, colours do not count."""
+    """Compare two images of NumPy arrays; where ``hidden`` [H, W] is true, colours do not count."""
     inside = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
     solid = inside & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
     difference = np.max(np.abs(ours.rgb.astype(np.int16) - theirs.rgb), axis=-1)
@@ -143,7 +143,7 @@ class Comparison:
     """A model that was read from a file, its poses, and the comparison of its views."""
 
     def __init__(self, path: pathlib.Path, size: int) -> None:
-        """Reads the model; raises a ValueError where MuJoCo cannot."""
+        """Read the model; raise a ValueError where MuJoCo cannot."""
         self.mj_model = mujoco.MjModel.from_xml_path(str(path))
         quality = self.mj_model.vis.quality
         quality.offsamples = 0
@@ -294,7 +294,7 @@ def seen_points(scene: Scene, frame: Frame, data: mujoco.MjData) -> tuple[np.nda
 
 
 def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> int:
-    """Prints the table of a folder; the exit status is 1 where a row fails."""
+    """Print the table of a folder; the exit status is 1 where a row fails."""
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     print("| model | view | seg | depth | rgb | max | > 16 | match | s | verdict |\n" + "| --- " * 10 + "|", flush=True)
     rows = failed = 0

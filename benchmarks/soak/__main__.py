@@ -64,7 +64,7 @@ def _goodput(options: argparse.Namespace, folder: Path) -> int:
 
 
 def main() -> int:
-    """Reads the command line and does what it asks for."""
+    """Read the command line and do what it asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=10_000, help="at most so many")
     parser.add_argument("--seed", type=int, default=0)

@@ -76,7 +76,7 @@ def _finished(part: Part, *statuses: int) -> Part:
 
 
 def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
-    """Makes a reward NaN on one of two seeds: the run stops, names the seed, and goes on from its last good checkpoint."""
+    """Make a reward NaN on one of two seeds: the run stops, names the seed, and goes on from its last good checkpoint."""
     folder.mkdir()
     (folder / "broken_task.py").write_text(TASK)
     run, steps = folder / "run", 4 * 50
@@ -121,7 +121,7 @@ def _is(process: int, words: str) -> bool:
 
 
 def _kill_a_worker(part: Part, words: str, dice: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
-    """Kills a process below a part that was started with these words, a while after there are any; whether there was one."""
+    """Kill a process below a part that was started with these words, a while after there are any; whether there was one."""
 
     def workers() -> list[int]:
         return [process for process in _children(part.process.pid) if _is(process, words)]
@@ -175,7 +175,7 @@ def _cell_rows(folder: Path) -> dict[str, list]:
 
 
 def job_of_a_study(folder: Path, dice: random.Random, references: "References") -> None:
-    """Kills a run of a sweep whose runs are jobs of submitit; then the sweep finishes."""
+    """Kill a run of a sweep whose runs are jobs of submitit; then the sweep finishes."""
     worker_of_a_study(folder, dice, references, ("--executor", "local"))
 
 
@@ -188,7 +188,7 @@ def _tables(out: Path) -> dict[str, bytes]:
 
 
 def worker_of_phenotyping(folder: Path, dice: random.Random, references: "References") -> None:
-    """Kills a worker of ``phenotype run``; then the same tables are written."""
+    """Kill a worker of ``phenotype run``; then the same tables are written."""
     plots, tables = references.phenotyping()
     _pool(_phenotype(folder, plots), folder, dice)
     if _tables(folder / "out") != tables:
@@ -209,7 +209,7 @@ def _figures(file: Path) -> list[dict[str, Any]]:
 
 
 def worker_of_grasping(folder: Path, dice: random.Random, references: "References") -> None:
-    """Kills a worker of ``grasp eval``; then the same figures are found."""
+    """Kill a worker of ``grasp eval``; then the same figures are found."""
     spec, figures = references.grasping()
     _pool(_grasp(folder, spec), folder, dice)
     if _figures(folder / "eval.json") != figures:
@@ -221,7 +221,7 @@ class NotStruck(Exception):
 
 
 def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
-    """Kills a worker of a pool; then the same command finishes."""
+    """Kill a worker of a pool; then the same command finishes."""
     folder.mkdir(exist_ok=True)
     part = _command(words, folder)
     with killed_afterwards(part):
@@ -310,7 +310,7 @@ ALONE: dict[str, Alone] = {
 
 
 def strike_alone(name: str, folder: Path, dice: random.Random, references: References) -> bool:
-    """Lets a fault of `ALONE` happen in a new folder; whether it did."""
+    """Let a fault of `ALONE` happen in a new folder; whether it did."""
     try:
         ALONE[name].strike(folder, dice, references)
     except NotStruck:

@@ -159,7 +159,7 @@ def _killed(folder: Path, dice: random.Random) -> bool:
 
 
 def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
-    """Resumes, and stops again in the middle of training; the exit status."""
+    """Resume, and stop again in the middle of training; the exit status."""
     with killed_afterwards(_started(folder, dice, variables)) as part:
         status = part.stop()
         part.check_words()
@@ -169,7 +169,7 @@ def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None
 
 
 def _check_went_back(folder: Path, before: list[dict[str, Any]], all_before: list[Checkpoint], good: list[Checkpoint]) -> None:
-    """Looks whether a run that may have gone back before a damaged checkpoint went on from the newest good one.
+    """Look whether a run that may have gone back before a damaged checkpoint went on from the newest good one.
 
     Args:
         folder: The run, resumed and stopped again.

@@ -42,7 +42,7 @@ def _success(folder: Path) -> list[float]:
 
 
 def killed_every(folder: Path, every: float, minutes: float, options: Sequence[str]) -> Killed:
-    """Trains for so many minutes, killed every so many seconds; then what is there is evaluated.
+    """Train for so many minutes, killed every so many seconds; then what is there is evaluated.
 
     Where the folder holds such a run already, it goes on: so an hour can be had in pieces, whose kills and minutes are added.
 
@@ -96,7 +96,7 @@ def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[fl
 
 
 def report(killed: Killed, every: float, reference: Sequence[float] | None) -> dict[str, Any]:
-    """Prints what was found, and returns it for a file."""
+    """Print what was found, and return it for a file."""
     print(
         f"goodput {killed.goodput:.4f} over {killed.env_steps:,} environment steps and {killed.minutes:g} minutes, killed "
         f"{killed.kills} times, every {every:g} s; replay lost {killed.replays_lost} times; success at the end "

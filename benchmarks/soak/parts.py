@@ -85,7 +85,7 @@ class Part:
         options: Sequence[str] = OPTIONS,
         file_bytes: int | None = None,
     ) -> "Part":
-        """Starts or resumes the run in ``folder``; no file may become larger than ``file_bytes``."""
+        """Start or resume the run in ``folder``; no file may become larger than ``file_bytes``."""
         goes_on = ["--resume"] if folder.exists() else []
         command = [sys.executable, "-m", "jaxrl_vis", "train", *options, "--run-dir", str(folder), *goes_on]
         return cls.command(command, folder, variables, file_bytes)
@@ -94,7 +94,7 @@ class Part:
     def command(
         cls, command: Sequence[str], folder: Path, variables: dict[str, str] | None = None, file_bytes: int | None = None
     ) -> "Part":
-        """Starts any command, which works beside ``folder``."""
+        """Start any command, which works beside ``folder``."""
 
         def limit() -> None:
             if file_bytes is not None:
@@ -117,7 +117,7 @@ class Part:
             self.lines.append(line.rstrip())
 
     def end(self, seconds: float = 240.0) -> int:
-        """Waits for the process and its last line; its exit status.
+        """Wait for the process and its last line; its exit status.
 
         Raises:
             Broken: It does not end.
@@ -133,7 +133,7 @@ class Part:
         return status
 
     def send(self, number: int) -> int:
-        """Sends a signal and waits for the end; the exit status."""
+        """Send a signal and wait for the end; the exit status."""
         self.process.send_signal(number)
         return self.end()
 
@@ -142,11 +142,11 @@ class Part:
         return self.send(signal.SIGTERM) if self.runs() else self.end()
 
     def runs(self) -> bool:
-        """Returns whether the process has not ended yet."""
+        """Return whether the process has not ended yet."""
         return self.process.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
-        """Waits until something is so, and says whether it is; not longer than the process runs."""
+        """Wait until something is so, and say whether it is; not longer than the process runs."""
         deadline = time.monotonic() + seconds
         while self.runs() and time.monotonic() < deadline:
             if condition():
@@ -155,15 +155,15 @@ class Part:
         return condition()
 
     def is_compiling(self) -> bool:
-        """Returns whether compilation has begun."""
+        """Return whether compilation has begun."""
         return any(line.startswith("compiling") for line in self.lines)
 
     def is_training(self) -> bool:
-        """Returns whether compilation is over."""
+        """Return whether compilation is over."""
         return any(line.startswith("compiled in") for line in self.lines)
 
     def is_saving(self) -> bool:
-        """Returns whether a checkpoint is half written."""
+        """Return whether a checkpoint is half written."""
         return any("tmp" in path.name for path in self.folder.glob("checkpoints/*/*"))
 
     def count(self, words: str) -> int:
@@ -171,7 +171,7 @@ class Part:
         return sum(words in line for line in self.lines)
 
     def check_words(self) -> None:
-        """Raises `Broken` where there was a traceback, or Python's own words for a crash."""
+        """Raise `Broken` where there was a traceback, or Python's own words for a crash."""
         said = "\n".join(self.lines)
         if "Traceback" in said or "Fatal Python error" in said:
             raise Broken(f"a traceback\n{said}")

@@ -59,7 +59,7 @@ class Record:
         return sum(self.faults.values())
 
     def write(self, path: Path) -> None:
-        """Writes it, so that whoever is killed leaves a record, too."""
+        """Write it, so that whoever is killed leaves a record, too."""
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".tmp")
         temporary.write_text(json.dumps(dataclasses.asdict(self), indent=1) + "\n")

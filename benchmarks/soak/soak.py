@@ -63,7 +63,7 @@ class Soak:
             return deck.pop()
 
     def _again(self, kinds: dict[str, Any], fault: str) -> None:
-        """Puts back a fault that has found nothing to strike any more."""
+        """Put back a fault that has found nothing to strike any more."""
         with self._lock:
             self._left += 1
             self._decks[next(iter(kinds))].insert(0, fault)
@@ -140,7 +140,7 @@ class Soak:
         return True
 
     def _check_kept(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
-        """Looks whether something is lost.
+        """Look whether something is lost.
 
         Args:
             folder: The run.

@@ -25,7 +25,7 @@ Masks = tuple[list[np.ndarray], list[tuple[float, ...]]]
 
 
 def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
-    """Draws a plot: its seed, and the masks of what is measured at 12 inches with our width and the truth."""
+    """Draw a plot: its seed, and the masks of what is measured at 12 inches with our width and the truth."""
     import dataclasses
 
     from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
@@ -65,7 +65,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
 
 
 def keep_masks(options: argparse.Namespace) -> None:
-    """Draws plots, and writes their masks."""
+    """Draw plots, and write their masks."""
     from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 
     if options.workers > 1:
@@ -103,7 +103,7 @@ def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
 
 
 def compare(file: Path) -> None:
-    """Prints errors of both, mm."""
+    """Print errors of both, mm."""
     try:
         from plantcv import plantcv as pcv  # pyright: ignore[reportMissingImports]
     except ImportError:

@@ -37,7 +37,7 @@ def scenes(arms: int, seed: int = 0) -> tuple[Any, np.ndarray]:
 
 
 def main() -> int:
-    """Prints the figure, and writes it where it is asked to."""
+    """Print the figure, and write it where it is asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, default=1000)
     parser.add_argument("--wind", type=float, default=10.0, help="mm")

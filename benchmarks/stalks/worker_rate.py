@@ -40,7 +40,7 @@ def options() -> argparse.Namespace:
 
 
 def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, each_is: float = 1.0) -> None:
-    """Prints how long a pair takes where so many processes look at pairs, each at one of its own.
+    """Print how long a pair takes where so many processes look at pairs, each at one of its own.
 
     Args:
         make: Called in each process: what it does, and for how many inputs; these are done once before time is taken.

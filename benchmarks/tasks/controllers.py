@@ -168,7 +168,7 @@ def _plan(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the success of each controller; 1 where one is below its bound."""
+    """Print the success of each controller; 1 where one is below its bound."""
     parser = argparse.ArgumentParser(description="Success of scripted controllers that see the true state.")
     names = sorted([*POLICIES, "FingerTurn"])
     parser.add_argument("env", nargs="*", default=names, help=f"any of {', '.join(names)}; default: all")

@@ -94,7 +94,7 @@ def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, i
 
 
 def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> bool:
-    """Prints a task's figures; whether all is well."""
+    """Print a task's figures; whether all is well."""
     env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
     goals = draw_goals(env, count)
     identical, near, least, pair = compare(goals, env.threshold)
@@ -122,7 +122,7 @@ def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> boo
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the figures of each task; 1 where one fails."""
+    """Print the figures of each task; 1 where one fails."""
     parser = argparse.ArgumentParser(description="Whether goal images show and tell apart what matters.")
     parser.add_argument("env", nargs="*", default=sorted(PARTS), help=f"any of {', '.join(sorted(PARTS))}; default: all")
     parser.add_argument("--goals", type=int, default=1000)

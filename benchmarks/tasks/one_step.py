@@ -169,7 +169,7 @@ def mujoco_step(mj_model: mujoco.MjModel, visited: Visited, weld_term: bool) -> 
 
 
 def _take_weld_term_away(data: mujoco.MjData) -> None:
-    """Sets the accelerations that equalities ask for to what they are in MJX, without the turning of their Jacobians."""
+    """Set the accelerations that equalities ask for to what they are in MJX, without the turning of their Jacobians."""
     rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     stiffness, damping, impedance, _ = data.efc_KBIP[rows].T
     data.efc_aref[rows] = -damping * data.efc_vel[rows] - stiffness * impedance * data.efc_pos[rows]
@@ -210,7 +210,7 @@ def _short(number: float) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints the table, in Markdown."""
+    """Print the table, in Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"any of {', '.join(STATES)}; default: all")
     options = parser.parse_args(arguments)

@@ -21,7 +21,7 @@ _BAD = (1e6, -1e6, jnp.inf, -jnp.inf, jnp.nan)
 
 
 def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
-    """Plays whole episodes of ``count`` environments until there are ``steps``.
+    """Play whole episodes of ``count`` environments until there are ``steps``.
 
     Returns:
         Steps played, and episodes that had a number that was not finite.
@@ -52,7 +52,7 @@ def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints a line for each task; 1 where any was not finite."""
+    """Print a line for each task; 1 where any was not finite."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", default=list(TASKS), metavar="TASK")
     parser.add_argument("--steps", type=int, default=1_000_000)

@@ -71,7 +71,7 @@ def measure_hand(episodes: int, seed: int = 0) -> tuple[float, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Prints one line a task."""
+    """Print one line a task."""
     parser = argparse.ArgumentParser(description="Chance level and difficulty of tasks.")
     parser.add_argument("env", nargs="*", default=list(TASKS), help=f"any of {', '.join(TASKS)}; default: all")
     parser.add_argument("--episodes", type=int, default=1000)

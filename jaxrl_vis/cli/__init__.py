@@ -63,7 +63,7 @@ def overview(group: str = "") -> str:
 
 
 def main(words: Sequence[str] | None = None, give_up: Callable[[int], None] | None = None) -> int:
-    """Runs one command. Output errors do not end it, and signals end it in order.
+    """Run one command. Output errors do not end it, and signals end it in order.
 
     Args:
         words: The command line without the program's name; None: that of this process.
@@ -123,7 +123,7 @@ def _ended_by(number: int) -> int:
 
 
 def _output_status(words: Sequence[str], printed: SafeStream) -> int:
-    """Returns the exit status of a successful command with regard to its output."""
+    """Return the exit status of a successful command with regard to its output."""
     prints_result = " ".join(words).startswith(_PRINT_RESULTS) or not words or {"-h", "--help", "--version"} & set(words)
     if not isinstance(printed.failure, OSError) or not prints_result:
         return 0
@@ -134,7 +134,7 @@ def _output_status(words: Sequence[str], printed: SafeStream) -> int:
 
 
 def entry() -> None:
-    """Runs `main` and ends this process.
+    """Run `main` and end this process.
 
     After a signal the process ends at once: everything is saved, and threads that still write a checkpoint, abandoned by a
     second signal, are not waited for.
@@ -150,7 +150,7 @@ def entry() -> None:
 
 
 def split_command(words: Sequence[str]) -> tuple[str, Sequence[str]]:
-    """Splits a command line into the command, of one word or more, and its arguments.
+    """Split a command line into the command, of one word or more, and its arguments.
 
     Args:
         words: At least one word.

@@ -13,7 +13,7 @@ from jaxrl_vis.run.storage.folder import read_config
 
 
 def check_env(name: str, folder: str | None = None) -> None:
-    """Checks that an environment exists; one that is not built in is imported.
+    """Check that an environment exists; one that is not built in is imported.
 
     Args:
         name: Name of the environment.
@@ -35,7 +35,7 @@ def check_env(name: str, folder: str | None = None) -> None:
 
 
 def may_run_code(run_dir: Path, trust: bool) -> bool:
-    """Returns True if a run's own code may be used: permitted now or before, trained here, or confirmed on the terminal.
+    """Return True if a run's own code may be used: permitted now or before, trained here, or confirmed on the terminal.
 
     Args:
         run_dir: The run folder.
@@ -60,7 +60,7 @@ def _is_at_terminal() -> bool:
 
 
 def check_run(folder: Path) -> None:
-    """Raises a `RequestError` unless ``folder`` is a run folder."""
+    """Raise a `RequestError` unless ``folder`` is a run folder."""
     check_path(folder / "config.json")
     if not (folder / "config.json").exists():
         above = next((parent for parent in folder.parents if (parent / "config.json").exists()), None)
@@ -70,7 +70,7 @@ def check_run(folder: Path) -> None:
 
 
 def check_counts(**counts: int | None) -> None:
-    """Raises a `RequestError` that names the first option below 1, if any."""
+    """Raise a `RequestError` that names the first option below 1, if any."""
     for name, count in counts.items():
         if count is not None and count < 1:
             raise RequestError(f"--{name.replace('_', '-')} must be at least 1, not {count}")

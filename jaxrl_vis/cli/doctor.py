@@ -9,7 +9,7 @@ class Doctor:
 
 
 def run(_: Doctor) -> int:
-    """Checks the installation; returns 1 if something fails."""
+    """Check the installation; return 1 if something fails."""
     from jaxrl_vis.host import doctor
 
     return doctor.main()

@@ -28,7 +28,7 @@ class Envs:
 
 
 def run(options: Envs) -> int:
-    """Prints the table of environments, and draws the gallery."""
+    """Print the table of environments, and draw the gallery."""
     for name in options.env:
         check_env(name)
     check_counts(goals=options.goals, image_size=options.image_size)

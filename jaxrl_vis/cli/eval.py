@@ -26,7 +26,7 @@ class Eval:
 
 
 def run(options: Eval) -> int:
-    """Evaluates a run and prints the results."""
+    """Evaluate a run and print the results."""
     check_run(options.run_dir)
     trust = may_run_code(options.run_dir, options.trust)
     check_counts(episodes=options.episodes)

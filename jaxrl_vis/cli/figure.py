@@ -69,7 +69,7 @@ class Figure:
 
 
 def run(options: Figure) -> int:
-    """Draws one figure; `UNFINISHED` where a run that belongs to it is not finished."""
+    """Draw one figure; `UNFINISHED` where a run that belongs to it is not finished."""
     if options.figure == "quadratic":
         return _draw_quadratic(options)
     out = options.out or Path(f"figure_{options.figure}.png")
@@ -99,7 +99,7 @@ def _draw_quadratic(options: Figure) -> int:
 
 
 def _request(options: Figure, out: Path) -> "Request":
-    """Makes the request for a figure from the options.
+    """Make the request for a figure from the options.
 
     Raises:
         RequestError: An option is invalid.

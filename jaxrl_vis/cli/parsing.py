@@ -131,7 +131,7 @@ class _Option:
         return not self.is_flag and not fields.unwrap(self.hint)[2]
 
     def annotation(self) -> Any:
-        """Returns the annotation for tyro: a list of words, or a flag."""
+        """Return the annotation for tyro: a list of words, or a flag."""
         hint = f"({self.default})" if self.default else ""
         if self.is_flag:
             extras: list[Any] = [tyro.conf.arg(help=self.help, help_behavior_hint=hint)]
@@ -152,7 +152,7 @@ class _Option:
 
 
 def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
-    """Parses the arguments of a command.
+    """Parse the arguments of a command.
 
     Args:
         command: A frozen dataclass. Its docstring and those of its fields are the help. A field annotated with
@@ -201,7 +201,7 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
 def _split(
     command: type, program: str, words: Sequence[str], options: dict[str, _Option]
 ) -> tuple[dict[str, Any], Sequence[str]]:
-    """Splits arguments into the words of each given option (or True and False for flags), and the words of none."""
+    """Split arguments into the words of each given option (or True and False for flags), and the words of none."""
     # A dictionary with optional keys: tyro omits options that were not given.
     annotations = {name: option.annotation() for name, option in options.items()}
     form: Any = typing.TypedDict(command.__name__, annotations, total=False)  # pyright: ignore[reportArgumentType]
@@ -262,7 +262,7 @@ def _value(option: _Option, words: Any) -> Any:
 
 
 def _collect_options(command: type) -> list[_Option]:
-    """Lists the options of a command in the order of its fields, with those of a `FieldsOf` in its place.
+    """List the options of a command in the order of its fields, with those of a `FieldsOf` in its place.
 
     A field that may be given either by name or by position makes two options, in this order.
     """
@@ -290,7 +290,7 @@ def _collect_options(command: type) -> list[_Option]:
 
 
 def _describe_fields(record: type) -> list[tuple[dataclasses.Field, Any, tuple[Any, ...], str]]:
-    """Lists the fields of a dataclass with their annotations, the metadata of `typing.Annotated`, and their docstrings."""
+    """List the fields of a dataclass with their annotations, the metadata of `typing.Annotated`, and their docstrings."""
     texts: dict[str, str] = {}
     for kind in reversed([kind for kind in record.__mro__ if dataclasses.is_dataclass(kind)]):
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body

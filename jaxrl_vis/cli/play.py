@@ -29,7 +29,7 @@ class Play:
 
 
 def run(options: Play) -> int:
-    """Draws a run's episodes."""
+    """Draw a run's episodes."""
     check_run(options.run_dir)
     check_counts(episodes=options.episodes)
     if options.html and options.aux:

@@ -48,7 +48,7 @@ class Sweep:
 
 
 def run(options: Sweep) -> int:
-    """Runs a sweep; returns `UNFINISHED` if a run of it is not finished."""
+    """Run a sweep; return `UNFINISHED` if a run of it is not finished."""
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")

@@ -21,7 +21,7 @@ from jaxrl_vis.validation import validate
 
 
 def describe_default(name: str) -> str:
-    """Describes a field's default: its value in this machine's ``auto`` preset, and the presets with other values."""
+    """Describe a field's default: its value in this machine's ``auto`` preset, and the presets with other values."""
     current = _auto(guess_accelerator())
     values = {preset_name: getattr(config, name) for preset_name, config in PRESETS.items()}
     words = {
@@ -33,12 +33,12 @@ def describe_default(name: str) -> str:
 
 
 def _auto(on_accelerator: bool) -> str:
-    """Returns the preset for the hardware."""
+    """Return the preset for the hardware."""
     return "fast" if on_accelerator else "cpu"
 
 
 def default_preset() -> str:
-    """Describes the default of ``--preset`` for the help."""
+    """Describe the default of ``--preset`` for the help."""
     return f"default: auto, which is {_auto(guess_accelerator())} on this machine; its values are the defaults shown below"
 
 
@@ -76,7 +76,7 @@ class Train:
 
 
 def training_config(options: Train) -> Config:
-    """Builds the requested configuration: the given options, and the rest from a saved run or a preset.
+    """Build the requested configuration: the given options, and the rest from a saved run or a preset.
 
     If neither is named, the preset depends on the hardware, which requires importing JAX.
 
@@ -112,7 +112,7 @@ def _words(value: Any) -> tuple[Any, ...]:
 
 
 def run(options: Train) -> int:
-    """Trains; reports are shown and saved by the trainer."""
+    """Train; reports are shown and saved by the trainer."""
     check_counts(start_timeout=options.start_timeout)
     claim_memory()
     rank = distributed.find_rank(options.coordinator, options.num_processes, options.process_id)

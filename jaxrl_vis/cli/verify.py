@@ -27,7 +27,7 @@ class Verify:
 
 
 def run(options: Verify) -> int:
-    """Verifies a run, and prints the results."""
+    """Verify a run, and print the results."""
     check_run(options.run_dir)
     trust = may_run_code(options.run_dir, options.trust)
     check_counts(iterations=options.iterations)

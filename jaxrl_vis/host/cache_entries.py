@@ -20,7 +20,7 @@ _hooked: Any = None
 
 
 def mend_damaged_entries() -> None:
-    """Installs a hook that deletes damaged entries when JAX warns of them, and suppresses the warning; idempotent."""
+    """Install a hook that deletes damaged entries when JAX warns of them, and suppresses the warning; idempotent."""
     global _hooked
     if warnings.showwarning is _hooked:
         return
@@ -36,7 +36,7 @@ def mend_damaged_entries() -> None:
 
 
 def _delete_damaged(program: str) -> bool:
-    """Deletes the damaged entries of a program, or all of them if none can be identified; returns True if any was deleted."""
+    """Delete the damaged entries of a program, or all of them if none can be identified; return True if any was deleted."""
     folder = Path(str(jax.config.jax_compilation_cache_dir))
     entries = list(folder.glob(f"{program}-*{_SUFFIX}"))
     deleted = False
@@ -48,7 +48,7 @@ def _delete_damaged(program: str) -> bool:
 
 
 def _is_whole(entry: Path) -> bool:
-    """Returns True if an entry can be decompressed, with the library that JAX used to write it."""
+    """Return True if an entry can be decompressed, with the library that JAX used to write it."""
     try:
         contents = entry.read_bytes()
         if not contents.startswith(_ZSTANDARD):

@@ -29,7 +29,7 @@ _TPU = (("libtpu",), ("/dev/accel0", "/dev/vfio/0"))
 
 
 def claim_memory() -> None:
-    """Lets JAX preallocate nine tenths of a GPU's memory instead of its default three quarters; call it before importing JAX.
+    """Let JAX preallocate nine tenths of a GPU's memory instead of its default three quarters; call it before importing JAX.
 
     For processes with exclusive use of a GPU, as in training. Values set by the user or a study (`shared`) are not changed.
     """
@@ -39,7 +39,7 @@ def claim_memory() -> None:
 
 
 def start_devices() -> None:
-    """Initialises JAX's devices in a background thread, which takes a second or two for a GPU, while imports continue.
+    """Initialise JAX's devices in a background thread, which takes a second or two for a GPU, while imports continue.
 
     Any use of the devices, or `check_devices`, waits for the thread. If initialisation fails, that use raises the error.
     """
@@ -53,7 +53,7 @@ def start_devices() -> None:
 
 
 def check_devices() -> None:
-    """Initialises JAX's devices and reports errors of its configuration.
+    """Initialise JAX's devices and report errors of its configuration.
 
     Raises:
         RequestError: JAX_PLATFORMS names a platform that is not available, or compilation is disabled.
@@ -107,7 +107,7 @@ def enable_compilation_cache() -> str:
 
 
 def hush_cache() -> None:
-    """Suppresses JAX's warnings about a faulty cache, one per program; the run reports the fault once."""
+    """Suppress JAX's warnings about a faulty cache, one per program; the run reports the fault once."""
     import jax
 
     if jax.config.jax_compilation_cache_dir and cache_fault() is not None:
@@ -120,7 +120,7 @@ def default_cache() -> Path:
 
 
 def cache_fault() -> str | None:
-    """Returns why programs compiled now will not be reused, after `enable_compilation_cache`; None if they will."""
+    """Return why programs compiled now will not be reused, after `enable_compilation_cache`; None if they will."""
     import jax
 
     if not jax.config.jax_enable_compilation_cache or jax.config.jax_compilation_cache_max_size == 0:
@@ -139,7 +139,7 @@ def cache_fault() -> str | None:
 
 
 def _write_fault(folder: Path) -> str | None:
-    """Returns why a folder, created if missing, cannot hold new files; None if it can."""
+    """Return why a folder, created if missing, cannot hold new files; None if it can."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -150,7 +150,7 @@ def _write_fault(folder: Path) -> str | None:
 
 
 def count_devices(requested: str) -> int:
-    """Converts an option to a number of devices: a number, or ``all``, the devices of all processes.
+    """Convert an option to a number of devices: a number, or ``all``, the devices of all processes.
 
     Raises:
         RequestError: The value is neither.
@@ -191,7 +191,7 @@ print(json.dumps([[device.platform, device.device_kind] for device in jax.local_
 
 
 def list_devices() -> list[Device]:
-    """Lists the GPUs that this process may use; a single entry without variables if there is only one device or no GPU.
+    """List the GPUs that this process may use; a single entry without variables if there is only one device or no GPU.
 
     Raises:
         RequestError: JAX finds no device.
@@ -211,7 +211,7 @@ def list_devices() -> list[Device]:
 
 
 def shared(devices: Sequence[Device], processes: int) -> list[Device]:
-    """Repeats every device for a number of parallel processes, and divides GPU memory among them."""
+    """Repeat every device for a number of parallel processes, and divide GPU memory among them."""
     if processes == 1:
         return list(devices)
     share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{_MAX_MEMORY / processes:.3f}"}
@@ -219,7 +219,7 @@ def shared(devices: Sequence[Device], processes: int) -> list[Device]:
 
 
 def guess_accelerator() -> bool:
-    """Returns True if JAX will probably use an accelerator: a guess without importing JAX, for help that must be fast."""
+    """Return True if JAX will probably use an accelerator: a guess without importing JAX, for help that must be fast."""
     requested = [word.strip() for word in os.environ.get("JAX_PLATFORMS", "").split(",") if word.strip()]
     if requested:
         return requested[0] != "cpu"
@@ -235,7 +235,7 @@ def _exists(files: tuple[str, ...]) -> bool:
 
 
 def _default_platform(requested: str) -> str:
-    """Returns the platform that JAX chooses without JAX_PLATFORMS, such as ``cpu``. The setting is restored."""
+    """Return the platform that JAX chooses without JAX_PLATFORMS, such as ``cpu``. The setting is restored."""
     import jax
     from jax.extend.backend import clear_backends
 

@@ -111,7 +111,7 @@ def start(rank: Rank, seconds: int = START_S) -> None:
 
 
 def _wait_for(coordinator: str, seconds: float) -> None:
-    """Waits for the coordinator to accept connections: JAX itself would end this process without a helpful message.
+    """Wait for the coordinator to accept connections: JAX itself would end this process without a helpful message.
 
     Raises:
         RequestError: It does not answer in time.
@@ -133,12 +133,12 @@ def _wait_for(coordinator: str, seconds: float) -> None:
 
 
 def are_several() -> bool:
-    """Returns True if there are several processes."""
+    """Return True if there are several processes."""
     return _count_and_index()[0] > 1
 
 
 def is_first() -> bool:
-    """Returns True in the process that writes files and console output."""
+    """Return True in the process that writes files and console output."""
     return _count_and_index()[1] == 0
 
 
@@ -152,7 +152,7 @@ def _count_and_index() -> tuple[int, int]:
 
 
 def meet(name: str) -> None:
-    """Waits until all processes have reached this point.
+    """Wait until all processes have reached this point.
 
     Args:
         name: Name of the synchronisation point.
@@ -179,12 +179,12 @@ def leave_together() -> None:
 
 
 def any_process(answer: bool) -> bool:
-    """Returns True in all processes if ``answer`` is true in any; a collective call."""
+    """Return True in all processes if ``answer`` is true in any; a collective call."""
     return bool(max_over_processes(int(answer)))
 
 
 def max_over_processes(number: int) -> int:
-    """Returns the maximum of ``number`` over all processes; a collective call."""
+    """Return the maximum of ``number`` over all processes; a collective call."""
     if not are_several():
         return number
     import numpy as np

@@ -11,7 +11,7 @@ from jaxrl_vis.host.devices import cache_fault, check_devices, enable_compilatio
 
 
 def versions() -> str:
-    """Returns the versions of Python and of the packages that matter."""
+    """Return the versions of Python and of the packages that matter."""
     installed = provenance.versions()
     # The checkout itself does not have to be installed.
     missing = [name for name, version in installed.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
@@ -21,13 +21,13 @@ def versions() -> str:
 
 
 def devices() -> str:
-    """Returns the platform and the device that JAX uses."""
+    """Return the platform and the device that JAX uses."""
     check_devices()
     return f"{provenance.device_record()['platform']}: {provenance.device_name()}"
 
 
 def memory() -> str:
-    """Returns the memory of the host and of the first device."""
+    """Return the memory of the host and of the first device."""
     import jax
 
     host = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
@@ -37,7 +37,7 @@ def memory() -> str:
 
 
 def compilation_cache() -> str:
-    """Returns the folder of the compilation cache, or why there is none."""
+    """Return the folder of the compilation cache, or why there is none."""
     import jax
 
     folder = enable_compilation_cache()
@@ -50,7 +50,7 @@ def compilation_cache() -> str:
 
 
 def physics_and_camera() -> str:
-    """Compiles and runs one control step, renders it, and checks that the image is neither empty nor equal to the goal
+    """Compile and run one control step, renders it, and check that the image is neither empty nor equal to the goal
     image.
     """
     import jax
@@ -87,7 +87,7 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 
 
 def main() -> int:
-    """Runs all checks, even after failures, and prints the results.
+    """Run all checks, even after failures, and print the results.
 
     Returns:
         0 if all checks pass; 1 if one fails; 2 if JAX is configured for a device that is not available, which stops the checks.

@@ -18,12 +18,12 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def user_cache() -> Path:
-    """Returns the cache folder of this project: ``jaxrl-vis`` in the user's cache folder."""
+    """Return the cache folder of this project: ``jaxrl-vis`` in the user's cache folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxrl-vis"
 
 
 def write_atomically(path: Path, contents: str | bytes) -> None:
-    """Replaces a file's contents atomically: after a power cut, or for a concurrent reader, the file is either old or new.
+    """Replace a file's contents atomically: after a power cut, or for a concurrent reader, the file is either old or new.
 
     Args:
         path: The file; missing parent folders are created. A link is followed: its target is replaced.
@@ -39,7 +39,7 @@ def write_atomically(path: Path, contents: str | bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path, durable: bool = True, mode: int = 0o666) -> Iterator[IO[bytes]]:
-    """Opens a temporary file that replaces ``path`` on success; on an exception, ``path`` is unchanged.
+    """Open a temporary file that replaces ``path`` on success; on an exception, ``path`` is unchanged.
 
     Safe for concurrent processes: each writes a file of its own, and the last one to finish wins.
 
@@ -70,7 +70,7 @@ def replacing(path: Path, durable: bool = True, mode: int = 0o666) -> Iterator[I
 
 
 def is_temporary(name: str) -> bool:
-    """Returns True if a name is that of an unfinished file of `replacing`."""
+    """Return True if a name is that of an unfinished file of `replacing`."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
@@ -85,7 +85,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def read_json(path: Path, kind: type = dict, mend: str = "") -> Any:
-    """Reads a JSON file.
+    """Read a JSON file.
 
     Args:
         path: The file.
@@ -114,7 +114,7 @@ def read_json(path: Path, kind: type = dict, mend: str = "") -> Any:
 
 
 def check_path(path: Path) -> None:
-    """Checks that ``path`` can be looked up, whether it exists or not.
+    """Check that ``path`` can be looked up, whether it exists or not.
 
     Raises:
         RequestError: The lookup fails: a name is too long or contains a NUL, or a parent folder is not accessible.
@@ -135,7 +135,7 @@ def _short(path: Path) -> str:
 
 
 def make_private(folder: Path) -> None:
-    """Creates a folder accessible only to its owner; an existing folder of this user is restricted likewise.
+    """Create a folder accessible only to its owner; an existing folder of this user is restricted likewise.
 
     Raises:
         OSError: The folder cannot be created.
@@ -146,7 +146,7 @@ def make_private(folder: Path) -> None:
 
 
 def stranger_to(status: os.stat_result) -> str | None:
-    """Describes who, other than this user and root, can have written a file or folder; None for nobody, and on Windows.
+    """Describe who, other than this user and root, can have written a file or folder; None for nobody, and on Windows.
 
     Args:
         status: Result of `os.stat`, or of `os.fstat` for an open file.
@@ -161,7 +161,7 @@ def stranger_to(status: os.stat_result) -> str | None:
 
 
 def read_private(path: Path) -> bytes | None:
-    """Reads a file that only this user or root can have written; returns None if it is missing or not such a file.
+    """Read a file that only this user or root can have written; return None if it is missing or not such a file.
 
     Symbolic links are not followed.
     """

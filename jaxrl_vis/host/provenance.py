@@ -30,7 +30,7 @@ _CODE = ("jaxrl_vis", "envs", "benchmarks", "pyproject.toml", ":!benchmarks/resu
 
 
 def git(*arguments: str, folder: Path = CHECKOUT) -> str | None:
-    """Runs a git command in ``folder`` and returns its standard output; None if git is missing or the command fails."""
+    """Run a git command in ``folder`` and return its standard output; None if git is missing or the command fails."""
     try:
         done = subprocess.run(("git", "-C", str(folder), *arguments), capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired):
@@ -39,13 +39,13 @@ def git(*arguments: str, folder: Path = CHECKOUT) -> str | None:
 
 
 def is_checkout(folder: Path = CHECKOUT) -> bool:
-    """Returns True if ``folder`` is the top of a git checkout: an installed copy may lie inside another project's."""
+    """Return True if ``folder`` is the top of a git checkout: an installed copy may lie inside another project's."""
     top = git("rev-parse", "--show-toplevel", folder=folder)
     return top is not None and Path(top).resolve() == folder.resolve()
 
 
 def revision(digits: int = 40, folder: Path = CHECKOUT) -> str | None:
-    """Returns the revision of the checkout, with ``-dirty`` if its code was modified; None outside a checkout.
+    """Return the revision of the checkout, with ``-dirty`` if its code was modified; None outside a checkout.
 
     The environment variable JAXRL_VIS_REVISION takes precedence: it names the revision of a copy without history.
 
@@ -63,7 +63,7 @@ def revision(digits: int = 40, folder: Path = CHECKOUT) -> str | None:
 
 
 def child_environment() -> dict[str, str]:
-    """Returns environment variables for a child process that imports this copy of the project."""
+    """Return environment variables for a child process that imports this copy of the project."""
     import jaxrl_vis_envs
 
     sources = {str(CHECKOUT), str(Path(jaxrl_vis_envs.__file__).resolve().parents[1])}
@@ -72,7 +72,7 @@ def child_environment() -> dict[str, str]:
 
 
 def install_command(extra: str) -> str:
-    """Returns the command that installs one of this project's extras: in a clone or an installed copy, with or without pip."""
+    """Return the command that installs one of this project's extras: in a clone or an installed copy, with or without pip."""
     in_clone = (CHECKOUT / "pyproject.toml").exists()
     local_uv = CHECKOUT / ".uv" / "bin" / "uv"
     if importlib.util.find_spec("pip"):
@@ -83,7 +83,7 @@ def install_command(extra: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of Python and of `PACKAGES`; `NOT_INSTALLED` for missing ones."""
+    """Return the versions of Python and of `PACKAGES`; `NOT_INSTALLED` for missing ones."""
     installed = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -94,7 +94,7 @@ def versions() -> dict[str, str]:
 
 
 def device_record() -> dict[str, Any]:
-    """Describes JAX's devices: ``platform``, ``kind`` of the first, ``count``, and ``cpu_count`` of the host."""
+    """Describe JAX's devices: ``platform``, ``kind`` of the first, ``count``, and ``cpu_count`` of the host."""
     import jax
 
     device = jax.devices()[0]
@@ -103,7 +103,7 @@ def device_record() -> dict[str, Any]:
 
 @functools.cache
 def device_name() -> str:
-    """Returns the hardware's name: the accelerator's name and count, or the processor's name and the number of usable cores."""
+    """Return the hardware's name: the accelerator's name and count, or the processor's name and the number of usable cores."""
     import jax
 
     if jax.default_backend() != "cpu":

@@ -13,7 +13,7 @@ _SIGNS = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")
 
 
 def to_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Formats rows as CSV with a header; the columns default to those of the first row. None becomes an empty field.
+    """Format rows as CSV with a header; the columns default to those of the first row. None becomes an empty field.
 
     Raises:
         ValueError: A row has a column that is not in ``columns``.
@@ -29,13 +29,13 @@ def to_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = No
 
 
 def escape_cell(value: Any) -> Any:
-    """Returns the text of a cell, with an apostrophe if a spreadsheet would evaluate it; the inverse is `unescape_cell`."""
+    """Return the text of a cell, with an apostrophe if a spreadsheet would evaluate it; the inverse is `unescape_cell`."""
     # Text that already has one gets another, so that `unescape_cell` is exact.
     return f"'{value}" if isinstance(value, str) and _needs_mark(value) else value
 
 
 def unescape_cell(written: str) -> str:
-    """Returns the text from which `escape_cell` made ``written``."""
+    """Return the text from which `escape_cell` made ``written``."""
     return written[1:] if written.startswith("'") and _needs_mark(written[1:]) else written
 
 

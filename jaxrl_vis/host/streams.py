@@ -26,7 +26,7 @@ class SafeStream:
         self.failure: Exception | None = None
 
     def write(self, text: str) -> int:
-        """Writes as much as possible; returns the length of ``text``."""
+        """Write as much as possible; return the length of ``text``."""
         if self._below is not None:
             try:
                 self._write(text)
@@ -41,12 +41,12 @@ class SafeStream:
             self._below.write(text.encode(error.encoding, "replace").decode(error.encoding))
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """Writes a sequence of lines."""
+        """Write a sequence of lines."""
         for line in lines:
             self.write(line)
 
     def flush(self) -> None:
-        """Flushes the wrapped stream, if possible."""
+        """Flush the wrapped stream, if possible."""
         if self._below is not None:
             try:
                 self._below.flush()
@@ -54,7 +54,7 @@ class SafeStream:
                 self.failure = self.failure or error
 
     def isatty(self) -> bool:
-        """Returns True if the stream is a terminal."""
+        """Return True if the stream is a terminal."""
         with contextlib.suppress(Exception):
             return bool(self._below.isatty())
         return False
@@ -65,7 +65,7 @@ class SafeStream:
         return getattr(self._below, "encoding", None) or "utf-8"
 
     def fileno(self) -> int:
-        """Returns the file descriptor of the wrapped stream.
+        """Return the file descriptor of the wrapped stream.
 
         Raises:
             OSError: There is none.
@@ -79,18 +79,18 @@ class SafeStream:
 
 
 def safe(stream: Any) -> SafeStream:
-    """Wraps a stream, such as ``sys.stdout``, which may be None or closed."""
+    """Wrap a stream, such as ``sys.stdout``, which may be None or closed."""
     return stream if isinstance(stream, SafeStream) else SafeStream(stream)
 
 
 def say(line: str) -> None:
-    """Prints a line to stdout; never raises."""
+    """Print a line to stdout; never raises."""
     print(line, flush=True, file=safe(sys.stdout))
 
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[SafeStream]:
-    """Replaces stdout and stderr by safe streams, for third-party libraries as well; yields stdout."""
+    """Replace stdout and stderr by safe streams, for third-party libraries as well; yield stdout."""
     before = sys.stdout, sys.stderr
     stdout, stderr = safe(before[0]), safe(before[1])
     sys.stdout, sys.stderr = stdout, stderr  # type: ignore[assignment] - a stream, but not a subclass of Python's
@@ -104,7 +104,7 @@ def safe_streams() -> Iterator[SafeStream]:
 
 
 def reserve_standard_files() -> None:
-    """Opens the null device for closed standard files (0, 1, 2).
+    """Open the null device for closed standard files (0, 1, 2).
 
     Otherwise the next file to be opened, such as a run's metrics, would take their descriptor, and output of C libraries would
     be written into it.
@@ -122,7 +122,7 @@ def reserve_standard_files() -> None:
 
 
 def detach_broken_streams() -> None:
-    """Flushes the standard streams and detaches broken ones, so that Python does not report errors at exit."""
+    """Flush the standard streams and detach broken ones, so that Python does not report errors at exit."""
     for stream in (sys.stdout, sys.stderr):
         if stream is None:
             continue

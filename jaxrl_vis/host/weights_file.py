@@ -69,20 +69,20 @@ def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarra
 
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
-    """Writes named arrays without conversion."""
+    """Write named arrays without conversion."""
     whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 
 def _named(params: Any) -> dict[str, Any]:
-    """Returns the leaves of nested dictionaries by path: ``detector/params/stem/kernel``."""
+    """Return the leaves of nested dictionaries by path: ``detector/params/stem/kernel``."""
     return {"/".join(str(part.key) for part in names): leaf for names, leaf in jax.tree_util.tree_flatten_with_path(params)[0]}
 
 
 def read_parameters(
     path: Path, command: str, declare: Callable[[dict[str, Any]], tuple[Settings, Any]]
 ) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
-    """Reads a file of `write_parameters`. Names, shapes and types are compared with the network's before any array is read.
+    """Read a file of `write_parameters`. Names, shapes and types are compared with the network's before any array is read.
 
     Args:
         path: The file.
@@ -146,7 +146,7 @@ def read_parameters(
 
 
 def _check_header(path: Path) -> None:
-    """Raises a ValueError if the header's size is inconsistent with the file or larger than that of any of our networks."""
+    """Raise a ValueError if the header's size is inconsistent with the file or larger than that of any of our networks."""
     size = path.stat().st_size
     if not path.is_file():
         raise ValueError("not a regular file")  # opening a pipe would block
@@ -156,7 +156,7 @@ def _check_header(path: Path) -> None:
 
 
 def check_range(path: Path, name: str, values: tuple[float, ...], low: float, high: float, step: int = 1) -> None:
-    """Checks a setting of a network before it is used.
+    """Check a setting of a network before it is used.
 
     Args:
         path: File that the setting was read from.
@@ -180,7 +180,7 @@ def _other_network(path: Path, why: str, command: str) -> str:
 
 
 def convert(old: Path, new: Path) -> None:
-    """Converts a .npz file of an earlier version to the current format, bit for bit.
+    """Convert a .npz file of an earlier version to the current format, bit for bit.
 
     Raises:
         OSError: A file cannot be read or written.

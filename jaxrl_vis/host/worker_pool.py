@@ -42,7 +42,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC
 def evaluate_all(
     evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, done: Callable[[int, Record], None]
 ) -> None:
-    """Evaluates numbers in this process or in several.
+    """Evaluate numbers in this process or in several.
 
     Args:
         evaluate: Maps a number to its record. With more than one worker it is pickled: a function at module level, or a
@@ -65,7 +65,7 @@ def _numbered(evaluate: Callable[[int], Record], number: int) -> tuple[int, Reco
 
 
 def map_unordered(function: Callable[[A], T], arguments: Iterable[A], workers: int) -> Generator[T]:
-    """Maps a function over arguments, possibly endless, and yields the results in order of completion.
+    """Map a function over arguments, possibly endless, and yield the results in order of completion.
 
     Args:
         function: Maps an argument to its result. With more than one worker, both are pickled.
@@ -136,7 +136,7 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
 
 
 def _wait_for(children: Collection[BaseProcess], seconds: float) -> None:
-    """Waits for children to end, up to a number of seconds.
+    """Wait for children to end, up to a number of seconds.
 
     `BaseProcess.join` may return too soon: the pool's own thread waits for its processes too, and the system reports the exit
     of a process to only one of the two threads; the other treats it as running until the first has recorded it.
@@ -147,12 +147,12 @@ def _wait_for(children: Collection[BaseProcess], seconds: float) -> None:
 
 
 def share_accelerator() -> None:
-    """Lets this process allocate GPU memory on demand, so that other processes can use the GPU; call it before using JAX."""
+    """Let this process allocate GPU memory on demand, so that other processes can use the GPU; call it before using JAX."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
 def _environments(workers: int) -> list[dict[str, str]]:
-    """Returns the environment variables of the workers: their GPU, if there are several, and their number of threads."""
+    """Return the environment variables of the workers: their GPU, if there are several, and their number of threads."""
     import jax
 
     from jaxrl_vis.host.devices import list_devices
@@ -167,7 +167,7 @@ def _environments(workers: int) -> list[dict[str, str]]:
 
 
 def _end_with_parent() -> None:
-    """Waits for the parent process to end, for example when killed, then exits: its results are no longer needed."""
+    """Wait for the parent process to end, for example when killed, then exits: its results are no longer needed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -175,7 +175,7 @@ def _end_with_parent() -> None:
 
 
 def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
-    """Initialises a worker process."""
+    """Initialise a worker process."""
     heed_parent_only()  # a signal to the process group would otherwise interrupt parent and worker at once
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
@@ -191,7 +191,7 @@ def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
 
 
 def code_digest(*packages: ModuleType, leave_out: tuple[str, ...] = ()) -> str:
-    """Computes a digest of the code that records come from: 12 hexadecimal digits.
+    """Compute a digest of the code that records come from: 12 hexadecimal digits.
 
     Args:
         packages: Packages whose files are included.
@@ -215,7 +215,7 @@ class RecordFile:
     """
 
     def __init__(self, path: Path | None, about: Mapping[str, Any], summary: Callable[[list[Record]], Mapping[str, Any]]):
-        """Reads the file, if it exists and was written under the same conditions.
+        """Read the file, if it exists and was written under the same conditions.
 
         Args:
             path: The file; None to keep the records in memory only.
@@ -237,17 +237,17 @@ class RecordFile:
         return number in self.records
 
     def add(self, number: int, record: Record) -> None:
-        """Adds the record of a number, and writes the file."""
+        """Add the record of a number, and write the file."""
         self.add_all({number: record})
 
     def add_all(self, records: Mapping[int, Record]) -> None:
-        """Adds the records of several numbers, and writes the file once."""
+        """Add the records of several numbers, and write the file once."""
         for number, record in records.items():
             self._keep(number, {"number": number, **record})
         self.write()
 
     def write(self) -> None:
-        """Writes the file."""
+        """Write the file."""
         if self._path is None:
             return
         ordered = sorted(self.records)
@@ -257,7 +257,7 @@ class RecordFile:
         write_atomically(self._path, f'{head[:-2]},\n  "each": [\n{lines}\n  ]\n}}\n')
 
     def _check(self, path: Path) -> None:
-        """Raises a RequestError if the records that were read have been altered."""
+        """Raise a RequestError if the records that were read have been altered."""
         try:
             self._summary([self.records[number] for number in sorted(self.records)])
         except Exception as error:  # computing with altered records may raise anything
@@ -273,7 +273,7 @@ class RecordFile:
 
 
 def finite(value: Any) -> Any:
-    """Replaces non-finite numbers by None, at any depth, for JSON."""
+    """Replace non-finite numbers by None, at any depth, for JSON."""
     if isinstance(value, Mapping):
         return {name: finite(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -282,7 +282,7 @@ def finite(value: Any) -> Any:
 
 
 def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
-    """Reads the records of a file.
+    """Read the records of a file.
 
     Raises:
         RequestError: The file has other conditions, or cannot be read.

@@ -45,7 +45,7 @@ def locate_env(config: Config) -> Config:
 
 
 def make_env(config: Config) -> GoalEnv:
-    """Builds the environment of a configuration.
+    """Build the environment of a configuration.
 
     Raises:
         RequestError: There is no such environment, or it cannot be made like that.

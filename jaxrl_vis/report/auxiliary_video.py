@@ -43,7 +43,7 @@ class Predictions:
 def draw_frames(
     episodes: videos.EpisodeImages, predictions: Predictions, frame_seconds: float
 ) -> tuple[list[Image.Image], list[float]]:
-    """Draws all frames of the video; returns them with their durations in seconds. Borders are as in `videos.draw_frames`.
+    """Draw all frames of the video; return them with their durations in seconds. Borders are as in `videos.draw_frames`.
 
     Args:
         episodes: T+1 images of each of K episodes, and their goals; success at the last step.
@@ -75,7 +75,7 @@ def _columns(
     depth_range: tuple[float, float],
     max_flow: float,
 ) -> list[list[Tile]]:
-    """Arranges tiles in columns; colour and depth of an observation are stacked in one column."""
+    """Arrange tiles in columns; colour and depth of an observation are stacked in one column."""
 
     def image_tiles(caption: str, image: np.ndarray) -> list[Tile]:
         rows = [image for _, image in videos.image_rows(image, depth_range)]
@@ -106,7 +106,7 @@ def _heat(values: np.ndarray, maximum: float) -> np.ndarray:
 
 
 def _compose(columns: Sequence[Sequence[Tile]], footer: tuple[str, str], colour: tuple[int, int, int]) -> Image.Image:
-    """Composes one frame of the video; ``colour`` is that of the observation's border."""
+    """Compose one frame of the video; ``colour`` is that of the observation's border."""
     whole = columns[0][0][1].shape[:2]
     width, height = videos.enlarge(columns[0][0][1], _SIZE).size
     cell = (width + 2 * videos.BORDER + videos.GAP, height + 2 * videos.BORDER + _CAPTION)

@@ -7,7 +7,7 @@ import numpy as np
 
 
 def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Maps depth to perceptually uniform colours; near is bright.
+    """Map depth to perceptually uniform colours; near is bright.
 
     Args:
         depth: [H, W], in any unit: metres, or the grey levels of an observation.
@@ -23,7 +23,7 @@ def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
 
 
 def label_colours(labels: np.ndarray, geoms: int, sky: tuple[int, int, int]) -> np.ndarray:
-    """Maps geom ids to colours that differ between neighbours: hues are multiples of the golden ratio.
+    """Map geom ids to colours that differ between neighbours: hues are multiples of the golden ratio.
 
     Args:
         labels: [H, W] int; ids below 0 and from ``geoms`` on are sky.

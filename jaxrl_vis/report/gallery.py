@@ -34,7 +34,7 @@ _SKY = (255, 255, 255)
 
 
 def print_table(names: Sequence[str] | None = None) -> None:
-    """Prints one row per environment in ``names`` (default: all), from their definitions; nothing is compiled.
+    """Print one row per environment in ``names`` (default: all), from their definitions; nothing is compiled.
 
     If ``names`` is None, environments of installed packages that cannot be created are listed below the table with their
     errors.
@@ -67,7 +67,7 @@ def print_table(names: Sequence[str] | None = None) -> None:
 
 
 def _make_all(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """Creates the environments ``names``; or all, with errors of those that cannot be created.
+    """Create the environments ``names``; or all, with errors of those that cannot be created.
 
     Raises:
         RequestError: One of ``names`` cannot be created.
@@ -101,7 +101,7 @@ class _Poses(NamedTuple):
 
 
 def image_environments() -> list[str]:
-    """Returns the names of the environments that have image observations and can be drawn."""
+    """Return the names of the environments that have image observations and can be drawn."""
     return [name for name, env in _make_all(None)[0].items() if _sees_images(env) and _can_be_drawn(env)]
 
 
@@ -115,7 +115,7 @@ def _can_be_drawn(env: Any) -> bool:
 
 
 def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
-    """Renders the start of an episode and ``goals`` goals with the environment's camera: [1 + goals, ...] NumPy arrays.
+    """Render the start of an episode and ``goals`` goals with the environment's camera: [1 + goals, ...] NumPy arrays.
 
     Args:
         env: An environment with a camera (`MjxGoalEnv`).
@@ -136,7 +136,7 @@ def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
 
 
 def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[str]:
-    """Checks that a gallery can be drawn. Call it before the drawing, which takes a minute.
+    """Check that a gallery can be drawn. Call it before the drawing, which takes a minute.
 
     Returns:
         The environments to be drawn.
@@ -161,7 +161,7 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
 
 
 def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
-    """Writes the gallery.
+    """Write the gallery.
 
     Args:
         path: The file; its suffix determines the format.
@@ -182,7 +182,7 @@ def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, 
 
 
 def _row(env: Any, frames: Frame) -> np.ndarray:
-    """Draws the row of one environment: [H, W, 3] uint8."""
+    """Draw the row of one environment: [H, W, 3] uint8."""
     geoms, groups = env.mj_model.ngeom, []
     for index, title in ((0, "start"), (1, "goal")):
         depth = depth_colours(np.asarray(frames.depth[index]), *env.config.depth_range)

@@ -8,7 +8,7 @@ CONFIRMATIONS = 2  # further evaluations that must reach a value
 
 
 def curve(rows: Sequence[Mapping[str, Any]], metric: str) -> list[tuple[int, float]]:
-    """Computes the median over seeds of a metric against environment steps, at the steps where every seed was evaluated.
+    """Compute the median over seeds of a metric against environment steps, at the steps where every seed was evaluated.
 
     Args:
         rows: Rows of metrics.jsonl, from one run or several. No seed may appear twice at the same step.
@@ -27,7 +27,7 @@ def curve(rows: Sequence[Mapping[str, Any]], metric: str) -> list[tuple[int, flo
 
 
 def steps_to(points: Sequence[tuple[int, float]], target: float, least: bool = False) -> int | None:
-    """Returns the first step whose evaluation and the next `CONFIRMATIONS` all reach ``target``; None if there is none.
+    """Return the first step whose evaluation and the next `CONFIRMATIONS` all reach ``target``; None if there is none.
 
     Args:
         points: From `curve`.

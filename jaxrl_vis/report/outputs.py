@@ -10,7 +10,7 @@ FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
-    """Checks that a file, or files in a folder, can be written. Leaves nothing behind.
+    """Check that a file, or files in a folder, can be written, and leave nothing behind.
 
     Missing parent folders are allowed: writers create them.
 

@@ -15,7 +15,7 @@ _SUCCESS, _DISTANCE = "#0f7b6c", "#b4531f"
 
 
 def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Collects one metric as an array.
+    """Collect one metric as an array.
 
     Args:
         rows: The rows of metrics.jsonl, in any order.
@@ -34,14 +34,14 @@ def gather(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[np.ndarray, np
 
 
 def show_steps(count: float, _: int | None = None) -> str:
-    """Formats a number of steps as ``250 k`` or ``1.44 M``."""
+    """Format a number of steps as ``250 k`` or ``1.44 M``."""
     if count >= 1e6:
         return f"{count / 1e6:g} M"
     return f"{count / 1e3:g} k" if count >= 1e3 else f"{count:g}"
 
 
 def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, label: str | None = None) -> float:
-    """Draws the median over seeds as a thick line, and the middle half of the seeds as a band.
+    """Draw the median over seeds as a thick line, and the middle half of the seeds as a band.
 
     Args:
         axes: Where to draw.
@@ -66,7 +66,7 @@ def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, 
 
 
 def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) -> float:
-    """Draws the median and its band, every seed as a thin line, and a dot at the end.
+    """Draw the median and its band, every seed as a thin line, and a dot at the end.
 
     Args:
         axes: Where to draw.
@@ -115,7 +115,7 @@ def plot_run(
     unit: str = "m",
     threshold: float | None = None,
 ) -> bool:
-    """Writes the learning curve of a run.
+    """Write the learning curve of a run.
 
     Args:
         rows: The rows of metrics.jsonl.

@@ -44,25 +44,25 @@ class EpisodeImages:
 
 
 def shows_images(shape: Sequence[int]) -> bool:
-    """Returns True if frames of this shape, [episodes, steps, *observation], are images that can be shown."""
+    """Return True if frames of this shape, [episodes, steps, *observation], are images that can be shown."""
     return len(shape) == 5 and shape[2] in (1, 3, 4)
 
 
 def first_seed(images: dict[str, Any]) -> EpisodeImages:
-    """Returns the first seed's images of an evaluation, [S, K, ...] arrays on any device, on the host."""
+    """Return the first seed's images of an evaluation, [S, K, ...] arrays on any device, on the host."""
     first = {name: np.asarray(values)[0] for name, values in images.items()}
     return EpisodeImages(first["frames"], first["goals"], first["success"])
 
 
 def range_of_depth(episodes: EpisodeImages) -> tuple[float, float]:
-    """Returns the range of depth in all these images, in grey levels, without outliers."""
+    """Return the range of depth in all these images, in grey levels, without outliers."""
     depth = np.concatenate([episodes.frames[:, ::5, -1].ravel(), episodes.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
     return float(near), max(float(far), float(near) + 1.0)
 
 
 def image_rows(image: np.ndarray, depth_range: tuple[float, float]) -> list[tuple[str, np.ndarray]]:
-    """Splits an image [C, H, W] into captions and images [H, W, 3] uint8."""
+    """Split an image [C, H, W] into captions and images [H, W, 3] uint8."""
     rows = []
     if image.shape[0] >= 3:
         rows.append(("colour", np.moveaxis(image[:3], 0, -1)))
@@ -72,7 +72,7 @@ def image_rows(image: np.ndarray, depth_range: tuple[float, float]) -> list[tupl
 
 
 def enlarge(image: np.ndarray, size: int = _IMAGE_SIZE) -> Image.Image:
-    """Enlarges an image [H, W, 3] uint8 by an integer factor to about ``size`` pixels."""
+    """Enlarge an image [H, W, 3] uint8 by an integer factor to about ``size`` pixels."""
     factor = max(1, round(size / image.shape[0]))
     enlarged = (image.shape[1] * factor, image.shape[0] * factor)
     return Image.fromarray(image).resize(enlarged, Image.Resampling.NEAREST)
@@ -86,7 +86,7 @@ def _compose(
     share: float,
     colour: tuple[int, int, int],
 ) -> Image.Image:
-    """Composes one frame of the video.
+    """Compose one frame of the video.
 
     Args:
         observation: [C, H, W] uint8.
@@ -121,7 +121,7 @@ def _compose(
 
 
 def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int) -> tuple[list[Image.Image], list[float]]:
-    """Draws all frames of a video; returns them with their durations in seconds.
+    """Draw all frames of a video; return them with their durations in seconds.
 
     The border turns green where the goal is reached, and red at the end of an episode that missed it.
     """
@@ -145,7 +145,7 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
 
 
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
-    """Encodes a looping GIF. All frames share one palette, without dithering: no flicker, and good compression."""
+    """Encode a looping GIF. All frames share one palette, without dithering: no flicker, and good compression."""
     samples = images[:: max(1, len(images) // 16)] + images[-1:]
     # Swatches reserve palette entries for the colours of borders and texts, however colourful the images are.
     swatches = (REACHED, MISSED, PLAIN, BACKGROUND, TEXT, FAINT)
@@ -166,7 +166,7 @@ def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
 
 
 def _strip(episodes: EpisodeImages) -> Image.Image:
-    """Draws six steps of up to four episodes, one episode per row, with the goal at the right."""
+    """Draw six steps of up to four episodes, one episode per row, with the goal at the right."""
     num_frames = episodes.frames.shape[1]
     depth_range = range_of_depth(episodes)
     steps = sorted({round(share * (num_frames - 1)) for share in (0, 0.1, 0.2, 0.35, 0.6, 1)})
@@ -197,7 +197,7 @@ def _strip(episodes: EpisodeImages) -> Image.Image:
 
 
 def check_output(path: Path) -> None:
-    """Checks that a video can be written to ``path``. Call it before playing the episodes, which takes a minute.
+    """Check that a video can be written to ``path``. Call it before playing the episodes, which takes a minute.
 
     Raises:
         RequestError: The suffix is not one of `SUFFIXES`, it needs a package that is not installed, or the file cannot be
@@ -214,7 +214,7 @@ def check_output(path: Path) -> None:
 
 
 def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04, max_episodes: int = 6) -> None:
-    """Writes episodes as a .gif, an .mp4, an .html page with an embedded .gif, or a .png with some frames.
+    """Write episodes as a .gif, an .mp4, an .html page with an embedded .gif, or a .png with some frames.
 
     Args:
         episodes: The episodes.
@@ -236,7 +236,7 @@ def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04
 
 
 def write_images(images: list[Image.Image], seconds: list[float], path: Path, frame_seconds: float) -> None:
-    """Writes frames of equal size as a .gif, an .mp4 or an .html page with an embedded .gif.
+    """Write frames of equal size as a .gif, an .mp4 or an .html page with an embedded .gif.
 
     Args:
         images: The frames.

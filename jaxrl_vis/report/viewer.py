@@ -16,7 +16,7 @@ _HOLD = 0.6  # duration of the last step of an episode, s
 
 
 def check_page(path: Path) -> None:
-    """Checks that a page can be written to ``path``. Call it before playing the episodes.
+    """Check that a page can be written to ``path``. Call it before playing the episodes.
 
     Raises:
         RequestError: The suffix is not .html, brax is not installed, or the file cannot be written there.
@@ -45,7 +45,7 @@ class PosedEpisodes(NamedTuple):
 
 
 def play_poses(acting: Acting, train: TrainState, key: jax.Array, num_envs: int) -> PosedEpisodes:
-    """Plays an episode of the first learner in each of E environments, without exploration.
+    """Play an episode of the first learner in each of E environments, without exploration.
 
     Args:
         acting: A MuJoCo environment, and the algorithm.
@@ -61,7 +61,7 @@ def play_poses(acting: Acting, train: TrainState, key: jax.Array, num_envs: int)
 
 
 def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, out: Path) -> None:
-    """Plays ``episodes`` episodes with the first seed of a learner, and writes the page.
+    """Play ``episodes`` episodes with the first seed of a learner, and write the page.
 
     Args:
         program: `train_step.TrainStep`.

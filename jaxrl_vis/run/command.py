@@ -7,7 +7,7 @@ from jaxrl_vis.config import Config, preset
 
 
 def training_options(config: Config) -> list[str]:
-    """Returns the arguments of ``jaxrl-vis train``: the task, the preset, and the fields that differ from it."""
+    """Return the arguments of ``jaxrl-vis train``: the task, the preset, and the fields that differ from it."""
     words = [config.env, "--preset", config.preset]
     base = preset(config.preset, env=config.env, method=config.method).replace(method=preset(config.preset).method)
     for field in dataclasses.fields(Config):
@@ -23,5 +23,5 @@ def training_options(config: Config) -> list[str]:
 
 
 def training_command(config: Config) -> str:
-    """Returns the shortest command that trains with ``config``, quoted for a shell."""
+    """Return the shortest command that trains with ``config``, quoted for a shell."""
     return shlex.join(["jaxrl-vis", "train", *training_options(config)])

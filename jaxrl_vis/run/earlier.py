@@ -18,7 +18,7 @@ from jaxrl_vis.types import LoopState
 def is_finished(
     folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
 ) -> bool:
-    """Returns True if a run is complete: a valid checkpoint after ``total`` iterations, its evaluation, and its images."""
+    """Return True if a run is complete: a valid checkpoint after ``total`` iterations, its evaluation, and its images."""
     if max([0, *checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)]) < total:
         return False
     restored = checkpoints.restore_train(programs.shapes)
@@ -30,7 +30,7 @@ def is_finished(
 
 
 def without_replay(programs: Programs, restored: Restored) -> LoopState:
-    """Builds the state for resuming from a light checkpoint, which has no replay.
+    """Build the state for resuming from a light checkpoint, which has no replay.
 
     Networks, optimisers, statistics and the iteration (and with it the random draws) are restored; the replay starts empty.
     Until it has filled up again, updates sample from fewer and newer episodes: a valid run, but not a continuation of the
@@ -42,20 +42,20 @@ def without_replay(programs: Programs, restored: Restored) -> LoopState:
 
 
 def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) -> bool:
-    """Returns True if the evaluation at the restored iteration exists for all seeds and none is due."""
+    """Return True if the evaluation at the restored iteration exists for all seeds and none is due."""
     rows = [row for row in folder.rows() if row["iteration"] == restored.iteration and "eval/success" in row]
     is_due = Progress.from_dict(restored.progress).evaluation_due
     return not is_due and {row["seed"] for row in rows} >= set(seeds)
 
 
 def last_evaluation(restored: Restored) -> int:
-    """Returns the last iteration that was evaluated according to a checkpoint; 0 for none."""
+    """Return the last iteration that was evaluated according to a checkpoint; 0 for none."""
     since = restored.progress.get("since_evaluation")
     return 0 if since is None else restored.iteration - len(since)
 
 
 def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
-    """Checks that metrics.jsonl has the evaluations before a checkpoint.
+    """Check that metrics.jsonl has the evaluations before a checkpoint.
 
     Damaged lines and rows of another run may have been these evaluations, since one wrong bit makes either. So may lines that
     an earlier resumption moved to the damaged or foreign checkpoints.
@@ -76,12 +76,12 @@ def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
 
 
 def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later: bool, evaluated: int = 0) -> str | None:
-    """Truncates metrics.jsonl to the run's rows up to an iteration, see `metrics.cut_back`."""
+    """Truncate metrics.jsonl to the run's rows up to an iteration, see `metrics.cut_back`."""
     return metrics.cut_back(folder.metrics, last, checkpoints.run_id, *_asides(folder), keeps_later, evaluated)
 
 
 def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
-    """Moves other runs' files out of this folder before its run is deleted; returns lines that report it."""
+    """Move other runs' files out of this folder before its run is deleted; returns lines that report it."""
     try:
         checkpoints.run_id = read_run_id(folder.path)
     except RequestError:  # without an id, no file can be attributed
@@ -92,7 +92,7 @@ def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
 
 
 def say_foreign(path: Path) -> str:
-    """Returns a message about another run's file and its new location."""
+    """Return a message about another run's file and its new location."""
     return f"not of this run, and left out: {path}"
 
 

@@ -61,7 +61,7 @@ class Account:
         return self.done / self.begun if self.begun else 1.0
 
     def describe(self, updates: int) -> str:
-        """Formats the account as one line; ``updates``: gradient steps per iteration."""
+        """Format the account as one line; ``updates``: gradient steps per iteration."""
         if self.begun is None:
             text = "goodput unknown (processes.jsonl is damaged)"
         else:
@@ -86,7 +86,7 @@ def account(processes: Sequence[Process | None], done: int) -> Account:
 
 
 def read_processes(path: Path) -> list[Process | None]:
-    """Reads the processes of a run in order, None for a damaged line; empty if there is no file."""
+    """Read the processes of a run in order, None for a damaged line; empty if there is no file."""
     if not path.exists():
         return []
     return [_process(line) for line in path.read_bytes().splitlines() if line.strip()]
@@ -117,7 +117,7 @@ class Goodput:
         self._offset = 0
 
     def begin(self, iteration: int, replay_lost: bool) -> None:
-        """Appends a line for this process.
+        """Append a line for this process.
 
         Args:
             iteration: Iteration from which it resumes; 0 for a new run.
@@ -149,11 +149,11 @@ class Goodput:
             self.close()
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
     def account(self, done: int) -> Account:
-        """Returns the account of this run after ``done`` iterations."""
+        """Return the account of this run after ``done`` iterations."""
         return account([*self._earlier, self._own], done)

@@ -175,7 +175,7 @@ class RunLoop:
                 self._goodput.close()
 
     def _check_ours(self) -> None:
-        """Raises a `FolderGoneError` where the run folder was moved, deleted or taken over; asked before each writing."""
+        """Raise a `FolderGoneError` where the run folder was moved, deleted or taken over; asked before each writing."""
         if self._held is not None and self.has_begun:
             self._folder.check_ours(self._checkpoints.run_id, self._held)
 
@@ -204,7 +204,7 @@ class RunLoop:
     # -- Before
 
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
-        """Restores and compiles; the compiled programs by name. Nothing is written."""
+        """Restore and compile; the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
         self._say(f"{self._config.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
@@ -223,7 +223,7 @@ class RunLoop:
         return compiled
 
     def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
-        """Asks for memory once more, the last thing that can refuse the run; then makes the folder and the state ready."""
+        """Ask for memory once more, the last thing that can refuse the run; then make the folder and the state ready."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
@@ -251,7 +251,7 @@ class RunLoop:
         self._pace.begin(self._done)
 
     def _open(self, goes_on: bool, overwrite: bool) -> None:
-        """Makes the folder ready, unless it was moved or deleted since it was locked: compiling takes a while."""
+        """Make the folder ready, unless it was moved or deleted since it was locked: compiling takes a while."""
         assert self._held is not None
         self._folder.check_place(self._held)
         try:
@@ -265,7 +265,7 @@ class RunLoop:
             raise
 
     def _begin_log(self, goes_on: bool, damaged: list[Path], foreign: list[Path]) -> None:
-        """Cuts the metrics back to the iteration that the run goes on from, and opens the loggers.
+        """Cut the metrics back to the iteration that the run goes on from, and open the loggers.
 
         Args:
             goes_on: True if it does.
@@ -351,7 +351,7 @@ class RunLoop:
         return Report(iteration, iteration * env_steps, iteration * updates, values)
 
     def _read(self) -> Report:
-        """Waits for the metrics of the first iteration that are not read yet, and takes them in.
+        """Wait for the metrics of the first iteration that are not read yet, and take them in.
 
         Raises:
             NonFiniteError: A guard has counted something.
@@ -368,14 +368,14 @@ class RunLoop:
         return self._report(iteration, values)
 
     def _begin_evaluation(self) -> Pending:
-        """Evaluates the learner; `_evaluate` waits for the outcome."""
+        """Evaluate the learner; `_evaluate` waits for the outcome."""
         assert self._loop is not None
         self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)
         return self._programs.pending(outcome)
 
     def _evaluate(self, report: Report, outcome: Pending) -> Report:
-        """Reads what an evaluation has found, writes a line per seed, and adds the figures to the report."""
+        """Read what an evaluation has found, write a line per seed, and add the figures to the report."""
         progress, speed = self._progress, self._pace.speed(self._done)
         values = outcome.read_per_seed(self._config.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):
@@ -436,7 +436,7 @@ class RunLoop:
         return dataclasses.replace(self._progress, wall_s=self._progress.wall_s + time.monotonic() - self._started)
 
     def _save_and_end(self, evaluation_due: bool, interruption: Interruption) -> None:
-        """Saves everything and raises what the signal stands for."""
+        """Save everything and raise what the signal stands for."""
         assert self._loop is not None
         self._console.stop()
         self._progress.evaluation_due = evaluation_due
@@ -448,7 +448,7 @@ class RunLoop:
         interruption.end()
 
     def _stop_nonfinite(self, where: str, values: PerSeed) -> None:
-        """Dumps the state and raises NonFiniteError."""
+        """Dump the state and raise NonFiniteError."""
         assert self._loop is not None
         self._console.stop()
         self._saver.stop_nonfinite(self._loop, self._done, where, values)

@@ -18,7 +18,7 @@ class Pace:
         self.begin(0)
 
     def begin(self, done: int) -> None:
-        """Starts the clock after ``done`` iterations."""
+        """Start the clock after ``done`` iterations."""
         self.mark(done)
         self.begun, self._begun_at = done, self._marked_at
 
@@ -27,9 +27,9 @@ class Pace:
         self._marked, self._marked_at = done, time.monotonic()
 
     def speed(self, done: int) -> float:
-        """Returns environment steps per second since the last evaluation, all seeds together, updates included."""
+        """Return environment steps per second since the last evaluation, all seeds together, updates included."""
         return max(0, done - self._marked) * self._steps / max(1e-9, time.monotonic() - self._marked_at)
 
     def seconds_left(self, done: int, total: int) -> float:
-        """Returns the seconds until ``total`` iterations are done, at the average speed; at least one must be done."""
+        """Return the seconds until ``total`` iterations are done, at the average speed; at least one must be done."""
         return (total - done) * (time.monotonic() - self._begun_at) / (done - self.begun)

@@ -31,7 +31,7 @@ from jaxrl_vis.types import LoopState
 
 
 def import_saving_libraries() -> None:
-    """Imports Matplotlib and orbax, which takes a second or two, in parallel with XLA's compilation."""
+    """Import Matplotlib and orbax, which takes a second or two, in parallel with XLA's compilation."""
     for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
         importlib.import_module(name)
 
@@ -60,11 +60,11 @@ class Saver:
         self._keeps_full = programs.config.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
-        """Returns True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
+        """Return True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
         return distributed.any_process(iteration in self._checkpoints.iterations(tier))
 
     def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Saves the learner in the background.
+        """Save the learner in the background.
 
         Raises:
             NonFiniteError: The state is not finite; it was dumped instead.
@@ -77,7 +77,7 @@ class Saver:
             self._checkpoints.retire_full()
 
     def full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Saves the complete state and waits for the disk. Raises as `light`."""
+        """Save the complete state and wait for the disk. Raises as `light`."""
         self._check()
         self._refuse_nonfinite(loop, iteration)
         self._checkpoints.save_full(iteration, loop, dataclasses.asdict(progress))
@@ -87,7 +87,7 @@ class Saver:
         return self._programs.layout.mesh is None and is_cheap(self._programs.shapes.replay)
 
     def is_recent_due(self, light: bool) -> bool:
-        """Returns True if `recent` should be called after this iteration: it is cheap, and the last call was long enough ago.
+        """Return True if `recent` should be called after this iteration: it is cheap, and the last call was long enough ago.
 
         Args:
             light: A light checkpoint is about to be written, which must not be the newest one, because the run would resume
@@ -96,7 +96,7 @@ class Saver:
         return self._keeps_recent and self._checkpoints.recent.is_due(light)
 
     def recent(self, loop: LoopState, iteration: int, progress: Progress) -> None:
-        """Saves the state for resuming after a kill; see `jaxrl_vis.run.storage.recent`.
+        """Save the state for resuming after a kill; see `jaxrl_vis.run.storage.recent`.
 
         Raises:
             NonFiniteError, StorageError: As `light`.
@@ -108,7 +108,7 @@ class Saver:
         self._checkpoints.recent.save(iteration, loop, num_envs, dataclasses.asdict(progress), started)
 
     def finish(self) -> None:
-        """Waits until everything is on the disk, and deletes states that only an unfinished run needs.
+        """Wait until everything is on the disk, and delete states that only an unfinished run needs.
 
         Raises:
             StorageError: Something could not be written.
@@ -121,7 +121,7 @@ class Saver:
             self._checkpoints.recent.clear()
 
     def on_signal(self, loop: LoopState, iteration: int, progress: Progress, interruption: Interruption) -> None:
-        """Saves the learner, then the complete state. If the disk fills up in between, the light checkpoint stays, with a
+        """Save the learner, then the complete state. If the disk fills up in between, the light checkpoint stays, with a
         message.
 
         Raises:
@@ -146,7 +146,7 @@ class Saver:
         self._say(f"saved; {self.resume}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
-        """Tries to save the learner after an unexpected error; failures are not reported."""
+        """Try to save the learner after an unexpected error; failures are not reported."""
         if loop is None or iteration == 0 or any(leaf.is_deleted() for leaf in jax.tree.leaves(loop)):
             return
         with contextlib.suppress(Exception):
@@ -167,7 +167,7 @@ class Saver:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """Converts errors of the run's files into a `StorageError`; use it only around file operations."""
+        """Convert errors of the run's files into a `StorageError`; use it only around file operations."""
         try:
             yield
         except OSError as error:
@@ -175,7 +175,7 @@ class Saver:
             raise StorageError(f"cannot write to {self._folder.path} ({reason})") from error
 
     def storage_error(self, error: StorageError) -> StorageError:
-        """Extends an error of writing by the last checkpoint and the command that resumes the run."""
+        """Extend an error of writing by the last checkpoint and the command that resumes the run."""
         newest = self._checkpoints.newest()
         good = "there is no checkpoint yet" if newest is None else f"the last checkpoint is of iteration {newest}"
         cause = error.__cause__
@@ -192,7 +192,7 @@ class Saver:
     def stop_nonfinite(
         self, loop: LoopState, iteration: int, where: str, values: PerSeed, broken: list[str] | None = None
     ) -> None:
-        """Dumps the state and raises NonFiniteError."""
+        """Dump the state and raise NonFiniteError."""
         with contextlib.suppress(StorageError):
             self._checkpoints.wait()
         newest = self._checkpoints.newest()

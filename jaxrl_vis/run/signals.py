@@ -41,7 +41,7 @@ _PATIENCE_S = 10.0  # for a command to end after a signal: a compilation by XLA 
 
 
 def signal_name(number: int) -> str:
-    """Returns a signal's name for messages: ``SIGHUP``, ``SIGRTMIN+2``, or ``Ctrl-C``."""
+    """Return a signal's name for messages: ``SIGHUP``, ``SIGRTMIN+2``, or ``Ctrl-C``."""
     if number in _REAL_TIME[1:-1]:  # Python has names for the first and the last of these
         return f"SIGRTMIN+{number - _REAL_TIME[0]}"
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
@@ -49,7 +49,7 @@ def signal_name(number: int) -> str:
 
 @contextlib.contextmanager
 def shielded_children() -> Iterator[None]:
-    """Blocks `SIGNALS` in processes and threads started in this context by this thread.
+    """Block `SIGNALS` in processes and threads started in this context by this thread.
 
     `timeout`, cluster schedulers and terminals signal the whole process group. XLA compiles with child processes (ptxas): a
     signal that killed one of them would fail the compilation, while the run itself is to save and end in good order. A blocked
@@ -66,7 +66,7 @@ def shielded_children() -> Iterator[None]:
 
 
 def shield_this_thread() -> None:
-    """Blocks `SIGNALS` for the rest of this thread's life: an initializer for pools of compiling threads."""
+    """Block `SIGNALS` for the rest of this thread's life: an initializer for pools of compiling threads."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
 
@@ -98,7 +98,7 @@ class _Handlers:
 
 
 def _is_free(number: int, caught_in_c: int) -> bool:
-    """Returns True if a signal would end this process, or has a handler of this module."""
+    """Return True if a signal would end this process, or has a handler of this module."""
     handler = signal.getsignal(number)
     if handler is signal.default_int_handler or isinstance(getattr(handler, "__self__", None), _Handlers):
         return True
@@ -106,7 +106,7 @@ def _is_free(number: int, caught_in_c: int) -> bool:
 
 
 def _caught_in_c() -> int:
-    """Returns a bit mask of signals that are caught or ignored: Python does not know handlers installed by C code.
+    """Return a bit mask of signals that are caught or ignored: Python does not know handlers installed by C code.
 
     Such as those of `faulthandler.register`. Zero if there is no /proc.
     """
@@ -140,7 +140,7 @@ class Interruption(_Handlers):
         return self.signal is not None
 
     def reached_any(self) -> bool:
-        """Returns True if any process has received a signal, on which all then agree; a collective call."""
+        """Return True if any process has received a signal, on which all then agree; a collective call."""
         if number := distributed.max_over_processes(self.signal or 0):
             self.signal = number
         return bool(number)
@@ -165,12 +165,12 @@ class Interruption(_Handlers):
             self.signal = number
 
     def end(self) -> None:
-        """Raises the exception of the signal: `Terminated` or KeyboardInterrupt."""
+        """Raise the exception of the signal: `Terminated` or KeyboardInterrupt."""
         _raise(self.signal or signal.SIGTERM)
 
 
 def _ignore_half_made_loops() -> None:
-    """Silences asyncio (orbax saves with it) about an event loop that a raising handler has kept from being made."""
+    """Silence asyncio (orbax saves with it) about an event loop that a raising handler has kept from being made."""
     before = sys.unraisablehook
 
     def hook(unraisable: "sys.UnraisableHookArgs") -> None:
@@ -239,7 +239,7 @@ class Ending(_Handlers):
 
 
 def heed_parent_only() -> None:
-    """Lets a child process, in which `SIGNALS` are blocked (`shielded_children`), end only by a SIGTERM of its parent.
+    """Let a child process, in which `SIGNALS` are blocked (`shielded_children`), end only by a SIGTERM of its parent.
 
     If the system does not report the sender of a signal (macOS), any SIGTERM ends it.
     """

@@ -90,7 +90,7 @@ class Trainer:
         return self.programs.shapes
 
     def compile(self) -> dict[str, Any]:
-        """Compiles everything that a run needs, side by side; `run` does it by itself. Returns the programs by name."""
+        """Compile everything that a run needs, side by side; `run` does it by itself. Returns the programs by name."""
         return self.programs.compile()
 
     def init(self, key: jax.Array) -> LoopState:
@@ -135,7 +135,7 @@ class Trainer:
         return self.programs.evaluate(loop.train if isinstance(loop, LoopState) else loop, key)[0]
 
     def run(self) -> Iterator[Report]:
-        """Trains to the end and yields a `Report` per iteration, one iteration late.
+        """Train to the end and yield a `Report` per iteration, one iteration late.
 
         Compiles; evaluates every ``eval_interval`` iterations and at the end; writes metrics, checkpoints, the curve and the
         video into the run folder; and says on stdout what it does, which cannot fail. Signals that would end the process are
@@ -171,7 +171,7 @@ def make_trainer(
     log: Sequence[str] | None = None,
     keep_programs: bool = False,
 ) -> Trainer:
-    """Builds the environment and the programs of a configuration. Compiles, allocates and writes nothing.
+    """Build the environment and the programs of a configuration. Nothing is compiled, allocated or written.
 
     Args:
         config: The run.

@@ -26,12 +26,12 @@ _trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 
 def is_own(config: Config) -> bool:
-    """Returns True if a part of a configuration is custom code."""
+    """Return True if a part of a configuration is custom code."""
     return bool(own_names(config))
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
-    """Returns True if a run's code was trusted before and is, as far as can be told, unchanged; or if it has none.
+    """Return True if a run's code was trusted before and is, as far as can be told, unchanged; or if it has none.
 
     Raises:
         RequestError: There is no run in ``run_dir``, or a part of it is not written ``module:Name``.
@@ -41,7 +41,7 @@ def is_trusted(run_dir: Path, config: Config) -> bool:
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
-    """Stores that the custom parts of a run may be imported.
+    """Store that the custom parts of a run may be imported.
 
     Args:
         run_dir: The run folder.
@@ -62,7 +62,7 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
 
 
 def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True") -> None:
-    """Checks that the code of a run may be imported; permission by ``may`` is stored.
+    """Check that the code of a run may be imported; permission by ``may`` is stored.
 
     Args:
         run_dir: The run folder.
@@ -81,7 +81,7 @@ def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True
 
 
 def question(run_dir: Path, config: Config) -> str:
-    """Returns the question about trust, for messages."""
+    """Return the question about trust, for messages."""
     files = _files(config)
     parts = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]
     return f"the run in {run_dir} runs code that is not of this project: {', '.join(parts)}"
@@ -99,7 +99,7 @@ def _is_stored(name: str) -> bool:
 
 
 def _files(config: Config) -> dict[str, Path | None]:
-    """Locates the modules of a run's custom parts, by name, without importing anything; None if there is none."""
+    """Locate the modules of a run's custom parts, by name, without importing anything; None if there is none."""
     files = {}
     for kind, name in own_names(config).items():
         try:
@@ -110,7 +110,7 @@ def _files(config: Config) -> dict[str, Path | None]:
 
 
 def _names(run_dir: Path, config: Config) -> tuple[str, str]:
-    """Computes digests of a run and its custom parts: without, and with the current contents of their files."""
+    """Compute digests of a run and its custom parts: without, and with the current contents of their files."""
     files = _files(config)
     about = [str(run_dir.resolve()), read_run_id(run_dir), *(word for pair in files.items() for word in map(str, pair))]
     paths = {file for file in files.values() if file is not None and not _is_inside(run_dir, file)}
@@ -129,6 +129,6 @@ def _is_inside(run_dir: Path, file: Path | None) -> bool:
 
 
 def _modules_in(run_dir: Path) -> list[Path]:
-    """Lists all files below a run folder that Python could import."""
+    """List all files below a run folder that Python could import."""
     suffixes = tuple(importlib.machinery.all_suffixes())
     return sorted(path for path in run_dir.resolve().rglob("*") if path.name.endswith(suffixes) and path.is_file())

@@ -116,7 +116,7 @@ WEIGHTS = "5.6"
 
 
 def check_weights(variants: Sequence[str]) -> None:
-    """Checks that the figure `WEIGHTS` can be drawn for these variants; none selects its own.
+    """Check that the figure `WEIGHTS` can be drawn for these variants; none selects its own.
 
     Raises:
         RequestError: There are several variants, or one without learned weights.

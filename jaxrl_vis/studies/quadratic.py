@@ -43,18 +43,18 @@ class Paths(NamedTuple):
 
 
 def losses(point: jax.Array) -> dict[str, jax.Array]:
-    """Computes the three losses of a point [2]."""
+    """Compute the three losses of a point [2]."""
     main = jnp.sum(jnp.square(point))
     return {MAIN: main, "shifted": jnp.sum(jnp.square(point - 0.5)), "opposed": -main}
 
 
 def authors_rule() -> Weighting:
-    """Returns the weighting of the example."""
+    """Return the weighting of the example."""
     return make_weighting("ol_aux", interval=1, learning_rate=1.0, beta=STEP_SIZE, log=False, minimum=None, multiplicative=True)
 
 
 def descend(weighting: Weighting) -> Paths:
-    """Runs gradient descent from all starts in parallel."""
+    """Run gradient descent from all starts in parallel."""
     gradient = weighted_grad(losses, weighting)
     names = (MAIN, *AUXILIARY)
 
@@ -74,7 +74,7 @@ def descend(weighting: Weighting) -> Paths:
 
 
 def draw(path: Path) -> None:
-    """Draws the paths with fixed and adaptive weights, and the weights.
+    """Draw the paths with fixed and adaptive weights, and the weights.
 
     Args:
         path: A .png, or any other format that Matplotlib can write.

@@ -14,7 +14,7 @@ RESAMPLES = 20_000
 
 
 def interquartile_mean(scores: Sequence[np.ndarray]) -> float:
-    """Computes the mean of the middle half of all scores.
+    """Compute the mean of the middle half of all scores.
 
     Args:
         scores: One array of scores per task, [S].
@@ -23,7 +23,7 @@ def interquartile_mean(scores: Sequence[np.ndarray]) -> float:
 
 
 def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    """Computes a percentile interval of the interquartile mean; seeds are resampled within their task.
+    """Compute a percentile interval of the interquartile mean; seeds are resampled within their task.
 
     Args:
         scores: One array of scores per task, [S].
@@ -38,7 +38,7 @@ def bootstrap_interval(scores: Sequence[np.ndarray], level: float = 0.95, seed: 
 
 
 def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
-    """Computes the two-sided p-value of the difference of two means, by all permutations of seeds between the groups.
+    """Compute the two-sided p-value of the difference of two means, by all permutations of seeds between the groups.
 
     Args:
         first, second: Scores of the groups, [S] and [T]; at most ten seeds each, with 184,756 permutations.

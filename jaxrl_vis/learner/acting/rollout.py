@@ -1,4 +1,4 @@
-"""Plays whole episodes with the current policy, all environments in step.
+"""Play whole episodes with the current policy, all environments in step.
 
 reset S x E environments (each draws its goal image once)
 scan over T:  act -> advance -> observe        observations [T, S, E, ...], each kept once
@@ -127,7 +127,7 @@ def play(
     record: Callable[[State], Any] | None = None,
     draws: Draws = ONE,
 ) -> Rollout:
-    """Plays one episode in each of E environments, for each of S learners side by side.
+    """Play one episode in each of E environments, for each of S learners side by side.
 
     To the environments learners are nothing but more environments: one `jax.vmap` less means half as much to trace.
 

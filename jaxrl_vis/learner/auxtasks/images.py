@@ -70,7 +70,7 @@ def to_words(images: jax.Array) -> jax.Array:
 
 
 def from_words(words: jax.Array, channels: int) -> jax.Array:
-    """Undoes `to_words`: [B, words, H, W] uint32 -> [B, channels, H, W] uint8."""
+    """Undo `to_words`: [B, words, H, W] uint32 -> [B, channels, H, W] uint8."""
     batch, _, *size = words.shape
     apart = jnp.stack([_byte(words, byte) for byte in range(_BYTES)], axis=2)
     return apart.reshape(batch, -1, *size)[:, :channels].astype(jnp.uint8)

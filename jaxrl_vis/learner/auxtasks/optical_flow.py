@@ -51,7 +51,7 @@ def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
 
 
 def from_bytes(kept: jax.Array, stretch: bool = False) -> jax.Array:
-    """Undoes `to_bytes` but for its rounding: [...] float32."""
+    """Undo `to_bytes` but for its rounding: [...] float32."""
     return kept.astype(jnp.float32) / _scale(stretch)
 
 

@@ -39,7 +39,7 @@ def pack(observations: jax.Array) -> jax.Array:
 
 
 def unpack(observations: jax.Array) -> jax.Array:
-    """Undoes `pack`."""
+    """Undo `pack`."""
     if observations.dtype != jnp.uint32:
         return observations
     *shape, words = observations.shape
@@ -131,7 +131,7 @@ class Replay(NamedTuple):
         return ReplayState(episodes=self._stored(rollout), size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
-        """Writes the E episodes of a rollout, over the oldest ones once the ring is full.
+        """Write the E episodes of a rollout, over the oldest ones once the ring is full.
 
         Args:
             state: The replay before.
@@ -186,7 +186,7 @@ class Replay(NamedTuple):
         steps: int = 1,
         goal_episode: jax.Array | None = None,
     ) -> Batch:
-        """Reads transitions, with what is in a slot of the same episode, or of another one, as their goal.
+        """Read transitions, with what is in a slot of the same episode, or of another one, as their goal.
 
         Args:
             state: The replay.

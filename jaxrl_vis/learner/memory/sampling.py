@@ -71,7 +71,7 @@ class Sampler:
     shards: Shards = ONE
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
-        """Draws B transitions and their goals: all of them for every part of a learner, which then keeps its own.
+        """Draw B transitions and their goals: all of them for every part of a learner, which then keeps its own.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -125,7 +125,7 @@ class Sampler:
         return is_trivial & ~jax.random.bernoulli(key, self.config.trivial_goals, time.shape)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
-        """Reads what was chosen, with goals that stand still and rewards that belong to them.
+        """Read what was chosen, with goals that stand still and rewards that belong to them.
 
         Args:
             state: The replay.

@@ -22,7 +22,7 @@ def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
 
 
 def from_blocks(blocks: jax.Array, height: int, width: int) -> jax.Array:
-    """Undoes `to_blocks`: [..., blocks, 4^levels * C] -> [..., C, height, width], same dtype.
+    """Undo `to_blocks`: [..., blocks, 4^levels * C] -> [..., C, height, width], same dtype.
 
     Args:
         blocks: In nested blocks; the number of blocks and the size say how many levels there are.

@@ -184,7 +184,7 @@ class Networks:
     critic_output_bias: float
 
     def __post_init__(self) -> None:
-        """Checks the image's size, and whether it can be moved as far as it is to be.
+        """Check the image's size, and whether it can be moved as far as it is to be.
 
         Raises:
             RequestError: The image is smaller than one block of the encoder, or could be moved out of sight; or there is no
@@ -316,7 +316,7 @@ class Networks:
         return Inputs(jnp.concatenate(pieces), views)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
-        """Normalises and orders [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
+        """Normalise and order [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
 
         Images may be moved by ``shift`` [B, 2] int32, as of `Batch`. They are normalised first: what moves in is the mean.
         """

@@ -33,7 +33,7 @@ def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
 def update(
     state: NormalizerState, observations: jax.Array, axes: tuple[int, ...] = (0, 1), shards: Shards = ONE
 ) -> NormalizerState:
-    """Merges the statistics of ``observations`` [E, T+2, ...] into the running ones.
+    """Merge the statistics of ``observations`` [E, T+2, ...] into the running ones.
 
     Args:
         state: Statistics so far.

@@ -105,7 +105,7 @@ class Layout:
     def spread(
         self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, kept_as: Any = None, **options: Any
     ) -> Any:
-        """Compiles a function of one device's part so that it runs on all devices.
+        """Compile a function of one device's part so that it runs on all devices.
 
         Args:
             function: Function of one device's parts of its arguments.
@@ -138,7 +138,7 @@ class Layout:
         return jax.tree.map(placed, self.shardings(specs), shapes)
 
     def put(self, tree: Any, specs: Any) -> Any:
-        """Moves arrays to where they belong; a leaf of ``specs`` stands for a part of ``tree``."""
+        """Move arrays to where they belong; a leaf of ``specs`` stands for a part of ``tree``."""
         if self.mesh is None:
             return tree
 
@@ -170,7 +170,7 @@ class Layout:
 
 
 def put_array(array: Any, sharding: Any) -> jax.Array:
-    """Moves an array to where it belongs, which may be devices of several processes: all call this with the same array."""
+    """Move an array to where it belongs, which may be devices of several processes: all call this with the same array."""
     if sharding.is_fully_addressable or getattr(array, "sharding", None) == sharding:
         return jax.device_put(array, sharding)
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
@@ -185,7 +185,7 @@ ONE_DEVICE = Layout()
 
 
 def _avoid_shardy() -> None:
-    """Lets XLA partition programs by GSPMD where Shardy would end the process.
+    """Let XLA partition programs by GSPMD where Shardy would end the process.
 
     In jaxlib 0.11 a pass of Shardy reads past the end of a list, and so dies of a segmentation fault, where constants that a
     `jax.shard_map` closes over turn out to be unused (`ManualComputationUnusedInputsPattern`); physics models are full of them.

@@ -95,7 +95,7 @@ def check_memory(
     layout: Layout = ONE_DEVICE,
     frame_stack: int = 1,
 ) -> str:
-    """Compares what a run needs on a device with what there is.
+    """Compare what a run needs on a device with what there is.
 
     Args:
         config: The run.

@@ -19,19 +19,19 @@ def _checked(tree: Any) -> dict[str, Any]:
 
 
 def broken_leaves(loop: LoopState) -> dict[str, jax.Array]:
-    """Checks every floating-point leaf for NaN or infinity: name -> [] bool. Traceable; compiled before training starts."""
+    """Check every floating-point leaf for NaN or infinity: name -> [] bool. Traceable; compiled before training starts."""
     return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked(loop).items()}
 
 
 def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
-    """Returns parts of all episodes of the replay, [S, N, T..., values] float32."""
+    """Return parts of all episodes of the replay, [S, N, T..., values] float32."""
     episodes = {name: np.asarray(getattr(loop.replay.episodes, name)) for name in names}
     # If devices share a learner, episodes are indexed by rollout and environment (`sharding.Layout`).
     return {name: array.reshape(len(array), -1, *array.shape[-2:]) for name, array in episodes.items()}
 
 
 def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
-    """Describes the evidence that the simulation produced a non-finite number; None if there is none.
+    """Describe the evidence that the simulation produced a non-finite number; None if there is none.
 
     It did if such a number precedes the first non-finite action: what follows such an action is due to the learner.
 
@@ -60,12 +60,12 @@ def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
 
 
 def _first(is_bad: np.ndarray) -> np.ndarray:
-    """Returns the index of the first true value along the last axis; the axis' length if there is none."""
+    """Return the index of the first true value along the last axis; the axis' length if there is none."""
     return np.where(is_bad.any(-1), is_bad.argmax(-1), is_bad.shape[-1])
 
 
 def dump(file: Path, loop: LoopState, values: PerSeed, leaves: list[str]) -> None:
-    """Writes an .npz for locating the source of a non-finite number. Runs on the host only, without compilation.
+    """Write an .npz for locating the source of a non-finite number. Runs on the host only, without compilation.
 
     ``train.*``: the learner. ``episodes.*``: states and actions of up to 64 replay episodes with a non-finite number, with
     their seed_index and slot. ``metrics.*``: losses etc., [S]. ``key`` (words) and ``iteration``: the source of the next

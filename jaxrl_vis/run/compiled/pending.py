@@ -36,10 +36,10 @@ class Pending:
             self._rows.copy_to_host_async()
 
     def read(self) -> dict[str, np.ndarray]:
-        """Waits for them; [S] float32 each, by name."""
+        """Wait for them; [S] float32 each, by name."""
         return dict(zip(self._names, np.asarray(self._rows), strict=True))
 
     def read_per_seed(self, seeds: int) -> PerSeed:
-        """Waits for them; of each, one number per seed: the shortest decimal that reads back as the same float32."""
+        """Wait for them; of each, one number per seed: the shortest decimal that reads back as the same float32."""
         spread = {name: np.broadcast_to(np.asarray(row, np.float32), (seeds,)) for name, row in self.read().items()}
         return {name: [float(str(number)) for number in row] for name, row in spread.items()}

@@ -154,7 +154,7 @@ class TraceCache:
         return hashlib.sha256(self._path(name).name.encode() + b"\0" + data).digest()
 
     def _is_private(self) -> bool:
-        """Returns whether the folder is this user's alone; of one that is this user's, others' rights are taken first."""
+        """Return whether the folder is this user's alone; of one that is this user's, others' rights are taken first."""
         try:
             status = self._folder.stat()
             if stranger_to(status) is not None:

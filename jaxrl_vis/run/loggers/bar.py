@@ -20,7 +20,7 @@ Wordings = Callable[[Task, str, str], Sequence[Sequence[str]]]
 
 
 def clock(seconds: float | None) -> str:
-    """Formats a duration as ``0:07:30``, with unlimited hours; ``-:--:--`` for None."""
+    """Format a duration as ``0:07:30``, with unlimited hours; ``-:--:--`` for None."""
     if seconds is None:
         return "-:--:--"
     whole = max(0, int(seconds))
@@ -42,7 +42,7 @@ class FittingProgress(Progress):
         super().__init__(console=Console(file=file), refresh_per_second=refresh_per_second)
 
     def get_renderables(self) -> Iterable[RenderableType]:
-        """Returns one line per task."""
+        """Return one line per task."""
         for task in self.tasks:
             yield self._line(task, self.console.width)
 

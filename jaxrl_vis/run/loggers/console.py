@@ -13,13 +13,13 @@ from jaxrl_vis.run.loggers.bar import FittingProgress
 
 
 def show_shares(values: Sequence[float]) -> str:
-    """Formats shares: ``0.93`` for one seed; for several, the median and all values: ``0.93 (0.91 0.93 0.96)``."""
+    """Format shares: ``0.93`` for one seed; for several, the median and all values: ``0.93 (0.91 0.93 0.96)``."""
     median = f"{statistics.median(values):.2f}"
     return median if len(values) == 1 else f"{median} ({' '.join(f'{value:.2f}' for value in values)})"
 
 
 def show_seconds(seconds: float) -> str:
-    """Formats a duration as ``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
+    """Format a duration as ``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
     whole = round(seconds)
     if whole < 60:
         return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
@@ -59,7 +59,7 @@ class RunConsole:
         self._task = None
 
     def say(self, line: str) -> None:
-        """Prints one line."""
+        """Print one line."""
         if self._quiet:
             return
         if self._bar is not None:
@@ -68,7 +68,7 @@ class RunConsole:
             streams.say(line)
 
     def start(self, total: int, done: int) -> None:
-        """Starts the progress bar, on a terminal.
+        """Start the progress bar, on a terminal.
 
         Args:
             total: Iterations of the whole run.
@@ -82,18 +82,18 @@ class RunConsole:
         self._task = self._bar.add_task("training", total=total, completed=done, success="-", distance="-", speed="-")
 
     def advance(self, done: int, steps_per_second: float) -> None:
-        """Advances the progress bar."""
+        """Advance the progress bar."""
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, speed=f"{steps_per_second:,.0f}")
 
     def evaluated(self, success: Sequence[float], distance: Sequence[float], unit: str) -> None:
-        """Shows the latest evaluation beside the bar."""
+        """Show the latest evaluation beside the bar."""
         if self._bar is not None and self._task is not None:
             shown = f"{statistics.median(distance):.3f} {unit}"
             self._bar.update(self._task, success=f"{statistics.median(success):.2f}", distance=shown)
 
     def stop(self) -> None:
-        """Removes the progress bar."""
+        """Remove the progress bar."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

@@ -24,7 +24,7 @@ _LEAVING_S = {True: 10.0, False: 60.0}  # seconds allowed for closing a logger: 
 
 
 def check(names: Sequence[str]) -> None:
-    """Checks that loggers exist and that their libraries are installed, without importing them.
+    """Check that loggers exist and that their libraries are installed, without importing them.
 
     Raises:
         RequestError: There is no such logger, or its library is missing.
@@ -40,13 +40,13 @@ class Logger(Protocol):
     """Interface of a logger. Any method may raise any exception."""
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """Logs rows of metrics.jsonl."""
+        """Log rows of metrics.jsonl."""
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """Logs a .png or .gif drawn after ``env_steps`` steps."""
+        """Log a .png or .gif drawn after ``env_steps`` steps."""
 
     def close(self) -> None:
-        """Waits until everything is delivered."""
+        """Wait until everything is delivered."""
 
 
 class Loggers:
@@ -63,7 +63,7 @@ class Loggers:
         self._open: dict[str, Logger] = {}
 
     def open(self, record: Mapping[str, Any], seeds: Sequence[int], rows: Sequence[Row]) -> None:
-        """Opens the loggers.
+        """Open the loggers.
 
         Args:
             record: The contents of config.json.
@@ -79,18 +79,18 @@ class Loggers:
             self._try(name, begin)
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """Forwards rows to the loggers."""
+        """Forward rows to the loggers."""
         for name, logger in list(self._open.items()):
             self._try(name, lambda logger=logger: logger.rows(rows))
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """Forwards an image to the loggers, if the file exists."""
+        """Forward an image to the loggers, if the file exists."""
         if file.exists():
             for logger_name, logger in list(self._open.items()):
                 self._try(logger_name, lambda logger=logger: logger.image(name, file, env_steps))
 
     def close(self, in_a_hurry: bool = False) -> None:
-        """Closes the loggers, within a time limit: a library that waits for a network would otherwise never let the run end."""
+        """Close the loggers, within a time limit: a library that waits for a network would otherwise never let the run end."""
         for name in list(self._open):
             logger = self._open.pop(name)
             thread = threading.Thread(target=self._try, args=(name, logger.close), daemon=True)

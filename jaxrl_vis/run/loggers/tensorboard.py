@@ -53,14 +53,14 @@ class TensorBoard:
             writer.flush()
 
     def rows(self, rows: Sequence[Row]) -> None:
-        """Logs the figures of rows at their ``env_steps``."""
+        """Log the figures of rows at their ``env_steps``."""
         for row in rows:
             values = [summary_pb2.Summary.Value(tag=name, simple_value=value) for name, value in scalars(row).items()]
             self._write(row["seed"], row["env_steps"], summary=summary_pb2.Summary(value=values))
         self._flush()
 
     def image(self, name: str, file: Path, env_steps: int) -> None:
-        """Logs the unchanged file: TensorBoard plays a .gif. It goes to the first seed, whose episodes the video shows."""
+        """Log the unchanged file: TensorBoard plays a .gif. It goes to the first seed, whose episodes the video shows."""
         from PIL import Image
 
         with Image.open(file) as picture:
@@ -71,6 +71,6 @@ class TensorBoard:
         self._flush()
 
     def close(self) -> None:
-        """Closes the files."""
+        """Close the files."""
         for writer in self._writers.values():
             writer.close()

@@ -21,12 +21,12 @@ Arrays = dict[str, np.ndarray]
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """Returns the leaves of a pytree by name, such as ``actor.head.output.kernel``."""
+    """Return the leaves of a pytree by name, such as ``actor.head.output.kernel``."""
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(tree)}
 
 
 def to_host(tree: Any, copy: bool) -> Arrays:
-    """Converts the leaves of a pytree to NumPy arrays by name; typed keys to their words.
+    """Convert the leaves of a pytree to NumPy arrays by name; typed keys to their words.
 
     Args:
         tree: Arrays on a device.
@@ -52,14 +52,14 @@ def _checksum(array: np.ndarray) -> int:
 
 
 def describe(arrays: dict[str, Any]) -> dict[str, list]:
-    """Describes arrays for a manifest: shape, dtype and checksum, by name."""
+    """Describe arrays for a manifest: shape, dtype and checksum, by name."""
     if distributed.are_several():
         return _describe_parts(arrays)
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
 
 
 def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
-    """Returns the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
+    """Return the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
     if not distributed.are_several():
         return to_host(tree, copy)
     return {
@@ -69,7 +69,7 @@ def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
 
 
 def _describe_parts(arrays: dict[str, jax.Array]) -> dict[str, list]:
-    """Describes arrays distributed over processes; the last number is the count of axes for `_row_checksum`."""
+    """Describe arrays distributed over processes; the last number is the count of axes for `_row_checksum`."""
     axes = {
         name: max((n + 1 for n, on in enumerate(_partition_spec(array)) if on), default=0) for name, array in arrays.items()
     }
@@ -91,7 +91,7 @@ def _partition_spec(array: jax.Array) -> Sequence[Any]:
 
 
 def _row_checksum(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> int:
-    """Computes a checksum that is additive over parts: the sum of the rows' checksums, each seeded with the row's position.
+    """Compute a checksum that is additive over parts: the sum of the rows' checksums, each seeded with the row's position.
 
     Args:
         array: A part of an array.
@@ -108,26 +108,26 @@ def _row_checksum(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> in
 
 
 def is_intact(array: np.ndarray, described: list) -> bool:
-    """Returns True if an array matches its description in the manifest."""
+    """Return True if an array matches its description in the manifest."""
     _, _, checksum, *axes = described
     return checksum == (_row_checksum(array, axes[0]) if axes else _checksum(array))
 
 
 def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
-    """Returns True for shapes [S, rollouts, E, ...] and [S, rollouts * E, ...] of the same episodes (`sharding.Layout`)."""
+    """Return True for shapes [S, rollouts, E, ...] and [S, rollouts * E, ...] of the same episodes (`sharding.Layout`)."""
     (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
     return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
 
 
 def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
-    """Returns the restore target for orbax: an array on the first device, or one on the host to be distributed later."""
+    """Return the restore target for orbax: an array on the first device, or one on the host to be distributed later."""
     if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
         return expected
     return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))
 
 
 def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    """Returns the specs of the arrays that `to_host` makes, on the first device unless the leaves define a sharding."""
+    """Return the specs of the arrays that `to_host` makes, on the first device unless the leaves define a sharding."""
     first = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
 
     def convert(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -140,7 +140,7 @@ def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
-    """Inverts `to_host`: builds a tree like ``template``, which also defines where its arrays are placed."""
+    """Invert `to_host`: builds a tree like ``template``, which also defines where its arrays are placed."""
 
     def convert(path: Any, leaf: Any) -> jax.Array:
         array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)
@@ -158,7 +158,7 @@ def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
 
 
 def check_structure(where: Path, saved: dict[str, list], expected: dict[str, jax.ShapeDtypeStruct]) -> None:
-    """Raises RequestError, naming the first differences, if a checkpoint has other arrays than this program."""
+    """Raise RequestError, naming the first differences, if a checkpoint has other arrays than this program."""
     differences = []
     for name in sorted(set(saved) | set(expected)):
         stored = f"{saved[name][1]}{saved[name][0]}" if name in saved else "nothing"

@@ -66,13 +66,13 @@ class Restored:
 
 
 def _free(path: Path) -> Path:
-    """Returns an unused path: ``path`` itself, or the first free one of path-2, path-3, ..."""
+    """Return an unused path: ``path`` itself, or the first free one of path-2, path-3, ..."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())
 
 
 def state_without_learner(loop: LoopState) -> dict[str, Any]:
-    """Returns the part of a loop state that full checkpoints have in addition to the learner."""
+    """Return the part of a loop state that full checkpoints have in addition to the learner."""
     return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
 
 
@@ -137,13 +137,13 @@ class Checkpoints:
         return self._managers[tier]
 
     def iterations(self, tier: str) -> list[int]:
-        """Returns the iterations of this run's checkpoints in a tier, ascending, including damaged ones."""
+        """Return the iterations of this run's checkpoints in a tier, ascending, including damaged ones."""
         if tier == RECENT:
             return self.recent.iterations()
         return [iteration for iteration, is_ours in self._list(tier) if is_ours]
 
     def _list(self, tier: str) -> list[tuple[int, bool]]:
-        """Returns the iterations of a tier's checkpoints, ascending, with True for those of this run."""
+        """Return the iterations of a tier's checkpoints, ascending, with True for those of this run."""
         folder = self._folder / tier
         if not folder.is_dir():
             return []
@@ -151,7 +151,7 @@ class Checkpoints:
         return sorted((int(name), self._is_ours(folder / name)) for name in names)
 
     def _is_ours(self, checkpoint: Path) -> bool:
-        """Returns True if a checkpoint's manifest has this run's id, or cannot be read: a damaged one may be this run's."""
+        """Return True if a checkpoint's manifest has this run's id, or cannot be read: a damaged one may be this run's."""
         try:
             manifest = read_json(checkpoint / FILE)
         except RequestError:
@@ -159,11 +159,11 @@ class Checkpoints:
         return self.run_id in (ANY_RUN, manifest.get(RUN_ID))
 
     def newest(self) -> int | None:
-        """Returns the newest iteration from which the run could resume; None if there is none."""
+        """Return the newest iteration from which the run could resume; None if there is none."""
         return max((iteration for tier in _PRECEDENCE for iteration in self.iterations(tier)), default=None)
 
     def save_light(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
-        """Copies the learner to the host and writes it in the background; ``train`` may be donated once this returns.
+        """Copy the learner to the host and write it in the background; ``train`` may be donated once this returns.
 
         Args:
             iteration: Iterations completed.
@@ -173,7 +173,7 @@ class Checkpoints:
         self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
-        """Writes the complete state and waits for the disk: an asynchronous copy of the replay would need memory for two."""
+        """Write the complete state and wait for the disk: an asynchronous copy of the replay would need memory for two."""
         items = {"train": to_save(loop.train, copy=False), "rest": to_save(state_without_learner(loop), copy=False)}
         self._save(FULL, iteration, items, progress)
         self.wait()
@@ -198,7 +198,7 @@ class Checkpoints:
             self._unsummed.add((tier, iteration))
 
     def _wait(self, tier: str) -> None:
-        """Waits until a tier is on the disk, including the checksums of its files."""
+        """Wait until a tier is on the disk, including the checksums of its files."""
         self._managers[tier].wait_until_finished()
         for saved in [saved for saved in self._unsummed if saved[0] == tier]:
             folder = self._folder / tier / str(saved[1])
@@ -208,7 +208,7 @@ class Checkpoints:
 
     @contextlib.contextmanager
     def _writing(self, tier: str) -> Iterator[None]:
-        """Converts orbax's exceptions on writing into a `StorageError`."""
+        """Convert orbax's exceptions on writing into a `StorageError`."""
         try:
             yield
         except Exception as error:
@@ -221,7 +221,7 @@ class Checkpoints:
             raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
 
     def wait(self) -> None:
-        """Waits until everything is on the disk.
+        """Wait until everything is on the disk.
 
         Raises:
             StorageError: Something could not be written.
@@ -231,7 +231,7 @@ class Checkpoints:
                 self._wait(tier)
 
     def close(self) -> None:
-        """Waits for pending writes, then releases orbax's threads."""
+        """Wait for pending writes, then release orbax's threads."""
         for tier, manager in list(self._managers.items()):
             with self._writing(tier):
                 self._wait(tier)
@@ -242,7 +242,7 @@ class Checkpoints:
             self._unsilence = None
 
     def retire_full(self, has_ended: bool = False) -> None:
-        """Deletes full checkpoints older than a light one that is safely on the disk: they are no longer needed for resuming.
+        """Delete full checkpoints older than a light one that is safely on the disk: they are no longer needed for resuming.
 
         Recent states that are not kept up to date any more go likewise.
 
@@ -259,7 +259,7 @@ class Checkpoints:
                     shutil.rmtree(self._folder / FULL / str(iteration), ignore_errors=True)
 
     def set_aside_after(self, iteration: int) -> list[Path]:
-        """Moves checkpoints after ``iteration``, which are unusable, to checkpoints/damaged/.
+        """Move checkpoints after ``iteration``, which are unusable, to checkpoints/damaged/.
 
         Returns:
             Where they are now.
@@ -269,7 +269,7 @@ class Checkpoints:
         return self._move(later, DAMAGED)
 
     def set_foreign_aside(self) -> list[Path]:
-        """Moves checkpoints of other runs to checkpoints/foreign/, where they do not count towards the number that is kept.
+        """Move checkpoints of other runs to checkpoints/foreign/, where they do not count towards the number that is kept.
 
         Returns:
             Where they are now.
@@ -295,12 +295,12 @@ class Checkpoints:
         return moved
 
     def _forget(self, tier: str) -> None:
-        """Closes the tier's manager, which caches the folder's contents; the next use creates a new one."""
+        """Close the tier's manager, which caches the folder's contents; the next use creates a new one."""
         if tier in self._managers:
             self._managers.pop(tier).close()
 
     def restore_for_resume(self, template: LoopState) -> Restored | None:
-        """Restores the newest valid checkpoint of any tier, full before recent before light; None if there is none.
+        """Restore the newest valid checkpoint of any tier, full before recent before light; None if there is none.
 
         Args:
             template: Shapes and dtypes of the loop state, as from `jax.eval_shape`.
@@ -311,11 +311,11 @@ class Checkpoints:
         return self._newest_good(template, with_rest=True)
 
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
-        """Restores the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
+        """Restore the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
         return self._newest_good(template, with_rest=False, only=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
-        """Returns the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
+        """Return the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
 
         Raises:
             RequestError: The checkpoint is damaged, or of another schema.
@@ -324,7 +324,7 @@ class Checkpoints:
             return self._manifest(tier, iteration)
 
     def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
-        """Restores one checkpoint completely, and compares it with the checksums in its manifest.
+        """Restore one checkpoint completely, and compare it with the checksums in its manifest.
 
         Raises:
             RequestError: The checkpoint is damaged, or has another structure.

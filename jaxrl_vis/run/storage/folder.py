@@ -56,7 +56,7 @@ _OF_WEIGHTINGS = (
 
 
 def default_folder(config: Config) -> Path:
-    """Returns ``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
+    """Return ``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
 
     The colon of ``module:Name`` becomes a hyphen, because Windows does not allow it in file names.
     """
@@ -66,14 +66,14 @@ def default_folder(config: Config) -> Path:
 
 
 def check_there(path: Path, resume: bool) -> None:
-    """Raises a `RequestError` if a run is to be resumed in a missing folder."""
+    """Raise a `RequestError` if a run is to be resumed in a missing folder."""
     _check_run_path(path)
     if resume and not path.exists():
         raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
 
 
 def _check_run_path(path: Path) -> None:
-    """Checks that ``path`` can be a run folder: orbax accepts only names in UTF-8."""
+    """Check that ``path`` can be a run folder: orbax accepts only names in UTF-8."""
     check_path(path / "config.json")
     try:
         str(path.resolve()).encode()
@@ -130,11 +130,11 @@ class RunFolder:
         return self.path / "video.gif"
 
     def lock(self, say: Callable[[str], None] = print) -> AbstractContextManager[Held]:
-        """Returns the context that locks the folder, see `run_lock`."""
+        """Return the context that locks the folder, see `run_lock`."""
         return run_lock(self.path, say)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Reads this run's rows of metrics.jsonl, in order of iteration, without damaged ones.
+        """Read this run's rows of metrics.jsonl, in order of iteration, without damaged ones.
 
         If config.json cannot be read, these are the rows of all runs.
 
@@ -149,7 +149,7 @@ class RunFolder:
         return [row for row in rows if row.get(RUN_ID) == run_id]
 
     def check_place(self, held: Held) -> None:
-        """Checks that the folder is still in place since it was locked, before a run starts there.
+        """Check that the folder is still in place since it was locked, before a run starts there.
 
         Args:
             held: What holds the folder.
@@ -162,7 +162,7 @@ class RunFolder:
             raise FolderGoneError(_where_gone(self.path, held.current_path(), "before the run began"))
 
     def check_ours(self, run_id: str | None, held: Held) -> None:
-        """Checks that the folder still belongs to a run, before something is written into it.
+        """Check that the folder still belongs to a run, before something is written into it.
 
         Args:
             run_id: Id of the run.
@@ -181,7 +181,7 @@ class RunFolder:
             raise FolderGoneError(_where_gone(self.path, held.current_path(), when))
 
     def remove_remains(self, run_id: str | None) -> None:
-        """Deletes files that checkpoint threads have recreated in a folder after it was moved or deleted.
+        """Delete files that checkpoint threads have recreated in a folder after it was moved or deleted.
 
         A folder with other contents is left alone.
 
@@ -194,7 +194,7 @@ class RunFolder:
                 shutil.rmtree(self.path)
 
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
-        """Checks whether this folder may be used for ``config``. Changes nothing.
+        """Check whether this folder may be used for ``config``. Changes nothing.
 
         Returns:
             True if an earlier run is to be resumed, False if a new run starts.
@@ -224,7 +224,7 @@ class RunFolder:
         return True
 
     def open(self, config: Config, resume: bool = False, overwrite: bool = False, log: tuple[str, ...] = ()) -> bool:
-        """Runs `check`, then prepares the folder: with ``overwrite``, an earlier run's files are deleted, and nothing else.
+        """Run `check`, then prepare the folder: with ``overwrite``, an earlier run's files are deleted, and nothing else.
 
         Call it last, after all other checks of the request.
 
@@ -249,7 +249,7 @@ class RunFolder:
         return goes_on
 
     def _delete_run(self) -> None:
-        """Deletes a run's files, checkpoints first: after a failure, the rest is still a run.
+        """Delete a run's files, checkpoints first: after a failure, the rest is still a run.
 
         Raises:
             RequestError: Something cannot be deleted.
@@ -278,7 +278,7 @@ class RunFolder:
 
 
 def _is_remainder(checkpoint: Path, run_id: str | None) -> bool:
-    """Returns whether a checkpoint without its run's folder is half of one, or of the run ``run_id``."""
+    """Return whether a checkpoint without its run's folder is half of one, or of the run ``run_id``."""
     manifest = checkpoint / "manifest"
     try:
         is_ours = not manifest.exists() or json.loads((manifest / "metadata").read_bytes()).get(RUN_ID) == run_id
@@ -288,7 +288,7 @@ def _is_remainder(checkpoint: Path, run_id: str | None) -> bool:
 
 
 def _where_gone(path: Path, place: Path | None, when: str) -> str:
-    """Returns a message about a run folder that is not in place."""
+    """Return a message about a run folder that is not in place."""
     if place is None:
         return f"{path} is gone: it was deleted, or moved away, {when}"
     is_there = place == path.resolve()
@@ -312,7 +312,7 @@ def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[st
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Reads a run's config.json.
+    """Read a run's config.json.
 
     Raises:
         RequestError: There is no run in ``path``, or its config.json cannot be read.
@@ -330,7 +330,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def read_run_id(path: Path) -> str | None:
-    """Reads the id of the run in ``path``; None for a run of an earlier version.
+    """Read the id of the run in ``path``; None for a run of an earlier version.
 
     Raises:
         RequestError: There is no run in ``path``, or its config.json cannot be read.
@@ -342,7 +342,7 @@ def read_run_id(path: Path) -> str | None:
 
 
 def read_log(path: Path) -> tuple[str, ...]:
-    """Reads the loggers of the run in ``path``; none if there is no run."""
+    """Read the loggers of the run in ``path``; none if there is no run."""
     check_path(path)
     log = read_record(path).get("log", []) if RunFolder(path).config.exists() else []
     if not isinstance(log, list) or not all(isinstance(name, str) for name in log):
@@ -351,7 +351,7 @@ def read_log(path: Path) -> tuple[str, ...]:
 
 
 def read_config(path: Path) -> Config:
-    """Reads the configuration of the run in ``path``.
+    """Read the configuration of the run in ``path``.
 
     Raises:
         RequestError: There is no run, or another version wrote it.
@@ -363,7 +363,7 @@ def read_config(path: Path) -> Config:
 
 
 def contradictions(saved: Config, config: Config, but_for: Collection[str] = MAY_CHANGE) -> list[str]:
-    """Describes the fields in which ``config`` would learn differently from ``saved``.
+    """Describe the fields in which ``config`` would learn differently from ``saved``.
 
     Args:
         saved: The configuration of a run.
@@ -380,7 +380,7 @@ def contradictions(saved: Config, config: Config, but_for: Collection[str] = MAY
 
 
 def _check_same(path: Path, saved: Config, config: Config) -> None:
-    """Raises RequestError, naming the fields, if ``config`` would learn differently from ``saved``."""
+    """Raise RequestError, naming the fields, if ``config`` would learn differently from ``saved``."""
     differences = contradictions(saved, config)
     if differences:
         raise RequestError(

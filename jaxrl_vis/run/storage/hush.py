@@ -11,7 +11,7 @@ from typing import Any
 
 @contextlib.contextmanager
 def hushed() -> Iterator[None]:
-    """Suppresses orbax's output about a checkpoint whose error will be reported in one line."""
+    """Suppress orbax's output about a checkpoint whose error will be reported in one line."""
     absl, before = logging.getLogger("absl"), sys.unraisablehook
     disabled = absl.disabled
     absl.disabled, sys.unraisablehook = True, lambda _: None
@@ -23,7 +23,7 @@ def hushed() -> Iterator[None]:
 
 
 def silence_orbax() -> Callable[[], None]:
-    """Silences orbax and tensorstore threads about errors that they also raise; returns the function that undoes it."""
+    """Silence orbax and tensorstore threads about errors that they also raise; return the function that undoes it."""
 
     def is_not_orbax(record: logging.LogRecord) -> bool:
         return "orbax" not in record.pathname

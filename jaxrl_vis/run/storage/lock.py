@@ -56,11 +56,11 @@ class Held:
         self.is_lost = True
 
     def watch(self, path: Path) -> None:
-        """Registers a file that is itself the lock, which is lost when another file takes its place."""
+        """Register a file that is itself the lock, which is lost when another file takes its place."""
         self._marker = path, path.stat()
 
     def check(self) -> None:
-        """Checks that the lock is still held.
+        """Check that the lock is still held.
 
         Raises:
             FolderGoneError: The lock is lost.
@@ -76,7 +76,7 @@ class Held:
             )
 
     def is_in_place(self) -> bool:
-        """Returns True if the folder is still the one under its name."""
+        """Return True if the folder is still the one under its name."""
         if (self._folder / FILE_NAME).exists():
             return True
         with contextlib.suppress(OSError):  # the folder may exist with its lock file deleted by hand
@@ -84,7 +84,7 @@ class Held:
         return False
 
     def current_path(self) -> Path | None:
-        """Returns the folder's current path; None if it was deleted, or the system cannot tell."""
+        """Return the folder's current path; None if it was deleted, or the system cannot tell."""
         if self._descriptor is None:
             return None
         with contextlib.suppress(OSError):
@@ -94,14 +94,14 @@ class Held:
         return None
 
     def close(self) -> None:
-        """Closes the folder."""
+        """Close the folder."""
         if self._descriptor is not None:
             os.close(self._descriptor)
 
 
 @contextlib.contextmanager
 def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]:
-    """Locks a run folder; creates it if missing, and removes it again if it is still empty at the end.
+    """Lock a run folder; create it if missing, and remove it again if it is still empty at the end.
 
     Args:
         folder: The folder.
@@ -131,7 +131,7 @@ def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]
 
 
 def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
-    """Locks the file until the end of ``stack``; False if the file system has no locks, or its present holder found none.
+    """Lock the file until the end of ``stack``; False if the file system has no locks, or its present holder found none.
 
     Raises:
         RequestError: Another process holds it.
@@ -154,7 +154,7 @@ def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
 
 
 def _has_locks(folder: Path) -> bool:
-    """Returns True if files in a folder can be locked; tried on an anonymous file, because a lock file would seem held."""
+    """Return True if files in a folder can be locked; tried on an anonymous file, because a lock file would seem held."""
     with tempfile.TemporaryFile(dir=folder) as file:
         try:
             filelock.lock_descriptor(file.fileno(), blocking=False)
@@ -166,7 +166,7 @@ def _has_locks(folder: Path) -> bool:
 
 
 def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) -> None:
-    """Deletes the lock file, unless it was replaced, and releases the lock; on Windows in the reverse order."""
+    """Delete the lock file, unless it was replaced, and release the lock; on Windows in the reverse order."""
     if os.name == "nt":
         lock.release()
     with contextlib.suppress(OSError):
@@ -235,7 +235,7 @@ def _read(path: Path) -> str:
 
 
 def _owner(text: str) -> tuple[str, int] | None:
-    """Parses host and process from a lock file of either form."""
+    """Parse host and process from a lock file of either form."""
     with contextlib.suppress(ValueError, KeyError, TypeError):
         if not text.startswith(_MARKER):
             record = json.loads(text)
@@ -251,7 +251,7 @@ def _holder(text: str) -> str:
 
 
 def _is_alive_or_elsewhere(text: str) -> bool:
-    """Returns True if the process named by a system lock may still run; used where that lock is not available."""
+    """Return True if the process named by a system lock may still run; used where that lock is not available."""
     owner = _owner(text)
     if owner is None:
         return False

@@ -12,12 +12,12 @@ FILE = "manifest/metadata"
 
 
 def progress_in(manifest: Mapping[str, Any]) -> Any:
-    """Returns the progress in a manifest, for `Progress.from_dict`; schema 1 called it "memo"."""
+    """Return the progress in a manifest, for `Progress.from_dict`; schema 1 called it "memo"."""
     return manifest.get("progress", manifest.get("memo", {}))
 
 
 def is_manifest(value: Any) -> bool:
-    """Returns True if a value is a manifest of `checkpoint`, in all parts that are used."""
+    """Return True if a value is a manifest of `checkpoint`, in all parts that are used."""
     if not isinstance(value, dict) or not isinstance(value.get("items"), dict) or "schema" not in value:
         return False
     arrays = [entry for item in value["items"].values() for entry in (item.values() if isinstance(item, dict) else [None])]

@@ -35,7 +35,7 @@ _SHOWN = 8  # line numbers in a message
 
 
 def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
-    """Averages metrics over the iterations in ``history``, seed by seed.
+    """Average metrics over the iterations in ``history``, seed by seed.
 
     The order of summation is fixed, so that a resumed run writes the same digits as an uninterrupted one.
     """
@@ -50,7 +50,7 @@ def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed
 
 
 def with_precision(means: PerSeed) -> PerSeed:
-    """Adds the precision of the filter to ``means``: the fraction of the dropped negatives that were false; NaN if none.
+    """Add the precision of the filter to ``means``: the fraction of the dropped negatives that were false; NaN if none.
 
     This is a ratio of means, not a mean of ratios: the fraction among all dropped samples.
     """
@@ -69,7 +69,7 @@ def _nine_digits(value: float) -> float:
 def make_rows(
     seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]], run_id: str | None = None
 ) -> list[dict[str, Any]]:
-    """Makes one row per seed: seed, ``counts``, its entry of ``values``, and the run's id. Non-finite numbers become None."""
+    """Make one row per seed: seed, ``counts``, its entry of ``values``, and the run's id. Non-finite numbers become None."""
     run = {} if run_id is None else {RUN_ID: run_id}
     return [
         {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}, **run}
@@ -78,7 +78,7 @@ def make_rows(
 
 
 def scalars(row: Row) -> dict[str, float]:
-    """Returns the figures of a row by name, without those that were not finite."""
+    """Return the figures of a row by name, without those that were not finite."""
     return {name: float(value) for name, value in row.items() if name not in _PLACE and value is not None}
 
 
@@ -98,7 +98,7 @@ class Contents:
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Appends rows to the file and syncs them to the disk."""
+    """Append rows to the file and sync them to the disk."""
     _append(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
@@ -113,7 +113,7 @@ def _append(path: Path, contents: bytes) -> None:
 
 
 def read_contents(path: Path) -> Contents:
-    """Reads a metrics file, which may be damaged; empty if there is no file.
+    """Read a metrics file, which may be damaged; empty if there is no file.
 
     Raises:
         RequestError: The file cannot be read.
@@ -140,7 +140,7 @@ def read_contents(path: Path) -> Contents:
 
 
 def _read_row(line: bytes) -> dict[str, Any] | None:
-    """Parses a row; None if it is not one that a run can have written."""
+    """Parse a row; None if it is not one that a run can have written."""
     try:
         row = parse_json(line.decode("utf-8"))
     except ValueError:
@@ -163,7 +163,7 @@ def _is_figure(value: Any) -> bool:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Reads the rows of a metrics file, in order of iteration, without damaged lines; empty if there is no file.
+    """Read the rows of a metrics file, in order of iteration, without damaged lines; empty if there is no file.
 
     Raises:
         RequestError: The file cannot be read.
@@ -174,7 +174,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 def cut_back(
     path: Path, iteration: int, run_id: str | None, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
 ) -> str | None:
-    """Removes the rows after ``iteration``, which a resumed run writes again, and the rows of other runs.
+    """Remove the rows after ``iteration``, which a resumed run writes again, and the rows of other runs.
 
     Args:
         path: The file.

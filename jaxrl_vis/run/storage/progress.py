@@ -28,7 +28,7 @@ class Progress:
 
     @classmethod
     def from_dict(cls, saved: Mapping[str, Any]) -> Self:
-        """Inverts `dataclasses.asdict`; fields of other versions are ignored.
+        """Invert `dataclasses.asdict`; fields of other versions are ignored.
 
         Raises:
             ValueError: A field has another type than when it was saved.

@@ -38,7 +38,7 @@ _EPISODES = "replay.episodes."
 
 
 def is_cheap(replay: ReplayState) -> bool:
-    """Returns True if this replay (or one of these shapes) is cheap to keep up to date in files, in time and disk space."""
+    """Return True if this replay (or one of these shapes) is cheap to keep up to date in files, in time and disk space."""
     return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
 
 
@@ -65,7 +65,7 @@ class Recent:
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
 
     def is_due(self, in_any_case: bool) -> bool:
-        """Returns True if enough time has passed since the last save for saving to take only a small fraction of it.
+        """Return True if enough time has passed since the last save for saving to take only a small fraction of it.
 
         Args:
             in_any_case: Ignore the time.
@@ -73,18 +73,18 @@ class Recent:
         return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
 
     def iterations(self) -> list[int]:
-        """Returns the iterations of this run's states, ascending, including damaged ones."""
+        """Return the iterations of this run's states, ascending, including damaged ones."""
         return sorted(iteration for iteration in _numbers(self._folder, "state") if self._is_ours(iteration))
 
     def _is_ours(self, iteration: int) -> bool:
-        """Returns True if a state's header has this run's id; one that cannot be read is damaged, and may be this run's."""
+        """Return True if a state's header has this run's id; one that cannot be read is damaged, and may be this run's."""
         try:
             return self.run_id in (ANY_RUN, self._header(iteration).get(RUN_ID))
         except Unusable:
             return True
 
     def set_foreign_aside(self, to: Path) -> bool:
-        """Moves all files away if there is a state of another run; returns True if there was one."""
+        """Move all files away if there is a state of another run; return True if there was one."""
         is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
         if is_foreign:
             to.parent.mkdir(exist_ok=True)
@@ -94,7 +94,7 @@ class Recent:
     def save(
         self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
     ) -> None:
-        """Writes a state and its missing rollouts; if there is no space, this is reported, and nothing more is saved.
+        """Write a state and its missing rollouts; if there is no space, this is reported, and nothing more is saved.
 
         Args:
             iteration: Iterations completed.
@@ -146,7 +146,7 @@ class Recent:
         self._tidy()
 
     def _write_rollout(self, number: int, parts: Arrays) -> int:
-        """Writes the episodes of one rollout, arrays [S, E, ...] one after the other; returns their checksum."""
+        """Write the episodes of one rollout, arrays [S, E, ...] one after the other; return their checksum."""
         checksum = 0
         with _appearing(self._path(number, "rollout")) as file:
             for part in parts.values():
@@ -156,7 +156,7 @@ class Recent:
         return checksum
 
     def _tidy(self) -> None:
-        """Deletes all but the newest states, and older rollouts that these do not need."""
+        """Delete all but the newest states, and older rollouts that these do not need."""
         for number in self.iterations()[:-_KEPT]:
             self._path(number, "state").unlink(missing_ok=True)
         first = min(self._rollouts, default=0)
@@ -168,7 +168,7 @@ class Recent:
         self._rollouts = {number: checksum for number, checksum in self._rollouts.items() if number >= int(first)}
 
     def manifest(self, iteration: int) -> dict[str, Any]:
-        """Returns the manifest of a state: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and the run's id.
+        """Return the manifest of a state: ``iteration``, ``items`` (`arrays.describe`), ``progress``, and the run's id.
 
         Raises:
             Unusable: The state is damaged.
@@ -176,7 +176,7 @@ class Recent:
         return self._header(iteration)
 
     def restore(self, iteration: int, template: LoopState) -> tuple[LoopState, dict[str, Any]]:
-        """Restores a state, and the progress that was saved with it.
+        """Restore a state, and the progress that was saved with it.
 
         Args:
             iteration: One of `iterations`.
@@ -204,7 +204,7 @@ class Recent:
         return loop, header["progress"]
 
     def _read_rollouts(self, checksums: dict[str, int], episodes: Arrays) -> None:
-        """Fills ``episodes``, arrays [S, N, ...], from the rollouts' files."""
+        """Fill ``episodes``, arrays [S, N, ...], from the rollouts' files."""
         num_episodes = next(iter(episodes.values())).shape[1]
         for number, checksum in checksums.items():
             contents = self._read(self._path(int(number), "rollout"))
@@ -218,7 +218,7 @@ class Recent:
                 array[:, start : start + num_envs], offset = _array(contents, offset, shape, array.dtype)
 
     def resume_from(self, iteration: int | None) -> None:
-        """Prepares for resuming from the state of an iteration, and deletes later rollouts; None: from none, so deletes all."""
+        """Prepare for resuming from the state of an iteration, and delete later rollouts; None: from none, so deletes all."""
         if iteration is None:
             self.clear()
             return
@@ -228,7 +228,7 @@ class Recent:
                 self._path(number, "rollout").unlink(missing_ok=True)
 
     def _drop_unfinished(self) -> None:
-        """Deletes what belongs to no state. The states stay: nothing newer may ever find room."""
+        """Delete what belongs to no state. The states stay: nothing newer may ever find room."""
         newest = max(self.iterations(), default=0)
         with contextlib.suppress(OSError):
             for file in self._folder.iterdir():
@@ -236,12 +236,12 @@ class Recent:
                     file.unlink(missing_ok=True)
 
     def retire(self, newest: int) -> None:
-        """Deletes everything if no more states are saved and a checkpoint of iteration ``newest`` has overtaken them."""
+        """Delete everything if no more states are saved and a checkpoint of iteration ``newest`` has overtaken them."""
         if self._is_off and newest >= max(self.iterations(), default=0):
             self.clear()
 
     def clear(self) -> None:
-        """Deletes all states: a full checkpoint replaces them, or the run has ended."""
+        """Delete all states: a full checkpoint replaces them, or the run has ended."""
         self._rollouts = {}
         with contextlib.suppress(OSError):
             for file in self._folder.iterdir():
@@ -250,7 +250,7 @@ class Recent:
             self._folder.rmdir()
 
     def set_aside(self, iteration: int, to: Path) -> None:
-        """Moves the state of an iteration."""
+        """Move the state of an iteration."""
         self._path(iteration, "state").replace(to)
 
     def _header(self, iteration: int) -> dict[str, Any]:
@@ -277,7 +277,7 @@ class Recent:
 
 
 def names_of_others(folder: Path) -> list[str]:
-    """Returns the names of foreign files in a folder of recent states; empty if there is no folder."""
+    """Return the names of foreign files in a folder of recent states; empty if there is no folder."""
     kinds = (".state", ".rollout")
     entries = folder.iterdir() if folder.is_dir() else ()
     bare = {entry.name: Path(entry.name.removesuffix(".tmp")) for entry in entries}
@@ -293,7 +293,7 @@ def _numbers(folder: Path, kind: str) -> list[int]:
 
 @contextlib.contextmanager
 def _appearing(path: Path) -> Iterator[IO[bytes]]:
-    """Opens a file that gets its name when it is complete. It is not synced to the disk, see the module."""
+    """Open a file that gets its name when it is complete. It is not synced to the disk, see the module."""
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
         yield file
@@ -305,7 +305,7 @@ def _bytes(array: np.ndarray) -> memoryview:
 
 
 def _array(contents: bytes, offset: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
-    """Returns the array of a shape that begins at an offset, and the offset of its end."""
+    """Return the array of a shape that begins at an offset, and the offset of its end."""
     count = int(np.prod(shape))
     end = offset + count * np.dtype(dtype).itemsize
     if end > len(contents):

@@ -9,7 +9,7 @@ FILE_NAME = "SHA256SUMS"
 
 
 def _files(folder: Path) -> list[str]:
-    """Returns the names of all files below a folder, relative to it and sorted, without the checksums' own."""
+    """Return the names of all files below a folder, relative to it and sorted, without the checksums' own."""
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return sorted(name for name in names if name not in (FILE_NAME, f"{FILE_NAME}.tmp"))
 
@@ -20,7 +20,7 @@ def _sum(file: Path) -> str:
 
 
 def write_sums(folder: Path) -> None:
-    """Writes the checksums of all files below a folder that is not written any more.
+    """Write the checksums of all files below a folder that is not written any more.
 
     Raises:
         OSError: A file cannot be read, or the checksums cannot be written.
@@ -31,7 +31,7 @@ def write_sums(folder: Path) -> None:
 
 
 def compare_sums(folder: Path) -> list[str] | None:
-    """Lists differences between a folder and its checksums, such as ``rest/d/6e55 has changed``; None if it has no checksums.
+    """List differences between a folder and its checksums, such as ``rest/d/6e55 has changed``; None if it has no checksums.
 
     Raises:
         OSError: A file cannot be read.

@@ -24,7 +24,7 @@ SHOWN = ("autoencoder", "optical_flow", "egomotion")
 
 
 def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trust: bool = False) -> None:
-    """Plays episodes with the first seed of a run's newest valid checkpoint, and draws the predictions of its auxiliary tasks.
+    """Play episodes with the first seed of a run's newest valid checkpoint, and draw the predictions of its auxiliary tasks.
 
     Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle are shown side by
     side, as far as the run has the tasks. Predictions are those of the critic's heads.
@@ -83,7 +83,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
 
 
 def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episode: Episodes, key: jax.Array) -> dict[str, Any]:
-    """Computes the fields of `auxiliary_video.Predictions` for one episode.
+    """Compute the fields of `auxiliary_video.Predictions` for one episode.
 
     Args:
         networks: Architecture of the parameters.
@@ -121,7 +121,7 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
 
 
 def _as_image(networks: Networks, train: TrainState, values: jax.Array) -> jax.Array:
-    """Converts normalised images [T, C or 1, H, W] to grey levels, uint8."""
+    """Convert normalised images [T, C or 1, H, W] to grey levels, uint8."""
     mean, scale = networks.scaling(train.normalizer)
     height, width = values.shape[-2:]
     if values.shape[1] == mean.shape[0]:

@@ -57,7 +57,7 @@ class Policy:
         return self.env.action_size
 
     def __call__(self, observation: Any, goal: Any) -> jax.Array:
-        """Computes an action.
+        """Compute an action.
 
         Args:
             observation: Output of `GoalEnv.observe`: planar [C, H, W] uint8, or [S] float32 for state tasks.
@@ -84,7 +84,7 @@ class Policy:
         return jax.jit(act)
 
     def _check(self, name: str, value: Any) -> None:
-        """Raises a RequestError unless ``value`` has the form of an observation."""
+        """Raise a RequestError unless ``value`` has the form of an observation."""
         spec = self.observation_spec
         shape, wanted = np.shape(value), tuple(spec.shape)
         if shape != wanted:
@@ -105,7 +105,7 @@ class Policy:
 
 
 def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None, trust: bool = False) -> Policy:
-    """Loads the policy of a run, on any platform that JAX supports.
+    """Load the policy of a run, on any platform that JAX supports.
 
     Args:
         run_dir: The run folder.

@@ -16,7 +16,7 @@ from jaxrl_vis.run.trust import check as check_trusted
 
 
 def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
-    """Creates the trainer of a run on one device, with changed fields of its configuration; its folder is not modified.
+    """Create the trainer of a run on one device, with changed fields of its configuration; its folder is not modified.
 
     Args:
         run_dir: The run folder.
@@ -34,7 +34,7 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
 
 
 def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -> Restored:
-    """Loads a saved learner of a run.
+    """Load a saved learner of a run.
 
     Args:
         trainer: From `open_run`.
@@ -63,7 +63,7 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -
 def evaluate_run(
     run_dir: Path | str, episodes: int | None = None, keep_programs: bool = False, trust: bool = False
 ) -> dict[str, list[float]]:
-    """Evaluates the newest valid checkpoint of a run.
+    """Evaluate the newest valid checkpoint of a run.
 
     Args:
         run_dir: The run folder.
@@ -91,7 +91,7 @@ def play_run(
     keep_programs: bool = False,
     trust: bool = False,
 ) -> None:
-    """Plays episodes with the first seed of a run's newest valid checkpoint, and writes a video.
+    """Play episodes with the first seed of a run's newest valid checkpoint, and write a video.
 
     Args:
         run_dir: The run folder.

@@ -32,7 +32,7 @@ class Results:
         self._programs, self._folder, self._loggers, self._say = programs, folder, loggers, say
 
     def show(self, done: int, progress_now: Callable[[], Progress], recorded: dict[str, Any]) -> None:
-        """Draws the results of a finished run, and prints a summary.
+        """Draw the results of a finished run, and print a summary.
 
         Args:
             done: Iterations completed.
@@ -52,7 +52,7 @@ class Results:
         self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def draw_curve(self, done: int) -> None:
-        """Draws the evaluations up to ``done`` iterations."""
+        """Draw the evaluations up to ``done`` iterations."""
         from jaxrl_vis.report import plots
 
         config, env = self._programs.config, self._programs.env

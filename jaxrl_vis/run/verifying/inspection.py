@@ -57,7 +57,7 @@ class Expected:
 
 
 def listed(values: Iterable[Any]) -> str:
-    """Formats the first few values, and the number of the others."""
+    """Format the first few values, and the number of the others."""
     words = [str(value) for value in values]
     return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
 
@@ -71,7 +71,7 @@ def _is_figure(value: Any) -> bool:
 
 
 def _read_line(line: bytes) -> dict[str, Any] | str:
-    """Parses a row, or describes what is wrong with it."""
+    """Parse a row, or describe what is wrong with it."""
     try:
         row = json.loads(line.decode("utf-8"))
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
@@ -82,7 +82,7 @@ def _read_line(line: bytes) -> dict[str, Any] | str:
 
 
 def read_file(path: Path, expected: Expected, is_written: bool, findings: Findings) -> list[dict[str, Any]]:
-    """Reads the rows of a run from a metrics file, in the order of the file; faults of other lines are reported.
+    """Read the rows of a run from a metrics file, in the order of the file; faults of other lines are reported.
 
     Args:
         path: metrics.jsonl.
@@ -106,7 +106,7 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
 
 
 def _fault(row: Mapping[str, Any], expected: Expected) -> str:
-    """Describes a contradiction between a row and the configuration; empty if there is none."""
+    """Describe a contradiction between a row and the configuration; empty if there is none."""
     iteration = row["iteration"]
     if row.get(RUN_ID) != expected.run_id:
         return f"is another run's ({row[RUN_ID]})" if RUN_ID in row else "names no run"
@@ -145,7 +145,7 @@ def missing_rows(
     without: Collection[int],
     is_written: bool,
 ) -> list[str]:
-    """Lists required rows that are missing, as lines of text.
+    """List required rows that are missing, as lines of text.
 
     Args:
         rows: The rows of the file.
@@ -177,7 +177,7 @@ def missing_rows(
 
 
 def check_record(record: Mapping[str, Any], config: Config, findings: Findings) -> None:
-    """Reports contradictions and omissions in config.json.
+    """Report contradictions and omissions in config.json.
 
     Args:
         record: Contents of the file.
@@ -205,7 +205,7 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
 
 
 def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findings: Findings) -> None:
-    """Reports foreign files, incomplete and set aside checkpoints, and files that a finished run lacks.
+    """Report foreign files, incomplete and set aside checkpoints, and files that a finished run lacks.
 
     Args:
         folder: The run folder.

@@ -83,7 +83,7 @@ class Repeater:
         self.without_evaluation: set[int] = set()
 
     def repeat(self, name: str, begin: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]) -> None:
-        """Repeats iterations and compares the results.
+        """Repeat iterations and compare the results.
 
         Args:
             name: Name of the starting point, for messages.
@@ -114,7 +114,7 @@ class Repeater:
         self._say(f"  {line}")
 
     def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
-        """Compares the rows of an iteration with the repetition."""
+        """Compare the rows of an iteration with the repetition."""
         there = [row for row in self._rows if row["iteration"] == iteration]
         outcome, _ = self._programs.evaluate(loop.train)
         evaluated = self._programs.pending(outcome).read_per_seed(len(self._expected.seeds))
@@ -154,14 +154,14 @@ class Repeater:
         self._differ(f"iteration {iteration}, from {name}: {shown}{hint}")
 
     def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
-        """Lists candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
+        """List candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
         interval, earliest = self._expected.eval_interval, min(history, default=iteration + 1) - 1
         scheduled = max((iteration - 1) // interval * interval, earliest)
         evaluated = sorted({row["iteration"] for row in self._rows if earliest <= row["iteration"] < iteration}, reverse=True)
         return list(dict.fromkeys([scheduled, *evaluated[:_OTHER_BEGINS], earliest]))
 
     def _repeated_rows(self, iteration: int, evaluated: PerSeed, history: Sequence[PerSeed]) -> dict[int, Row]:
-        """Makes the rows that a run writes for an iteration, by seed, without the columns that are not repeated."""
+        """Make the rows that a run writes for an iteration, by seed, without the columns that are not repeated."""
         counts = {
             "iteration": iteration,
             "updates": iteration * self._expected.updates,
@@ -171,7 +171,7 @@ class Repeater:
         return {row["seed"]: row for row in metrics.make_rows(self._expected.seeds, counts, evaluated | means)}
 
     def _compare_checkpoints(self, iteration: int, mark: int | None, loop: LoopState) -> None:
-        """Compares the state with checkpoints of the same iteration by their checksums."""
+        """Compare the state with checkpoints of the same iteration by their checksums."""
         for tier in (LIGHT, FULL, RECENT):
             manifest = self._manifests.get((tier, iteration))
             if manifest is None or saved_progress(manifest).replay_lost_at != mark:
@@ -195,7 +195,7 @@ class Repeater:
 
 
 def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
-    """Yields pairs of a manifest's items and the arrays that they describe."""
+    """Yield pairs of a manifest's items and the arrays that they describe."""
     items = manifest["items"]
     if tier == RECENT:
         state = {"train": loop.train, "key": loop.key, "iteration": loop.iteration, "replay": {"size": loop.replay.size}}
@@ -207,12 +207,12 @@ def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[
 
 
 def saved_progress(manifest: Mapping[str, Any]) -> Progress:
-    """Returns the host's progress saved with a checkpoint."""
+    """Return the host's progress saved with a checkpoint."""
     return Progress.from_dict(progress_in(manifest))
 
 
 def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
-    """Returns True if a manifest has the host's progress, with the right types.
+    """Return True if a manifest has the host's progress, with the right types.
 
     Args:
         manifest: Manifest of a checkpoint.
@@ -235,7 +235,7 @@ def _compared(row: Mapping[str, Any]) -> Row:
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yields names whose values are not written identically, with both values."""
+    """Yield names whose values are not written identically, with both values."""
     compared = _compared(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
@@ -244,7 +244,7 @@ def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tu
 
 
 def _relative(value: Any, again: Any) -> float:
-    """Returns the difference of two numbers relative to the larger one; infinite if one is not a number."""
+    """Return the difference of two numbers relative to the larger one; infinite if one is not a number."""
     if not (isinstance(value, int | float) and isinstance(again, int | float)):
         return math.inf
     return abs(value - again) / max(abs(value), abs(again)) if value != again else 0.0

@@ -54,7 +54,7 @@ def verify_run(
     say: Callable[[str], None] = lambda line: None,
     trust: bool = False,
 ) -> Verification:
-    """Repeats the beginning of a run and the continuation of each full checkpoint; its folder is not modified.
+    """Repeat the beginning of a run and the continuation of each full checkpoint; its folder is not modified.
 
     Args:
         run_dir: The run folder; the run may still be in progress.
@@ -91,7 +91,7 @@ def verify(
     report: Verification,
     say: Callable[[str], None],
 ) -> Verification:
-    """Verifies a run with an existing trainer of its configuration and the contents of its config.json."""
+    """Verify a run with an existing trainer of its configuration and the contents of its config.json."""
     return _Verifier(trainer, RunFolder(path), record, report, say).verify(iterations)
 
 
@@ -115,7 +115,7 @@ class _Verifier:
         self._rows: list[Row] = []
 
     def verify(self, iterations: int | None) -> Verification:
-        """Runs all checks, see `verify_run`."""
+        """Run all checks, see `verify_run`."""
         try:
             self._say_origin()
             is_written = (self._folder.path / LOCK_NAME).exists()
@@ -174,11 +174,11 @@ class _Verifier:
         )
 
     def _is_there(self, tier: str, number: int) -> bool:
-        """Returns True if a checkpoint still exists: the run itself deletes all but the newest two."""
+        """Return True if a checkpoint still exists: the run itself deletes all but the newest two."""
         return (self._folder.checkpoints / tier / str(number)).is_dir()
 
     def _read_manifests(self) -> None:
-        """Reads and checks all checkpoints, except the arrays of full ones, which are checked when they are restored."""
+        """Read and check all checkpoints, except the arrays of full ones, which are checked when they are restored."""
         problems = self._report.problems
         for tier, number in self._names():
             name = f"checkpoint {tier}/{number}"
@@ -202,7 +202,7 @@ class _Verifier:
                 self._manifests[tier, number] = manifest
 
     def _read_recent(self) -> None:
-        """Reads and checks recent states. They are not synced to the disk, so a power cut can leave a damaged one."""
+        """Read and check recent states. They are not synced to the disk, so a power cut can leave a damaged one."""
         recent = self._checkpoints.recent
         for number in recent.iterations():
             name = f"{RECENT}/{number}"
@@ -217,7 +217,7 @@ class _Verifier:
                 self._manifests[RECENT, number] = manifest
 
     def _check_manifest(self, name: str, number: int, manifest: Mapping[str, Any]) -> bool:
-        """Returns True if a manifest belongs to this run and its checkpoint's iteration; reports errors."""
+        """Return True if a manifest belongs to this run and its checkpoint's iteration; reports errors."""
         problems = self._report.problems
         if manifest.get("iteration") != number:
             problems.append(f"checkpoint {name} says that it is of iteration {manifest.get('iteration')}")
@@ -230,7 +230,7 @@ class _Verifier:
         return False
 
     def _check_presence(self, is_written: bool) -> None:
-        """Reports a lack of checkpoints although the run is far enough to have one."""
+        """Report a lack of checkpoints although the run is far enough to have one."""
         last = max((row["iteration"] for row in self._rows), default=0)
         interval = self._config.checkpoint_interval
         # An evaluation's rows are written before the checkpoint of the same iteration.
@@ -241,7 +241,7 @@ class _Verifier:
     # -- Repeating
 
     def _repeat_all(self, iterations: int | None) -> Repeater:
-        """Repeats the run from the seed, and from each full checkpoint."""
+        """Repeat the run from the seed, and from each full checkpoint."""
         programs, seed = self._programs, Progress()
         repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._say)
         compared_iterations = self._plan(0, seed, iterations)
@@ -256,7 +256,7 @@ class _Verifier:
         return repeater
 
     def _repeat_after(self, number: int, repeater: Repeater, iterations: int | None) -> None:
-        """Repeats the run from a full checkpoint; a damaged one is reported."""
+        """Repeat the run from a full checkpoint; a damaged one is reported."""
         manifest = self._manifests[FULL, number]
         try:
             restored = self._checkpoints.restore(FULL, manifest, self._programs.shapes)
@@ -287,7 +287,7 @@ class _Verifier:
         check_compiled(self._programs.compile(), already_there=False, layout=layout)
 
     def _plan(self, begin: int, progress: Progress, iterations: int | None) -> list[int]:
-        """Lists iterations whose rows can be repeated from a state after ``begin`` iterations."""
+        """List iterations whose rows can be repeated from a state after ``begin`` iterations."""
         mark, first = progress.replay_lost_at, begin if progress.evaluation_due else begin + 1
         # Up to the next loss of the replay: what follows it started from a state that was not saved.
         losses = [row[LOST] for row in self._rows if LOST in row and row[LOST] != mark and row[LOST] >= begin]
@@ -299,7 +299,7 @@ class _Verifier:
         return near or compared_iterations[:1]
 
     def _say_rest(self, repeated: set[int]) -> None:
-        """Reports rows and checkpoints that no repetition has reached."""
+        """Report rows and checkpoints that no repetition has reached."""
         unverified = self._report.unverified
         rest = [row["iteration"] for row in self._rows if row["iteration"] not in repeated]
         if rest:

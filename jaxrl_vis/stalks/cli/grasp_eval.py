@@ -80,7 +80,7 @@ def _check(options: Eval) -> None:
 
 
 def evaluate(options: Eval) -> int:
-    """Prints the figures."""
+    """Print the figures."""
     _check(options)
     if options.policy is not None:
         check_run(options.policy)

@@ -73,7 +73,7 @@ class GraspsFigure(_Figure):
 
 
 def draw_perception(options: PerceptionFigure) -> int:
-    """Draws figure 4.4."""
+    """Draw figure 4.4."""
     out = options.check()
     from jaxrl_vis.stalks.grasping.masks.loading import load_painter, resolve_weights
     from jaxrl_vis.stalks.grasping.report.perception_figure import draw_figure
@@ -87,7 +87,7 @@ def draw_perception(options: PerceptionFigure) -> int:
 
 
 def draw_path(options: PathFigure) -> int:
-    """Draws figure 4.5, and the video."""
+    """Draw figure 4.5, and the video."""
     check_wind(options.wind)
     if options.video is not None:
         from jaxrl_vis.report.videos import check_output
@@ -108,7 +108,7 @@ def draw_path(options: PathFigure) -> int:
 
 
 def draw_grasps(options: GraspsFigure) -> int:
-    """Draws figure 4.6, from an evaluation, or after one."""
+    """Draw figure 4.6, from an evaluation, or after one."""
     check_wind(options.wind)
     out = options.check()
     from jaxrl_vis.stalks.grasping.report import reach_figures

@@ -34,7 +34,7 @@ class Run(CameraOptions):
 
 
 def run(options: Run) -> int:
-    """Writes tables and overlays."""
+    """Write tables and overlays."""
     check_speed(options.speed)
     if not 0.05 <= options.height <= 3.0:
         raise RequestError(f"--height must be from 0.05 to 3 m, not {options.height:g}")

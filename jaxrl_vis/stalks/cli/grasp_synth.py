@@ -18,7 +18,7 @@ class Synth(SynthOptions):
 
 
 def synth(options: Synth) -> int:
-    """Writes the runs."""
+    """Write the runs."""
     check_counts(runs=options.runs)
     options.check()
     check_extra("grasping")

@@ -32,7 +32,7 @@ class Train(TrainingOptions):
 
 
 def train(options: Train) -> int:
-    """Trains the network and writes its weights."""
+    """Train the network and write its weights."""
     check_counts(crop=options.crop)
     options.check()
     if options.crop % 64:

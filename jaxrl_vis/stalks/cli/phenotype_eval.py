@@ -37,7 +37,7 @@ class Eval(EvaluationOptions):
 
 
 def evaluate(options: Eval) -> int:
-    """Prints the figures."""
+    """Print the figures."""
     check_counts(plots=options.plots)
     options.check()
     if not 0.0 <= options.least_score <= 1.0:

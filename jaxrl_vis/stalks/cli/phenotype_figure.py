@@ -33,7 +33,7 @@ class Figure:
 
 
 def draw(options: Figure) -> int:
-    """Draws one figure."""
+    """Draw one figure."""
     is_table = options.figure == "table3.1"
     suffixes = (".md",) if is_table else FIGURE_SUFFIXES
     out = options.out or Path("table_3.1.md" if is_table else f"figure_{options.figure}.png")

@@ -44,7 +44,7 @@ class Run(CameraOptions):
 
 
 def run(options: Run) -> int:
-    """Writes tables and overlays."""
+    """Write tables and overlays."""
     if not 0.0 <= options.least_score <= 1.0:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
     check_speed(options.speed)

@@ -25,7 +25,7 @@ class Synth(SynthOptions):
 
 
 def synth(options: Synth) -> int:
-    """Writes the plots."""
+    """Write the plots."""
     check_counts(plots=options.plots)
     options.check()
     check_extra("phenotyping")
@@ -39,7 +39,7 @@ def synth(options: Synth) -> int:
 def write_synthetic(
     options: SynthOptions, family: "Family", count: int, truth: Literal["all", "boxes", "none"], noun: str
 ) -> None:
-    """Writes plots and prints a line about them.
+    """Write plots and print a line about them.
 
     Args:
         options: Folder, image format and first seed.

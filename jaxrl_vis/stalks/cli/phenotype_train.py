@@ -40,7 +40,7 @@ class Train(TrainingOptions):
 
 
 def train(options: Train) -> int:
-    """Trains the networks and writes their weights."""
+    """Train the networks and write their weights."""
     check_counts(snips=options.snips)
     options.check()
     drawn = (options.family, options.shift, options.spec, options.frames, options.width)

@@ -16,7 +16,7 @@ _SHORT_NAME = 20
 
 @contextlib.contextmanager
 def progress(unit: str) -> Iterator[Done]:
-    """Shows the progress of a command.
+    """Show the progress of a command.
 
     Args:
         unit: Unit of progress, in the plural.

@@ -96,7 +96,7 @@ class Request:
 
 
 def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
-    """Writes the results of runs.
+    """Write the results of runs.
 
     Args:
         runs: Folders of pairs.

@@ -85,7 +85,7 @@ def run(
     workers: int = 1,
     say: Callable[[str, str], None] = lambda plot, why: None,
 ) -> tuple[list[Row], list[Row]]:
-    """Writes the results of plots.
+    """Write the results of plots.
 
     Args:
         plots: Folders of pairs.
@@ -214,7 +214,7 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
 def _finish(
     plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, run_all: UnorderedMap
 ) -> PlotResult:
-    """Follows the stalks of a plot, and draws its overlays."""
+    """Follow the stalks of a plot, and draw its overlays."""
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
     skipped = len(records) - len(usable)
     frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
@@ -246,7 +246,7 @@ def _draw_overlays(
     labels: list[list[str | None]],
     run_all: UnorderedMap,
 ) -> None:
-    """Writes the overlays of a plot that are missing or show something else."""
+    """Write the overlays of a plot that are missing or show something else."""
     folder.mkdir(parents=True, exist_ok=True)
     index = folder / "drawn.json"
     shown = {pair.name: value_digest([record, names]) for (pair, record), names in zip(usable, labels)}
@@ -272,7 +272,7 @@ def _draw_overlays(
 
 
 def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
-    """Writes the overlay of one pair."""
+    """Write the overlay of one pair."""
     target, pair, frame, names = asked
     write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
 

@@ -46,7 +46,7 @@ class Cell:
 
 
 def show_budget(steps: int) -> str:
-    """Formats a number of steps as ``250k`` or ``2.5M``; with all digits if that would round."""
+    """Format a number of steps as ``250k`` or ``2.5M``; with all digits if that would round."""
     for size, letter in ((10**6, "M"), (10**3, "k")):
         if steps >= size and steps % (size // 100) == 0:
             return f"{steps / size:g}{letter}"
@@ -54,7 +54,7 @@ def show_budget(steps: int) -> str:
 
 
 def split_seeds(cell: Cell, count: int) -> list[Cell]:
-    """Splits a cell into cells of at most ``count`` seeds, for devices with too little memory for all of them.
+    """Split a cell into cells of at most ``count`` seeds, for devices with too little memory for all of them.
 
     Their families end in the seeds.
     """
@@ -71,7 +71,7 @@ def split_seeds(cell: Cell, count: int) -> list[Cell]:
 
 
 def find_folder(cell: Cell, runs: Path) -> Path:
-    """Finds the folder of a cell: a longer run of its family that has come far enough, or else the cell's own."""
+    """Find the folder of a cell: a longer run of its family that has come far enough, or else the cell's own."""
     own = runs / cell.name
     if _reached(own, cell) is not None or not runs.is_dir():
         return own
@@ -88,7 +88,7 @@ def find_folder(cell: Cell, runs: Path) -> Path:
 
 
 def _reached(folder: Path, cell: Cell) -> int | None:
-    """Returns the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one."""
+    """Return the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one."""
     steps: dict[int, set[int]] = {}
     for row in RunFolder(folder).rows():
         if row["env_steps"] >= cell.config.env_steps and "eval/success" in row:
@@ -97,7 +97,7 @@ def _reached(folder: Path, cell: Cell) -> int | None:
 
 
 def differences(cell: Cell, runs: Path) -> list[str]:
-    """Describes settings in which the cell's run differs; empty if there is no difference, or no run yet.
+    """Describe settings in which the cell's run differs; empty if there is no difference, or no run yet.
 
     Raises:
         RequestError: Its config.json cannot be read.
@@ -107,7 +107,7 @@ def differences(cell: Cell, runs: Path) -> list[str]:
 
 
 def contradiction(cell: Cell, runs: Path) -> str | None:
-    """Returns why a cell's folder cannot be used for it, in one line; None if it can, or does not exist yet."""
+    """Return why a cell's folder cannot be used for it, in one line; None if it can, or does not exist yet."""
     folder, mend = find_folder(cell, runs), "move it away, or choose another --runs"
     try:
         changes = differences(cell, runs)
@@ -117,12 +117,12 @@ def contradiction(cell: Cell, runs: Path) -> str | None:
 
 
 def is_finished(cell: Cell, runs: Path) -> bool:
-    """Returns True if a cell is completely trained and evaluated."""
+    """Return True if a cell is completely trained and evaluated."""
     return _reached(find_folder(cell, runs), cell) is not None and contradiction(cell, runs) is None
 
 
 def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, Any]]:
-    """Reads the evaluations of a finished cell, up to its end, from metrics.jsonl; empty if it is not finished.
+    """Read the evaluations of a finished cell, up to its end, from metrics.jsonl; empty if it is not finished.
 
     Args:
         cell: The cell.
@@ -137,7 +137,7 @@ def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[s
 
 
 def describe_progress(cell: Cell, runs: Path) -> str:
-    """Describes the progress of an unfinished cell: ``not begun``, or ``120k of 250k steps``."""
+    """Describe the progress of an unfinished cell: ``not begun``, or ``120k of 250k steps``."""
     reason = contradiction(cell, runs)
     if reason is not None:
         return reason
@@ -148,7 +148,7 @@ def describe_progress(cell: Cell, runs: Path) -> str:
 
 
 def latest_rows(folder: Path) -> Sequence[dict[str, Any]]:
-    """Returns the rows of a run's last evaluation, one per seed; none before the first."""
+    """Return the rows of a run's last evaluation, one per seed; none before the first."""
     rows = RunFolder(folder).rows()
     last = max((row["env_steps"] for row in rows), default=0)
     return [row for row in rows if row["env_steps"] == last]

@@ -36,7 +36,7 @@ class Training:
         self._folder, self._child = Path.cwd(), None
 
     def __call__(self) -> int:
-        """Trains, and returns the command's exit status."""
+        """Train, and return the command's exit status."""
         words = list(self._words)
         run_dir = self._folder / words[words.index("--run-dir") + 1] if "--run-dir" in words else None
         if "--resume" not in words and run_dir is not None and (run_dir / "config.json").exists():
@@ -53,7 +53,7 @@ class Training:
                 signal.signal(signal.SIGTERM, before)
 
     def checkpoint(self) -> Any:
-        """Stops the run before the job is ended and queued again; called by submitit."""
+        """Stop the run before the job is ended and queued again; called by submitit."""
         import submitit
 
         self._terminate_child()
@@ -82,7 +82,7 @@ class Job:
         self.returncode, self._is_cancelled = None, False
 
     def poll(self) -> int | None:
-        """Returns the exit status; None while the job is queued or running."""
+        """Return the exit status; None while the job is queued or running."""
         if self.returncode is None and self._job.done():
             self.returncode = -signal.SIGTERM if self._is_cancelled else _FAILED
             with contextlib.suppress(Exception):  # a cancelled or lost job has no result
@@ -90,7 +90,7 @@ class Job:
         return self.returncode
 
     def send_signal(self, _: int) -> None:
-        """Cancels the job: the run saves and ends."""
+        """Cancel the job: the run saves and ends."""
         self._is_cancelled = True
         if self._is_local:  # cancelling would kill it a second later
             with contextlib.suppress(ProcessLookupError):
@@ -99,12 +99,12 @@ class Job:
             self._job.cancel()
 
     def kill(self) -> None:
-        """Cancels the job at once, as a cluster does."""
+        """Cancel the job at once, as a cluster does."""
         self._is_cancelled = True
         self._job.cancel()
 
     def wait(self, timeout: float | None = None) -> int:
-        """Waits for the job to end.
+        """Wait for the job to end.
 
         Raises:
             subprocess.TimeoutExpired: It still runs.

@@ -44,19 +44,19 @@ class Process(Protocol):
     returncode: Any
 
     def poll(self) -> int | None:
-        """Returns the exit status; None while the process runs."""
+        """Return the exit status; None while the process runs."""
         ...
 
     def send_signal(self, sig: int, /) -> None:
-        """Sends a signal to the process."""
+        """Send a signal to the process."""
         ...
 
     def wait(self, timeout: float | None = None) -> int:
-        """Waits for the process to end."""
+        """Wait for the process to end."""
         ...
 
     def kill(self) -> None:
-        """Kills the process."""
+        """Kill the process."""
         ...
 
 
@@ -65,7 +65,7 @@ Start = Callable[[Sequence[str], Path, Mapping[str, str]], Process]
 
 
 def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> Process:
-    """Runs a command on this machine. See `cluster` for others."""
+    """Run a command on this machine. See `cluster` for others."""
     # In its own session, so that a Ctrl-C of the terminal reaches it only once, from here: a second signal would end it at
     # once.
     with log.open("a", encoding="utf-8") as file:
@@ -76,7 +76,7 @@ def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str
 
 
 def train_command(cell: Cell, folder: Path, resume: bool) -> list[str]:
-    """Returns the command that trains a cell."""
+    """Return the command that trains a cell."""
     words = [sys.executable, "-m", "jaxrl_vis", "train", *training_options(cell.config), "--run-dir", str(folder)]
     return [*words, "--resume"] if resume else words
 
@@ -99,7 +99,7 @@ def run_cells(
     say: Callable[[str], None] = streams.say,
     start: Start = start_process,
 ) -> list[str]:
-    """Trains unfinished cells; resumes those already started.
+    """Train unfinished cells; resumes those already started.
 
     Args:
         cells: Cells to train: longest first, so that devices finish at about the same time, otherwise in this order.
@@ -143,7 +143,7 @@ def run_cells(
 
 
 def _work(cell: Cell) -> float:
-    """Estimates the relative duration of a cell: a gradient step with auxiliary losses takes about three times as long."""
+    """Estimate the relative duration of a cell: a gradient step with auxiliary losses takes about three times as long."""
     return cell.config.env_steps * cell.config.seeds * (3.0 if cell.config.aux_tasks else 1.0)
 
 
@@ -228,7 +228,7 @@ class _Grid:
                 running.process.send_signal(signal.SIGTERM)
 
     def _end_at_once(self) -> None:
-        """Ends all processes, after any error; does nothing if all have ended."""
+        """End all processes, after any error; does nothing if all have ended."""
         self._signal()
         deadline = time.monotonic() + _GRACE_S
         for running in self._running:

@@ -55,18 +55,18 @@ class Line:
         return self.end / max(1, max(row["updates"] for row in self.rows))
 
     def values(self, metric: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns env_steps [P] and the metric [S, P]."""
+        """Return env_steps [P] and the metric [S, P]."""
         return gather(self.rows, metric)
 
     def has_lost_replay(self) -> bool:
-        """Returns True if a run was resumed without its replay, and so deviates from an uninterrupted one."""
+        """Return True if a run was resumed without its replay, and so deviates from an uninterrupted one."""
         return any("resume/replay_lost_at" in row for row in self.rows)
 
 
 def read_lines(
     cells: Mapping[tuple[str, str], Sequence[Cell]], runs: Path, as_they_are: bool = False
 ) -> tuple[dict[tuple[str, str], Line], list[str]]:
-    """Reads the lines of finished cells, and lists unfinished ones.
+    """Read the lines of finished cells, and list unfinished ones.
 
     Args:
         cells: (task, variant) -> the runs of a line.
@@ -121,7 +121,7 @@ class Reached:
     budget: int
 
     def ratio(self, other: "Reached") -> str:
-        """Formats the ratio of the other's steps to these: ``2.0``, or a bound if one of them did not reach the level."""
+        """Format the ratio of the other's steps to these: ``2.0``, or a bound if one of them did not reach the level."""
         if self.steps and other.steps:
             return f"{other.steps / self.steps:.1f}"
         if self.steps:
@@ -129,7 +129,7 @@ class Reached:
         return f"< {other.steps / self.budget:.1f}" if other.steps else "–"
 
     def __str__(self) -> str:
-        """Formats the steps as ``120 k (100 k to 140 k)``, or ``> 250 k`` if the level was not reached."""
+        """Format the steps as ``120 k (100 k to 140 k)``, or ``> 250 k`` if the level was not reached."""
         if self.steps is None:
             return f"> {show_steps(self.budget)}"
         if self.low is None:
@@ -139,7 +139,7 @@ class Reached:
 
 
 def reached(line: Line, level: float) -> Reached:
-    """Finds the steps at which a line reached a level."""
+    """Find the steps at which a line reached a level."""
     median = steps_to(line.points, level)
     if len(line.seeds) == 1:
         return Reached(level, median, None, None, line.end)
@@ -151,19 +151,19 @@ def reached(line: Line, level: float) -> Reached:
 
 
 def mean_success(line: Line, up_to: int) -> float:
-    """Averages the median success over all evaluations up to a number of environment steps; 0.0 if there are none."""
+    """Average the median success over all evaluations up to a number of environment steps; 0.0 if there are none."""
     values = [success for steps, success in line.points if steps <= up_to]
     return float(np.mean(values)) if values else 0.0
 
 
 def final(line: Line, metric: str = SUCCESS) -> tuple[float, float, float]:
-    """Computes quartiles over seeds of a metric at the end: 25 %, median, 75 %."""
+    """Compute quartiles over seeds of a metric at the end: 25 %, median, 75 %."""
     values = [row[metric] for row in line.rows if row["env_steps"] == line.end and row.get(metric) is not None]
     return _quartiles(values)
 
 
 def area(line: Line) -> tuple[float, float, float]:
-    """Computes quartiles over seeds of the mean success over all evaluations, the area under the curve: 25 %, median, 75 %."""
+    """Compute quartiles over seeds of the mean success over all evaluations, the area under the curve: 25 %, median, 75 %."""
     return _quartiles([float(np.nanmean(row)) for row in line.values(SUCCESS)[1]])
 
 
@@ -173,7 +173,7 @@ def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def mean_weight(line: Line, name: str) -> float:
-    """Averages the weight of an auxiliary loss over training, in the median over seeds; NaN if none was logged."""
+    """Average the weight of an auxiliary loss over training, in the median over seeds; NaN if none was logged."""
     _, values = line.values(f"train/weight/{name}")
     per_seed = [np.nanmean(row) for row in values if np.isfinite(row).any()]
     return float(np.median(per_seed)) if per_seed else float("nan")

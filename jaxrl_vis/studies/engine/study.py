@@ -103,7 +103,7 @@ _LONGEST = 1_500_000  # environment steps of a task without a budget in the stud
 
 
 def make_cells(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
-    """Makes the cells of a study, task after task.
+    """Make the cells of a study, task after task.
 
     Raises:
         RequestError: There is no such task or variant, or a configuration is invalid.

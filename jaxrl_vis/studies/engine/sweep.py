@@ -49,7 +49,7 @@ class Request:
 
 
 def make_cells(request: Request) -> list[Cell]:
-    """Makes the cells of a sweep, task after task.
+    """Make the cells of a sweep, task after task.
 
     Raises:
         RequestError: A configuration is invalid.
@@ -66,7 +66,7 @@ def make_cells(request: Request) -> list[Cell]:
 
 
 def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> bool:
-    """Trains missing cells, resumes unfinished ones, and prints a table.
+    """Train missing cells, resumes unfinished ones, and print a table.
 
     Returns:
         True if everything is finished.
@@ -90,7 +90,7 @@ def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> boo
 
 
 def _table(cells: Sequence[Cell], runs: Path) -> tuple[list[str], list[str]]:
-    """Formats lines about finished and about unfinished cells."""
+    """Format lines about finished and about unfinished cells."""
     results: dict[tuple[str, str], dict[int, float]] = {}
     unfinished = []
     for cell in cells:

@@ -12,7 +12,7 @@ _VARIANTS = {"NoAux": "none", "OL-AUX-5": "ol_aux_5"}
 
 
 def released_curves() -> dict[tuple[str, str], list[tuple[int, float]]]:
-    """Reads the curves: (environment, variant) -> (environment steps, success), ascending; both under this project's names."""
+    """Read the curves: (environment, variant) -> (environment steps, success), ascending; both under this project's names."""
     text = importlib.resources.files("jaxrl_vis.studies").joinpath(_FILE).read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     curves: dict[tuple[str, str], list[tuple[int, float]]] = {}
@@ -23,7 +23,7 @@ def released_curves() -> dict[tuple[str, str], list[tuple[int, float]]]:
 
 
 def mean_difference(ours: Sequence[tuple[int, float]], theirs: Sequence[tuple[int, float]]) -> float | None:
-    """Computes the mean absolute difference of two curves, at the points of the second one within the range of the first.
+    """Compute the mean absolute difference of two curves, at the points of the second one within the range of the first.
 
     Args:
         ours: (environment steps, success), ascending; interpolated linearly.

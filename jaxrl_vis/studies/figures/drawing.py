@@ -72,7 +72,7 @@ class Picture:
 
 
 def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> None:
-    """Writes a figure.
+    """Write a figure.
 
     Args:
         path: A .png, or any other format that Matplotlib can write.
@@ -83,7 +83,7 @@ def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitl
 
 
 def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figure:
-    """Composes a figure of panels with one legend.
+    """Compose a figure of panels with one legend.
 
     Args:
         rows: Panels, row by row; all rows have the same length.

@@ -30,7 +30,7 @@ _ORACLE_WORKS: dict[str, tuple[str, float]] = {
 
 
 def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Makes the content of a figure from its lines."""
+    """Make the content of a figure from its lines."""
 
     def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:
         return [Panel(f"{task}: {title}", _curves(lines, task, variants, metric), is_share) for task in tasks]
@@ -58,7 +58,7 @@ def _curves(lines: Mapping[tuple[str, str], Line], task: str, variants: Sequence
 
 
 def _values(line: Line, metric: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns env_steps [P] and the metric [S, P]; precision is NaN where the filter is inactive, as in the tables."""
+    """Return env_steps [P] and the metric [S, P]; precision is NaN where the filter is inactive, as in the tables."""
     steps, values = line.values(metric)
     if metric == _PRECISION:
         values = np.where(line.values(_FILTERED)[1] >= _ACTIVE, values, np.nan)
@@ -85,7 +85,7 @@ Quartiles = tuple[float, float, float]
 
 
 def _figures(line: Line) -> dict[str, Quartiles | float]:
-    """Computes quartiles over seeds of evaluation metrics, and medians of reward statistics."""
+    """Compute quartiles over seeds of evaluation metrics, and medians of reward statistics."""
     filtered = _mean(line, _FILTERED)
     return {
         "final_success": final(line, SUCCESS),
@@ -102,14 +102,14 @@ def _figures(line: Line) -> dict[str, Quartiles | float]:
 
 
 def _mean(line: Line, metric: str) -> float:
-    """Computes the mean of a metric over training, in the median over seeds; NaN if it was never logged."""
+    """Compute the mean of a metric over training, in the median over seeds; NaN if it was never logged."""
     _, values = line.values(metric)
     per_seed = [float(np.nanmean(row)) for row in values if np.isfinite(row).any()]
     return float(np.median(per_seed)) if per_seed else float("nan")
 
 
 def _last(line: Line, metric: str) -> float:
-    """Returns the last value of a metric, in the median over seeds; NaN if it was not logged."""
+    """Return the last value of a metric, in the median over seeds; NaN if it was not logged."""
     values = line.values(metric)[1][:, -1]
     return float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else float("nan")
 
@@ -124,7 +124,7 @@ def _cells(figures: Mapping[str, Quartiles | float]) -> list[str]:
 
 
 def _csv(value: Quartiles | float) -> list[tuple[str, float | None]]:
-    """Returns suffixes of a column's name, and their values."""
+    """Return suffixes of a column's name, and their values."""
     low, median, high = value if isinstance(value, tuple) else (None, value, None)
     rounded = [
         (end, None if number is None or np.isnan(number) else round(number, 5))
@@ -134,7 +134,7 @@ def _csv(value: Quartiles | float) -> list[tuple[str, float | None]]:
 
 
 def _oracle_notes(lines: Mapping[tuple[str, str], Line]) -> list[str]:
-    """Makes notes on tasks where the oracle itself fails, so that methods cannot be compared."""
+    """Make notes on tasks where the oracle itself fails, so that methods cannot be compared."""
     notes = []
     for (task, variant), line in lines.items():
         if variant == "oracle" and task in _ORACLE_WORKS:

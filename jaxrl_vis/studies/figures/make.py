@@ -32,7 +32,7 @@ _SHOW: dict[str, Callable[..., FigureContent]] = {
 
 
 def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> bool:
-    """Trains missing cells and draws finished ones.
+    """Train missing cells and draw finished ones.
 
     Returns:
         True if all cells are finished, and so drawn.
@@ -66,7 +66,7 @@ def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> b
 def _write(
     request: Request, lines: dict[tuple[str, str], Line], variants: Sequence[str], unfinished: Sequence[str]
 ) -> list[Path]:
-    """Writes the images and both tables; returns their paths."""
+    """Write the images and both tables; return their paths."""
     study = request.study
     tasks = [task for task in request.tasks or study.steps if any((task, variant) in lines for variant in variants)]
     content = _SHOW[study.family.name](request, lines, tasks, variants)
@@ -89,7 +89,7 @@ def _name(figure: str) -> str:
 
 
 def _about(request: Request, lines: Sequence[Line]) -> str:
-    """Describes preset, seeds and updates per step, which every figure must state."""
+    """Describe preset, seeds and updates per step, which every figure must state."""
     seeds = sorted({seed for line in lines for seed in line.seeds})
     seeds_text = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}; line: median, band: 25 to 75 %"
     ratios = sorted({f"{line.steps_per_update:.3g}" for line in lines}, key=float)

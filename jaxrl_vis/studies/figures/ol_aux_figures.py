@@ -21,7 +21,7 @@ Lines = Mapping[tuple[str, str], Line]
 
 
 def show(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Makes the content of a figure from its lines."""
+    """Make the content of a figure from its lines."""
     is_weights = request.figure == WEIGHTS
     panels = [Panel(task, (_weights if is_weights else _success)(lines, task, variants), not is_weights) for task in tasks]
     text, rows = _weights_table(request, lines, tasks) if is_weights else _steps_table(lines, tasks)

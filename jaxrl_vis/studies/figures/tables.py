@@ -30,7 +30,7 @@ class Named:
 def steps_table(
     lines: Mapping[str, Sequence[Named]], levels: Mapping[str, Sequence[float]]
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Tabulates steps to each level, and speed-ups over the baseline of the same source.
+    """Tabulate steps to each level, and speed-ups over the baseline of the same source.
 
     Args:
         lines: Task -> its lines.
@@ -96,7 +96,7 @@ def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: 
 def weights_table(
     weighted: Mapping[str, Line], alone: Mapping[tuple[str, str], Line], bases: Mapping[str, Line], names: Mapping[str, str]
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Tabulates mean weights of auxiliary losses with the gain of each one alone, and their rank correlation (Spearman's).
+    """Tabulate mean weights of auxiliary losses with the gain of each one alone, and their rank correlation (Spearman's).
 
     The gain is the difference of mean success to the run without auxiliary losses, up to the shorter run's end.
 
@@ -139,5 +139,5 @@ def _correlation(weights: Sequence[float], gains: Sequence[float], wanted: int) 
 
 
 def table_row(cells: Sequence[str]) -> str:
-    """Formats a row of a Markdown table."""
+    """Format a row of a Markdown table."""
     return "| " + " | ".join(cells) + " |"

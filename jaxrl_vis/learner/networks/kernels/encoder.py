@@ -72,7 +72,7 @@ def prepare(
     shift: jax.Array | None = None,
     interpret: bool = False,
 ) -> jax.Array:
-    """Normalises images and puts them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
+    """Normalise images and put them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
 
     Args:
         images: Planar images.

@@ -53,7 +53,7 @@ def is_available() -> bool:
 
 
 def probe() -> None:
-    """Compiles small instances of all three kernels for the device that is the default; raises what that raises."""
+    """Compile small instances of all three kernels for the device that is the default; raise what that raises."""
     probe_program().lower().compile()
 
 

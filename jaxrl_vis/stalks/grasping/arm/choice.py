@@ -44,7 +44,7 @@ class Choice(NamedTuple):
 
 
 def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> list[Choice]:
-    """Chooses a way to each of the stalks that were found.
+    """Choose a way to each of the stalks that were found.
 
     Args:
         points: Grasp points, in one robot frame.

@@ -35,7 +35,7 @@ HEIGHTS = (0.6, 0.9)
 
 
 def check_policy(policy: Policy) -> None:
-    """Raises a `RequestError` unless the policy can drive the arm."""
+    """Raise a `RequestError` unless the policy can drive the arm."""
     if not isinstance(policy.env, StalkReach) or policy.env.observation_spec.dtype != jnp.uint8:
         raise RequestError(f"--policy must be a run of VisualStalkReach, not of {policy.env_name}")
     if policy.env.frame_stack != 1:
@@ -52,7 +52,7 @@ class _Moving(NamedTuple):
 def reach_by_policy(
     stands: Stands, detected: Stands, targets: np.ndarray, policy: Policy, key: jax.Array, wind_mm: float
 ) -> ReachResult:
-    """Lets the policy bring each arm to its target, and closes the jaws there.
+    """Let the policy bring each arm to its target, and close the jaws there.
 
     Args:
         stands: The true stalks around each of B arms.

@@ -140,7 +140,7 @@ def reach(
     sides: np.ndarray | None = None,
     look: Callable[[ArmView], np.ndarray] | None = None,
 ) -> ReachResult:
-    """Sends each arm to its target and closes its jaws there.
+    """Send each arm to its target and close its jaws there.
 
     Args:
         stands: The stalks around each of B arms.

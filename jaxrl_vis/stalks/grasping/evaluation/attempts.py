@@ -190,7 +190,7 @@ def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, .
 def carry_out(
     plans: Iterable[Plan], wind_mm: float, loop: Loop = "open", policy: Policy | None = None, seed: int = 0
 ) -> list[Attempt]:
-    """Sends an arm to each target of all runs that is not refused, side by side.
+    """Send an arm to each target of all runs that is not refused, side by side.
 
     Args:
         plans: One for each run.

@@ -212,7 +212,7 @@ def match(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
 
 
 def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: float = 0.015) -> Score:
-    """Puts the attempts beside the truth.
+    """Put the attempts beside the truth.
 
     Args:
         attempts: Attempts of all runs, at most one for each stalk.

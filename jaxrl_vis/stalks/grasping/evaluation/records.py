@@ -166,7 +166,7 @@ class Reaches:
 
 
 def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> None:
-    """Sends the arm to all targets of the runs that were not carried out in this way yet, and keeps what came of it.
+    """Send the arm to all targets of the runs that were not carried out in this way yet, and keep what came of it.
 
     Args:
         table: The records of all runs.

@@ -90,7 +90,7 @@ class Scene:
 
 
 def draw_scene(family: Family, seed: int) -> Scene:
-    """Draws the pairs of a row."""
+    """Draw the pairs of a row."""
     sequence = Sequence.of(draw(family, seed))
     views, masks = [], []
     for pair in sequence:
@@ -101,7 +101,7 @@ def draw_scene(family: Family, seed: int) -> Scene:
 
 
 def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAULT_VARIANT) -> tuple[RunScore, Perception]:
-    """Runs everything on a scene and compares.
+    """Run everything on a scene and compares.
 
     Args:
         scene: The pairs and the truth.
@@ -191,7 +191,7 @@ def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> flo
 
 
 def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
-    """Compares painted masks with true ones."""
+    """Compare painted masks with true ones."""
     far = [_between_outlines(*both) for both in masks]
     return MaskScore(
         hits=int(sum((painted & true).sum() for painted, true in masks)),

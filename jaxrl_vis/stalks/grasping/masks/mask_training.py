@@ -144,7 +144,7 @@ def _initial(settings: Settings, crop: int, key: jax.Array) -> Any:
 def train(
     sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0
 ) -> tuple[Any, int]:
-    """Trains a generator.
+    """Train a generator.
 
     Args:
         sources: Iterators over examples; each is read by a thread of its own.

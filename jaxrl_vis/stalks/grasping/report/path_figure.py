@@ -18,7 +18,7 @@ _PLANNED, _TAKEN, _HELD, _STALK = "#2b6cb0", "#dd6b20", "#2f855a", "#a0aec0"
 
 
 def draw_path(path: Path, stands: Stands, targets: np.ndarray, result: ReachResult, index: int = 0) -> None:
-    """Writes the figure of one reach.
+    """Write the figure of one reach.
 
     Args:
         path: A .png, or any other format that matplotlib can write.

@@ -18,7 +18,7 @@ _INK = "#333333"
 
 
 def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: str) -> Perception:
-    """Draws the figure.
+    """Draw the figure.
 
     Args:
         out: The file, .png, .pdf or .svg.

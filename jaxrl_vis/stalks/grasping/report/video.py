@@ -26,7 +26,7 @@ _HEADER = 34  # px
 def write_reaches(
     path: Path, stands: Stands, result: ReachResult, targets: Sequence[int], chosen: Sequence[int], size: int = 320
 ) -> None:
-    """Writes some reaches as a video.
+    """Write some reaches as a video.
 
     Args:
         path: A .gif, .mp4 or .html file.

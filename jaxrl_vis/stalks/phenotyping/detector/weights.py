@@ -52,7 +52,7 @@ def write_weights(
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
-    """Reads what `write_weights` wrote: parameters, settings, and where they come from.
+    """Read what `write_weights` wrote: parameters, settings, and where they come from.
 
     Raises:
         RequestError: There is no such file, or it holds no weights, or not those of its settings.

@@ -79,7 +79,7 @@ def score_plot(
     least_score: float = 0.5,
     with_thesis: bool = False,
 ) -> PlotScore:
-    """Draws a plot, runs everything on it and compares.
+    """Draw a plot, run everything on it and compare.
 
     Args:
         family: Family that the plot is drawn from.

@@ -49,7 +49,7 @@ def write_plots(
     truth: Truth = "all",
     done: Callable[[int, int], None] = lambda plot, pair: None,
 ) -> int:
-    """Writes plots of a family.
+    """Write plots of a family.
 
     Args:
         folder: Folder to write to; made if it is missing.
@@ -101,7 +101,7 @@ def plot_name(seed: int) -> str:
 
 
 def write_plot(folder: Path, plot: Plot, image_format: ImageFormat, truth: Truth, done: Callable[[int, int], None]) -> None:
-    """Writes one plot; see `write_plots`."""
+    """Write one plot; see `write_plots`."""
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     sequence = Sequence.of(plot)
     write_calibration(folder / "calibration.yaml", sequence.drive.stated)

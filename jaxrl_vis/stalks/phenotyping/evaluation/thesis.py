@@ -18,7 +18,7 @@ _DEPTHS = (0.5, 1.3)  # m
 def measure_pair_as_thesis(
     detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration
 ) -> list[Sighting]:
-    """Measures what was found in a pair [H, W, 3] uint8, by ellipses and semi-global matching."""
+    """Measure what was found in a pair [H, W, 3] uint8, by ellipses and semi-global matching."""
     disparity = np.full(left.shape[:2], np.nan, np.float32)
     far, near = (float(calibration.disparity(np.array(depth))) for depth in reversed(_DEPTHS))
     for detection in detections:

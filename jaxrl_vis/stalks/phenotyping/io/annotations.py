@@ -195,7 +195,7 @@ def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
 
 
 def _is_inside(name: str) -> bool:
-    """Returns whether a file's name, as it stands in annotations, leads to nowhere but into their folder, on any system."""
+    """Return whether a file's name, as it stands in annotations, leads to nowhere but into their folder, on any system."""
     path = PureWindowsPath(name)  # which knows both separators
     steps = path.parts
     return bool(steps) and not path.anchor and ".." not in steps and name == readable(name)

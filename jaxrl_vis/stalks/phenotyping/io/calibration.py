@@ -32,7 +32,7 @@ _MAX_PIXELS = 100_000  # along a side of an image
 
 
 def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
-    """Reads a calibration.
+    """Read a calibration.
 
     Args:
         path: A file of OpenCV or of ROS, or a folder that holds left.yaml and right.yaml.
@@ -65,7 +65,7 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
 
 
 def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:
-    """Checks that an image is of the size that was calibrated.
+    """Check that an image is of the size that was calibrated.
 
     Raises:
         RequestError: It is not.
@@ -76,7 +76,7 @@ def check_size(calibration: Calibration, width: int, height: int, name: str) -> 
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Writes a calibration as OpenCV YAML: P1, P2 and Q, with the baseline in metres.
+    """Write a calibration as OpenCV YAML: P1, P2 and Q, with the baseline in metres.
 
     Raises:
         OSError: The file cannot be written.

@@ -182,7 +182,7 @@ def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sorts 2 before 10."""
+    """Sort 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
 
 

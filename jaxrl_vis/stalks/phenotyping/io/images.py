@@ -22,7 +22,7 @@ _MAX_BYTES, _MAX_BESIDES = 16, 1 << 26  # of a file, for each pixel and for what
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Writes an image: [H, W, 3] or [H, W], uint8 or uint16; the suffix says how. The file is complete whenever it can be read.
+    """Write an image: [H, W, 3] or [H, W], uint8 or uint16; the suffix says how. The file is complete whenever it can be read.
 
     Raises:
         OSError: It cannot be written.

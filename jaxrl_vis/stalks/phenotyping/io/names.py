@@ -33,7 +33,7 @@ def file_name(text: str) -> str:
 
 
 def check_length(path: Path) -> None:
-    """Raises a `RequestError` where a file's name is so long that files that are called after it cannot be written."""
+    """Raise a `RequestError` where a file's name is so long that files that are called after it cannot be written."""
     name = readable(path.name)
     length = len(name.encode())
     if length > _LONGEST:

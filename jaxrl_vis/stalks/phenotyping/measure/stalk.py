@@ -67,7 +67,7 @@ def measure(
     disparity: np.ndarray | None = None,
     strip: Strip | None = None,
 ) -> Measurement:
-    """Measures a stalk.
+    """Measure a stalk.
 
     Args:
         mask: [h, w] bool, or float32 from 0 to 1: of the stalk, in a part of the left image.

@@ -79,7 +79,7 @@ class _Writer:
         self._taken: list[tuple[int, int, int, int]] = []
 
     def above(self, place: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
-        """Writes above a place, as near to it as there is room, with a thread down to it."""
+        """Write above a place, as near to it as there is room, with a thread down to it."""
         wide, tall = self._size(text)
         left = min(max(place[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
         bottom = place[1] - tall // 2

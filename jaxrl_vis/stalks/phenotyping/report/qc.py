@@ -118,7 +118,7 @@ class Page:
         self._file.close()
 
     def add(self, plot: PlotResult) -> None:
-        """Adds a plot.
+        """Add a plot.
 
         Raises:
             OSError: An overlay cannot be read.
@@ -159,7 +159,7 @@ class Page:
         write("<h3>Pairs</h3>" + "".join(pictures.whole(self._whole)) + "</details>\n")
 
     def write(self, path: Path, skipped: list[dict[str, Any]]) -> None:
-        """Writes the page. The file is complete whenever it can be read.
+        """Write the page. The file is complete whenever it can be read.
 
         Args:
             path: The file, .html.

@@ -182,7 +182,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def write_rows(path: Path, columns: tuple[str, ...], rows: list[Row]) -> None:
-    """Writes a table as CSV. The file is complete whenever it can be read.
+    """Write a table as CSV. The file is complete whenever it can be read.
 
     Raises:
         OSError: It cannot be written.

@@ -37,7 +37,7 @@ class Followed:
 
 
 def follow_either_way(frames: list[list[Sighting]], distances: np.ndarray, calibration: Calibration) -> Followed:
-    """Puts the sightings of a plot together, whichever way the cameras moved.
+    """Put the sightings of a plot together, whichever way the cameras moved.
 
     What goes together with distances that grow to the cameras' right stays as `track.follow` makes it.
 

@@ -105,7 +105,7 @@ class _Open:
 def follow(
     frames: list[list[Sighting]], distances: np.ndarray, calibration: Calibration, gates: Gates = Gates()
 ) -> tuple[list[Track], Path]:
-    """Puts the sightings of a plot together.
+    """Put the sightings of a plot together.
 
     Args:
         frames: Sightings of each pair, in the order in which the robot passed.

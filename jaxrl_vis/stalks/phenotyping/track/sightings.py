@@ -142,7 +142,7 @@ def measure_pair(
     ground: Ground | None = None,
     disparity: np.ndarray | None = None,
 ) -> list[Sighting]:
-    """Measures what was found in a pair.
+    """Measure what was found in a pair.
 
     Args:
         detections: In the left image.

@@ -59,7 +59,7 @@ class _Pool(Pool[Example]):
         super().__init__(sources, plan.images)
 
     def add(self, example: Example) -> None:
-        """Keeps an example and its snips."""
+        """Keep an example and its snips."""
         self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
         super().add(example)
 
@@ -124,7 +124,7 @@ def _optimiser() -> optax.GradientTransformation:
 def train(
     sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0, start: Any = None
 ) -> tuple[Any, int]:
-    """Trains the networks.
+    """Train the networks.
 
     Args:
         sources: Iterators over examples; each is read by a thread of its own.

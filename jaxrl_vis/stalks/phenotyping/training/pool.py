@@ -16,7 +16,7 @@ class Pool(Generic[T]):
     """
 
     def __init__(self, sources: list[Iterator[T]], most: int) -> None:
-        """Starts to make them.
+        """Start to make them.
 
         Args:
             sources: Each is read by a thread of its own.
@@ -54,7 +54,7 @@ class Pool(Generic[T]):
                 continue
 
     def fill(self, least: int) -> None:
-        """Takes what is ready, and waits until there are so many, or no more come."""
+        """Take what is ready, and wait until there are so many, or no more come."""
         while self._running and len(self.examples) < self._most:
             try:
                 example = self._queue.get(block=len(self.examples) < least)
@@ -72,15 +72,15 @@ class Pool(Generic[T]):
             self.stop()
 
     def add(self, example: T) -> None:
-        """Keeps an example."""
+        """Keep an example."""
         self.examples.append(example)
 
     def stop(self) -> None:
-        """Tells the threads to make no more."""
+        """Tell the threads to make no more."""
         self._stop.set()
 
     def close(self) -> None:
-        """Ends the threads: one that still computes when the program ends would make it crash."""
+        """End the threads: one that still computes when the program ends would make it crash."""
         self.stop()
         for thread in self._threads:
             thread.join()

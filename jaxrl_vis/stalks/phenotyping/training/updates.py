@@ -33,7 +33,7 @@ class Schedule(Protocol):
 
 
 def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: Report, every: float) -> int:
-    """Updates until the plan's steps or minutes are over.
+    """Update until the plan's steps or minutes are over.
 
     Args:
         update: Makes one.
