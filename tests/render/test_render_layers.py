@@ -3,7 +3,15 @@
 from test_packaging import imports_within
 
 # A room imports from earlier rows only; rooms of one row do not import each other.
-ROOMS = (("mounts",), ("model", "outputs"), ("scene", "reference"), ("camera",), ("pixel",), ("cpu", "gpu"), ("images",))
+ROOMS = (
+    ("mounts",),
+    ("model", "outputs", "viewpoint"),
+    ("scene", "reference"),
+    ("camera",),
+    ("pixel",),
+    ("cpu", "gpu"),
+    ("images",),
+)
 RENDER = "jaxrl_vis_envs.render."
 
 

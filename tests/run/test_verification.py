@@ -103,7 +103,8 @@ def test_each_changed_digit_of_a_repeated_row_is_found(copy, verified):
         changed = [dict(row) for row in rows]
         row = changed[number % 4]  # one seed or the other of the first two evaluations
         text = json.dumps(row[name])
-        last = max(place for place, letter in enumerate(text.partition("e")[0]) if letter.isdigit())
+        mantissa = text if isinstance(row[name], str) else text.partition("e")[0]  # the run's id has letters
+        last = max(place for place, letter in enumerate(mantissa) if letter.isdigit())
         row[name] = json.loads(text[:last] + str((int(text[last]) + 1) % 10) + text[last + 1 :])
         write_rows(copy, changed)
         report = verified(copy)
