@@ -13,6 +13,7 @@ from jaxrl_vis.stalks.phenotyping.detector import weights
 
 
 def main(trained: Path) -> None:
+    """Write trained weights into the package, in the room of the network that they fit; exit with a line if they fit none."""
     for room in (weights, painter):
         try:
             params, settings, origin = room.read_weights(trained)

@@ -24,6 +24,12 @@ def squared(offset: int, number: int) -> Record:
     return {"square": number * number + offset, "process": os.getpid(), "threads": os.environ.get("OMP_NUM_THREADS")}
 
 
+def loads_glfw(number: int) -> Record:
+    import mujoco  # noqa: F401 - without a display it would look for one in a process of its own
+
+    return {"glfw": "glfw" in sys.modules, "gl": os.environ.get("MUJOCO_GL")}
+
+
 def broken(number: int) -> Record:
     if number == 2:
         raise ValueError(f"number {number} is broken")
@@ -60,6 +66,13 @@ def test_results_are_the_same_in_one_process_and_in_several():
     assert {record["process"] for record in one.values()} == {os.getpid()}
     assert os.getpid() not in {record["process"] for record in two.values()}
     assert all(int(record["threads"]) >= 1 for record in two.values())
+
+
+def test_workers_look_for_no_window_system(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    results: dict[int, Record] = {}
+    evaluate_all(loads_glfw, range(2), 2, results.__setitem__)
+    assert list(results.values()) == [{"glfw": False, "gl": "disable"}] * 2
 
 
 def test_what_goes_wrong_in_a_process_is_told():

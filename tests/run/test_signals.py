@@ -355,3 +355,27 @@ def test_a_command_that_does_not_look_up_is_ended(monkeypatch, not_ignored):
             signal.raise_signal(signal.SIGTERM)
         assert given_up.get(timeout=10) == signal.SIGTERM
     assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_a_second_signal_leaves_no_words_about_a_half_made_event_loop(monkeypatch):
+    """The handler may raise while orbax makes a loop, which Python then collects, and complains about."""
+    shown = []
+    monkeypatch.setattr(sys, "unraisablehook", shown.append)
+    with pytest.raises(Terminated), signals.Interruption():
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+
+    class BaseEventLoop:
+        def __del__(self):
+            raise AttributeError("'NoneType' object has no attribute 'fileno'")
+
+    BaseEventLoop.__del__.__qualname__ = "BaseEventLoop.__del__"
+    BaseEventLoop()
+    assert shown == []
+
+    class Other:
+        def __del__(self):
+            raise ValueError("ours")
+
+    Other()
+    assert [type(problem.exc_value) for problem in shown] == [ValueError]
