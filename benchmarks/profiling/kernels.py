@@ -117,7 +117,9 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
     episodes = compiled["rollout"](*playing)[0] if "insert" in parts else None
     for part in parts:
         _, _, turns, what = arguments[part]
-        report(f"{what} of {program.config.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order)
+        report(
+            f"{what} of {program.config.run.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order
+        )
 
 
 def parse_compiler_options(words: list[str]) -> dict[str, Any]:

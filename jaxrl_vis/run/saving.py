@@ -57,7 +57,7 @@ class Saver:
     ):
         self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
         self._check = check
-        self._keeps_full = programs.config.full_checkpoint_interval > 0
+        self._keeps_full = programs.config.run.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
         """Return True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
@@ -206,7 +206,7 @@ class Saver:
                 dumped = f"state dumped to {file}"
             except OSError as error:
                 dumped = f"the state cannot be written to {file} ({error.strerror or type(error).__name__})"
-            simulated = made_by_simulation(loop, self._programs.config.num_envs)
+            simulated = made_by_simulation(loop, self._programs.config.run.num_envs)
             if simulated is None and not leaves and values and all(name.startswith("eval/") for name in values):
                 simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves

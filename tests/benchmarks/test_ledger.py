@@ -312,7 +312,7 @@ def test_a_row_says_what_its_runs_reached(tmp_path: Path) -> None:
 
 def test_rows_ask_for_five_seeds_on_a_gpu() -> None:
     for row in LEARNING:
-        assert sum(config.seeds for config in row.runs.values()) == (3 if "cpu" in next(iter(row.runs)) else 5)
+        assert sum(config.run.seeds for config in row.runs.values()) == (3 if "cpu" in next(iter(row.runs)) else 5)
 
 
 def test_the_command_line_checks(readme: Path, capsys: pytest.CaptureFixture[str]) -> None:
