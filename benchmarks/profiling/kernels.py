@@ -21,9 +21,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis import fields, preset
+from jaxrl_vis import preset
 from jaxrl_vis.bench.update import seed_keys, start
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, fields
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.learner.environment import make_env

@@ -242,7 +242,7 @@ def rows_of(success: list[float], seed: int = 0, every: int = 1000) -> list[dict
 def make_run(folder: Path, rows: list[dict[str, Any]], **overrides: Any) -> Path:
     folder.mkdir(parents=True)
     about = {
-        "schema": 1,
+        "schema": 2,
         "preset": "debug",
         "git_revision": "a" * 40,
         "versions": {"jax": "1"},

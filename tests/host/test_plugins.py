@@ -10,8 +10,8 @@ import pytest
 from doc_blocks import ROOT, blocks, commands
 
 import jaxrl_vis
-from jaxrl_vis import cli, fields
-from jaxrl_vis.config import Config, preset
+from jaxrl_vis import cli
+from jaxrl_vis.config import Config, fields, preset
 from jaxrl_vis.config.methods import METHODS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import plugins
