@@ -131,6 +131,7 @@ class Saver:
         self._say(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
         if self.is_recent_due(light=True):  # in case the user does not wait
             self.recent(loop, iteration, progress)
+        self._checkpoints.wait()  # one of this iteration may still be on its way: it is not written twice
         if not self.has(LIGHT, iteration) or progress.evaluation_due:
             self.light(loop, iteration, progress)
         self._checkpoints.wait()

@@ -33,7 +33,7 @@ from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 
 SCHEMA = 2
 
-CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged")
+CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged", "replaced")
 """Subfolders written by `checkpoint`."""
 
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
