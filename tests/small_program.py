@@ -5,8 +5,7 @@ import dataclasses
 import functools
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config
-from jaxrl_vis.config.groups import HOST, marked
+from jaxrl_vis.config import HOST, Config, marked
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import JIT_OPTIONS

@@ -7,9 +7,7 @@ import inspect
 from pathlib import Path
 
 from jaxrl_vis.cli.parsing import describe_options
-from jaxrl_vis.config import PRESETS, Config, fields
-from jaxrl_vis.config.groups import RESUMABLE
-from jaxrl_vis.config.presets import TASKS
+from jaxrl_vis.config import PRESETS, RESUMABLE, TASKS, Config, fields
 
 PAGE = Path(__file__).resolve().parents[1] / "configuration.md"
 BEGIN, END = "<!-- fields: begin -->\n", "<!-- fields: end -->\n"

@@ -8,9 +8,7 @@ from typing import Annotated, Any
 
 from jaxrl_vis.cli.checks import check_counts, check_env, may_run_code
 from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
-from jaxrl_vis.config import PRESETS, Config, preset
-from jaxrl_vis.config.groups import OPTIONS
-from jaxrl_vis.config.validation import validate
+from jaxrl_vis.config import OPTIONS, PRESETS, Config, preset, validate
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices

@@ -10,7 +10,39 @@
 Imports no JAX.
 """
 
-from jaxrl_vis.config.groups import Config, Pixels, changes, config_from_dict, data_devices
-from jaxrl_vis.config.presets import PRESETS, preset
+from jaxrl_vis.config.groups import (
+    HOST,
+    OPTIONS,
+    RESUMABLE,
+    UNMEASURED,
+    Config,
+    Mark,
+    Pixels,
+    changes,
+    config_from_dict,
+    data_devices,
+    marked,
+    of_weightings,
+)
+from jaxrl_vis.config.presets import PRESETS, TASKS, general_values, preset
+from jaxrl_vis.config.validation import validate
 
-__all__ = ["PRESETS", "Config", "Pixels", "changes", "config_from_dict", "data_devices", "preset"]
+__all__ = [
+    "HOST",
+    "OPTIONS",
+    "PRESETS",
+    "RESUMABLE",
+    "TASKS",
+    "UNMEASURED",
+    "Config",
+    "Mark",
+    "Pixels",
+    "changes",
+    "config_from_dict",
+    "data_devices",
+    "general_values",
+    "marked",
+    "of_weightings",
+    "preset",
+    "validate",
+]

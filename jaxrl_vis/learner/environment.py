@@ -4,9 +4,8 @@ import dataclasses
 from typing import Any
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config, fields
-from jaxrl_vis.config.groups import OPTIONS, EnvironmentOptions
-from jaxrl_vis.config.validation import validate
+from jaxrl_vis.config import OPTIONS, Config, fields, validate
+from jaxrl_vis.config.groups import EnvironmentOptions
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host import plugins
 from jaxrl_vis_envs.base import GoalEnv

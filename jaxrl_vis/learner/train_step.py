@@ -20,9 +20,8 @@ import jax
 import jax.numpy as jnp
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, validate
 from jaxrl_vis.config.resolved import Resolved, resolve
-from jaxrl_vis.config.validation import validate
 from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import iteration as iterations
 from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate

@@ -10,8 +10,7 @@ Figure 5.1 can also be drawn for the two tasks from states, and for the hand and
 
 from typing import Any
 
-from jaxrl_vis.config import changes
-from jaxrl_vis.config.presets import general_values
+from jaxrl_vis.config import changes, general_values
 from jaxrl_vis.studies.engine.study import Family, Study, Variant
 
 _OURS: dict[str, Any] = {"method": "indicator_balance_filter"}

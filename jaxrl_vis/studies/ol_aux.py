@@ -11,9 +11,8 @@ Every figure also has a run without auxiliary losses as the reference of speed-u
 from collections.abc import Sequence
 from typing import Any
 
-from jaxrl_vis.config import changes
+from jaxrl_vis.config import changes, general_values
 from jaxrl_vis.config.methods import AuxTaskName
-from jaxrl_vis.config.presets import general_values
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.studies.engine.study import Family, Study, Variant
 

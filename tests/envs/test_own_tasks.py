@@ -10,8 +10,7 @@ import pytest
 import jaxrl_vis
 import jaxrl_vis_envs
 from jaxrl_vis import cli
-from jaxrl_vis.config import preset
-from jaxrl_vis.config.groups import RESUMABLE, marked
+from jaxrl_vis.config import RESUMABLE, marked, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run.storage.folder import default_folder

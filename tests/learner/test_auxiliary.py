@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis.config import preset
+from jaxrl_vis.config import preset, validate
 from jaxrl_vis.config.resolved import resolve
-from jaxrl_vis.config.validation import validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import optical_flow

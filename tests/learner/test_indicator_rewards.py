@@ -8,9 +8,8 @@ import pytest
 from learners import begin, rollout, train_iteration
 from test_ddpg import DISCOUNT, trained
 
-from jaxrl_vis.config import preset
+from jaxrl_vis.config import preset, validate
 from jaxrl_vis.config.resolved import resolve
-from jaxrl_vis.config.validation import validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.acting.rollout import add_noise
 from jaxrl_vis.learner.ddpg import diagnostics

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import cli
-from jaxrl_vis.config import Config, preset
+from jaxrl_vis.config import Config, preset, validate
 from jaxrl_vis.config.resolved import resolve
-from jaxrl_vis.config.validation import validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
 from jaxrl_vis.learner.ddpg.ddpg import GradientSteps, make_ddpg

@@ -30,9 +30,7 @@ from jaxrl_vis import cli, config
 from jaxrl_vis.cli.checks import check_env
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import Config
-from jaxrl_vis.config.groups import OPTIONS, RESUMABLE, marked
-from jaxrl_vis.config.validation import validate
+from jaxrl_vis.config import OPTIONS, RESUMABLE, Config, marked, validate
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run import trainer

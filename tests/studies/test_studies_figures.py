@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from jaxrl_vis import cli
-from jaxrl_vis.config.validation import validate
+from jaxrl_vis.config import validate
 from jaxrl_vis.host.spreadsheets import to_csv
 from jaxrl_vis.run.storage.folder import SCHEMA
 from jaxrl_vis.studies import indicator

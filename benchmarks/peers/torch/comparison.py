@@ -21,8 +21,7 @@ import numpy as np
 import jaxrl_vis_envs
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.config import Config
-from jaxrl_vis.config.groups import OPTIONS
+from jaxrl_vis.config import OPTIONS, Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler

@@ -28,8 +28,7 @@ from jax import export
 from jax.extend.core import jaxpr_as_fun
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config
-from jaxrl_vis.config.groups import HOST, marked
+from jaxrl_vis.config import HOST, Config, marked
 from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to
 from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.host.provenance import device_record, versions

@@ -22,8 +22,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import Config, config_from_dict
-from jaxrl_vis.config.groups import RESUMABLE, Mark, marked, of_weightings
+from jaxrl_vis.config import RESUMABLE, Config, Mark, config_from_dict, marked, of_weightings
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import check_path, is_temporary, read_json, write_atomically

@@ -8,8 +8,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import Config
-from jaxrl_vis.config.groups import OPTIONS
+from jaxrl_vis.config import OPTIONS, Config
 from jaxrl_vis.run.goodput import read_processes
 from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.folder import LOGGER_FOLDERS, WANDB_STATE, RunFolder

@@ -14,8 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import Config
-from jaxrl_vis.config.groups import UNMEASURED
+from jaxrl_vis.config import UNMEASURED, Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.storage.folder import RunFolder, contradictions, read_config
 

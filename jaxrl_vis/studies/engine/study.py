@@ -5,8 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxrl_vis.config import Config, preset
-from jaxrl_vis.config.validation import validate
+from jaxrl_vis.config import Config, preset, validate
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.studies.engine.cells import Cell, split_seeds
 

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import changes, preset
-from jaxrl_vis.config.validation import validate
+from jaxrl_vis.config import changes, preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import streams
 from jaxrl_vis.host.devices import Device, list_devices
