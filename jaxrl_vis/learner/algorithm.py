@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.config.resolved import Resolved
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, Statistics
 
 Agent = Any

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config, validate
-from jaxrl_vis.config.resolved import Resolved, resolve
 from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import iteration as iterations
 from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate
@@ -36,6 +35,7 @@ from jaxrl_vis.learner.memory.sampling import Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks, compute_dtype
 from jaxrl_vis.learner.parallel.sharding import Layout, make_layout
+from jaxrl_vis.learner.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_default_device

@@ -13,8 +13,8 @@ import pytest
 
 from jaxrl_vis.config import PRESETS, Config, Pixels, config_from_dict, fields, preset, validate
 from jaxrl_vis.config.methods import METHODS, MethodName
-from jaxrl_vis.config.resolved import resolve
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis_envs.pixels import CHANNELS
 
 BAD_VALUES: tuple[tuple[str, Any, str], ...] = (

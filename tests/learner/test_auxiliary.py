@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.config import preset, validate
-from jaxrl_vis.config.resolved import resolve
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import optical_flow
@@ -19,6 +18,7 @@ from jaxrl_vis.learner.memory.replay import Indices, Replay
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.types import Episodes, Statistics
 

@@ -16,7 +16,6 @@ import pytest
 
 from jaxrl_vis import cli
 from jaxrl_vis.config import Config, preset, validate
-from jaxrl_vis.config.resolved import resolve
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
 from jaxrl_vis.learner.ddpg.ddpg import GradientSteps, make_ddpg
@@ -27,6 +26,7 @@ from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.parallel.sharding import make_layout
 from jaxrl_vis.learner.parallel.shards import DATA, Shards
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis.run.compiled import memory
 from jaxrl_vis.types import Batch, Episodes, ReplayState, TrainState
 

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.config.resolved import Resolved
 from jaxrl_vis.learner.algorithm import Algorithm, Batches, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import adam, diagnostics
@@ -29,6 +28,7 @@ from jaxrl_vis.learner.ddpg.latent_reward import LatentReward, make_latent_rewar
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
 from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
 

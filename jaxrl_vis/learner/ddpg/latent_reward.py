@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import optax
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.config.resolved import Resolved
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.networks.normalizer import Scaling
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Params, Replaceable
 
 _SMALL = 1e-6  # of a latent's length: the direction of a shorter one means nothing

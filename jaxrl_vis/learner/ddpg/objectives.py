@@ -18,13 +18,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.config.resolved import Resolved
 from jaxrl_vis.learner.auxtasks import View
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.ddpg import losses
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Params
 

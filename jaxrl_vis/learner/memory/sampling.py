@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.config.resolved import Resolved
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.memory import reward_errors
 from jaxrl_vis.learner.memory.random_integers import scaled
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import Indices, Replay
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
 
