@@ -60,8 +60,8 @@ class Auxiliary:
 
     def start(self, critic: Params) -> WeightingState:
         """The weighting's state before the first update."""
-        kept = (critic,) if self.weighting.hold is not None else ()
-        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *kept)
+        held = (critic,) if self.weighting.hold is not None else ()
+        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *held)
 
     def with_stored(self, episodes: Episodes) -> Episodes:
         """Return a rollout's episodes with the arrays that tasks compute once an episode."""

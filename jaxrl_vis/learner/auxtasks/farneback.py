@@ -84,18 +84,18 @@ def _between(before: list[Planes], after: list[Planes], settings: Settings) -> j
 
 def _displacements(before: list[Planes], after: list[Planes], settings: Settings) -> Planes:
     """Displacements to the right and down, from the expansions of two images, the coarsest level first."""
-    found: Planes = ()
+    displacements: Planes = ()
     for expansion_t, expansion_tp1 in zip(before, after, strict=True):
         rows, columns = expansion_t[0].shape
-        if not found:
-            found = (jnp.zeros((rows, columns)),) * 2
+        if not displacements:
+            displacements = (jnp.zeros((rows, columns)),) * 2
         else:
-            resize_rows, resize_columns = (_resizing(new, old) for new, old in zip((rows, columns), found[0].shape))
-            found = tuple(_product(resize_rows, plane, resize_columns.T) / settings.scale for plane in found)
+            resize_rows, resize_columns = (_resizing(new, old) for new, old in zip((rows, columns), displacements[0].shape))
+            displacements = tuple(_product(resize_rows, plane, resize_columns.T) / settings.scale for plane in displacements)
         for _ in range(settings.iterations):
-            equations = _equations(expansion_t, expansion_tp1, *found)
-            found = _solve(tuple(_mean_in_window(plane, settings.window) for plane in equations))
-    return found
+            equations = _equations(expansion_t, expansion_tp1, *displacements)
+            displacements = _solve(tuple(_mean_in_window(plane, settings.window) for plane in equations))
+    return displacements
 
 
 def _mean_in_window(plane: jax.Array, window: int) -> jax.Array:
@@ -176,14 +176,14 @@ def _fits(new: int, old: int, scale: float, radius: int, sigma: float) -> tuple[
 def _expansions(image: jax.Array, settings: Settings) -> list[Planes]:
     """Coefficients of an image [H, W] at each level, the coarsest first: b (right, down), then A's (xx, yy, xy)."""
     (height, width), shape = image.shape, (settings.radius, settings.sigma)
-    image, found = image.astype(jnp.float32), []
+    image, expansions = image.astype(jnp.float32), []
     for scale in _scales(height, width, settings):
         value_y, slope_y, curvature_y = _fits(round(height * scale), height, scale, *shape)
         value_x, slope_x, curvature_x = _fits(round(width * scale), width, scale, *shape)
         value, slope, curvature = (_by_columns(image, fit.T) for fit in (value_x, slope_x, curvature_x))
         pairs = (value_y, slope), (slope_y, value), (value_y, curvature), (curvature_y, value), (0.5 * slope_y, slope)
-        found.append(tuple(_by_rows(of_rows, planes) for of_rows, planes in pairs))
-    return found
+        expansions.append(tuple(_by_rows(of_rows, planes) for of_rows, planes in pairs))
+    return expansions
 
 
 def _equations(expansion_t: Planes, expansion_tp1: Planes, found_right: jax.Array, found_down: jax.Array) -> Planes:

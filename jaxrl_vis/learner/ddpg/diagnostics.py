@@ -36,10 +36,10 @@ def count_rewards(
     else:
         positive = (reward == reward_positive).astype(jnp.float32)
     negative = 1.0 - positive
-    found = {"positive_share": jnp.mean(positive), "negative": jnp.sum(negative), "filtered": jnp.sum(1.0 - keep)}
+    counts = {"positive_share": jnp.mean(positive), "negative": jnp.sum(negative), "filtered": jnp.sum(1.0 - keep)}
     if success is None:
-        return found
-    return found | {
+        return counts
+    return counts | {
         "failure": jnp.sum(1.0 - success),
         "false_positive": jnp.sum(positive * (1.0 - success)),
         "false_negative": jnp.sum(negative * success),
@@ -63,10 +63,10 @@ def shares(counts: Metrics, parts: int = 1) -> Metrics:
     def share(part: str, whole: str) -> jax.Array:
         return counts[part] / jnp.maximum(counts[whole], 1.0 / parts)
 
-    found = {"positive_share": counts["positive_share"], "filtered_share": share("filtered", "negative")}
+    result = {"positive_share": counts["positive_share"], "filtered_share": share("filtered", "negative")}
     if "failure" not in counts:
-        return found
-    return found | {
+        return result
+    return result | {
         "false_positive_share": share("false_positive", "failure"),
         "false_negative_share": share("false_negative", "negative"),
         "filtered_false_share": share("filtered_false", "negative"),

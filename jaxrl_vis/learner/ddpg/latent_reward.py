@@ -61,7 +61,7 @@ def cosine_reward(latent: jax.Array, goal_latent: jax.Array, positive: float = 1
         positive: R+.
         negative: R-.
     """
-    first, second = (each.astype(jnp.float32) for each in (latent, goal_latent))
+    first, second = (array.astype(jnp.float32) for array in (latent, goal_latent))
     lengths = jnp.linalg.norm(first, axis=-1) * jnp.linalg.norm(second, axis=-1)
     cosine = jnp.sum(first * second, axis=-1) / jnp.maximum(lengths, _SMALL**2)
     return jax.lax.stop_gradient(negative + (positive - negative) * jnp.clip(cosine, 0.0, 1.0))

@@ -47,17 +47,17 @@ def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, t
     return jax.lax.stop_gradient(1.0 - false_negative.astype(jnp.float32))
 
 
-def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array, kept: jax.Array | None = None) -> jax.Array:
+def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array, count: jax.Array | None = None) -> jax.Array:
     """Mean squared temporal-difference error over the transitions with ``keep`` 1: [] float32; 0 where there are none.
 
     Args:
         value_t: [B] float32, the online critic's values.
         target: [B] float32, from `td_target`.
         keep: [B] float32, 0 or 1, from `keep_mask`.
-        kept: [] float32, transitions to divide the sum by; None: the sum of ``keep``, at least 1.
+        count: [] float32, transitions to divide the sum by; None: the sum of ``keep``, at least 1.
     """
-    kept = jnp.maximum(jnp.sum(keep), 1.0) if kept is None else kept
-    return jnp.sum(keep * jnp.square(value_t - target)) / kept
+    count = jnp.maximum(jnp.sum(keep), 1.0) if count is None else count
+    return jnp.sum(keep * jnp.square(value_t - target)) / count
 
 
 def actor_loss(

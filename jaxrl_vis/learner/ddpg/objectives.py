@@ -66,12 +66,12 @@ def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inp
     """
     names = ("before", "goal", *auxiliary.encoded)
     if apart:
-        found = [_encode(networks, params, inputs, name)[0] for name in names]
-        pair = jnp.stack(found[:2])
+        latents = [_encode(networks, params, inputs, name)[0] for name in names]
+        pair = jnp.stack(latents[:2])
     else:
-        found = _encode(networks, params, inputs, *names)
-        pair = found[:2]
-    return _with_others(auxiliary, pair, found[0], found[2:])
+        latents = _encode(networks, params, inputs, *names)
+        pair = latents[:2]
+    return _with_others(auxiliary, pair, latents[0], latents[2:])
 
 
 def _with_others(auxiliary: Auxiliary, pair: jax.Array, before: jax.Array, others: Iterable[jax.Array]) -> Latents:

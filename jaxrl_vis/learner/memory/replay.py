@@ -105,10 +105,10 @@ class Replay(NamedTuple):
             name: _pack_steps(jnp.zeros((episodes, *spec.shape), spec.dtype)) for name, spec in dict(stored or {}).items()
         }
         first, *others = observation.shape
-        kept = (episodes, horizon + 2, first // self.frame_stack, *others)
+        stored_shape = (episodes, horizon + 2, first // self.frame_stack, *others)
         return ReplayState(
             episodes=Episodes(
-                observations=pack(jnp.zeros(kept, observation.dtype)),
+                observations=pack(jnp.zeros(stored_shape, observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
                 stored=beside,

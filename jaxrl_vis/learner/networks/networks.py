@@ -136,16 +136,16 @@ class Inputs(NamedTuple):
 
     def pieces(self, *names: str) -> list[Piece]:
         """Return where observations lie: ``before``, ``goal``, ``after``, or a view, in the order of ``names``."""
-        size, found = self.size, []
+        size, pieces = self.size, []
         for name in names:
             if name in self.views:
-                found.append((self.views[name], slice(0, size)))
+                pieces.append((self.views[name], slice(0, size)))
                 continue
             start = _OBSERVED.index(name) * size
-            if found and found[-1][0] is self.observed and found[-1][1].stop == start:  # neighbours are one piece
-                start = found.pop()[1].start
-            found.append((self.observed, slice(start, (_OBSERVED.index(name) + 1) * size)))
-        return found
+            if pieces and pieces[-1][0] is self.observed and pieces[-1][1].stop == start:  # neighbours are one piece
+                start = pieces.pop()[1].start
+            pieces.append((self.observed, slice(start, (_OBSERVED.index(name) + 1) * size)))
+        return pieces
 
 
 class _Head(nn.Module):
@@ -311,8 +311,8 @@ class Networks:
             shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
             together = self.prepare(of_observations, batch.observations.reshape(count * size, *shape), shift)
             return Inputs(together, views)
-        each_scaling = (of_observations, of_goals, of_observations)
-        pieces = [self.prepare(each, rows, batch.shift) for each, rows in zip(each_scaling, batch.observations, strict=True)]
+        scalings = (of_observations, of_goals, of_observations)
+        pieces = [self.prepare(own, rows, batch.shift) for own, rows in zip(scalings, batch.observations, strict=True)]
         return Inputs(jnp.concatenate(pieces), views)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
@@ -351,9 +351,9 @@ class Networks:
             return self._encoder.apply({"params": params["encoder"]}, *(inputs[which] for inputs, which in pieces))
         channels = self.observation_spec.shape[0]
         weights = encoder_kernel.make_weights(params["encoder"], channels)
-        found = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
+        features = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
         finer = 4 ** (self._levels - encoder_kernel.LEVELS)
-        blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in found]
+        blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in features]
         return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:

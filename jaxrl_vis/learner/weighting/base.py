@@ -88,7 +88,7 @@ class Weighting(NamedTuple):
 
     def slopes(self, losses: Losses) -> dict[str, jax.Array]:
         """s_i: the derivative of what is learned by the loss itself, [] float32 by name. All 1 without logarithms."""
-        return {name: log_slope(loss, self._eps_of(name)) if self.log else jnp.ones(()) for name, loss in losses.items()}
+        return {name: log_slope(loss, self._loss_eps(name)) if self.log else jnp.ones(()) for name, loss in losses.items()}
 
     def coefficients(self, weights: Weights, losses: Losses) -> dict[str, jax.Array]:
         """c_i = w_i s_i: what gradients of the losses are multiplied with before they are added up, [] float32 by name."""
@@ -100,10 +100,10 @@ class Weighting(NamedTuple):
         Its gradient, weights being constant, is the sum of c_i grad L_i.
         """
         weights = jax.lax.stop_gradient(weights)
-        learned = {name: log_loss(loss, self._eps_of(name)) if self.log else loss for name, loss in losses.items()}
+        learned = {name: log_loss(loss, self._loss_eps(name)) if self.log else loss for name, loss in losses.items()}
         return sum((weights[name] * loss for name, loss in learned.items()), jnp.zeros(()))
 
-    def _eps_of(self, name: str) -> float:
+    def _loss_eps(self, name: str) -> float:
         return self.main_eps if name == MAIN else self.eps
 
 

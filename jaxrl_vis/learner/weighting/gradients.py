@@ -152,7 +152,7 @@ def weighted_grad(
     if way == "latents" and encode is None:
         raise RequestError("way latents needs to know what the latents are: give encode")
 
-    def losses_of(params: Params, *args: Any) -> Any:
+    def encoded_losses(params: Params, *args: Any) -> Any:
         if encode is None:
             return losses_fn(params, *args)
         picked = shared(params)
@@ -161,13 +161,13 @@ def weighted_grad(
         return losses_fn(params, encode(picked, *args), *args)
 
     def find_per_loss(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        losses, gradients, extra = loss_gradients(losses_of, params, *args, has_aux=has_aux)
+        losses, gradients, extra = loss_gradients(encoded_losses, params, *args, has_aux=has_aux)
         check_names(losses, state)
         losses, gradients = reduce((losses, gradients))
         compared_losses, compared = losses, gradients
         if weighting.hold is not None:
             state = weighting.hold(params, state)
-            compared_losses, compared = reduce(loss_gradients(losses_of, state.params, *args, has_aux=has_aux)[:2])
+            compared_losses, compared = reduce(loss_gradients(encoded_losses, state.params, *args, has_aux=has_aux)[:2])
         statistics = measure(weighting, compared_losses, {name: shared(tree) for name, tree in compared.items()})
         weights, state, metrics = weighting.update(compared_losses, statistics, state)
         combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
@@ -178,25 +178,25 @@ def weighted_grad(
         through = latents.encode(encode, shared(params), *args)
         # The losses are traced here, to see which latents and parameters each of them reads.
         program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
-        found = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
-        check_names(found.losses, state)
-        losses = reduce(found.losses)
+        differentiated = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
+        check_names(differentiated.losses, state)
+        losses = reduce(differentiated.losses)
         statistics = of_main = None
         if weighting.needs == "dots":
-            of_main = through.backward(found.at_latents, {MAIN: jnp.ones(())})
+            of_main = through.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
             with forwards():
-                dots = through.dots(reduce(of_main), found.at_latents)
+                dots = through.dots(reduce(of_main), differentiated.at_latents)
             statistics = reduce(dots)
         weights, state, metrics = weighting.update(losses, statistics, state)
         coefficients = weighting.coefficients(weights, losses)
         rest = coefficients
         if of_main is not None:
             rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
-        added = through.backward(found.at_latents, rest)
+        added = through.backward(differentiated.at_latents, rest)
         if of_main is not None:  # the main loss's own is known already, and gradients add up
             added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
-        combined = jax.tree.map(jnp.add, found.combined(params, coefficients), _embed(shared, params, added))
-        return Weighted(reduce(combined), state, losses, metrics, weights, found.extra)
+        combined = jax.tree.map(jnp.add, differentiated.combined(params, coefficients), _embed(shared, params, added))
+        return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
 
     return find_per_loss if way == "per_loss" else find_by_latents
 

@@ -81,7 +81,7 @@ def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], pic
     named = functions if isinstance(functions, Mapping) else {_ALL: functions}
     of_picked = {group: (lambda picked, encode=encode: encode(picked, *args)) for group, encode in named.items()}
     passes = {group: jax.vjp(function, picked) for group, function in of_picked.items()}
-    latents = {group: found for group, (found, _) in passes.items()}
+    latents = {group: values for group, (values, _) in passes.items()}
     return Through(latents, {group: back for group, (_, back) in passes.items()}, of_picked, picked, has_names)
 
 
@@ -107,8 +107,8 @@ class Differentiated:
 
         def total(place: int, leaf: jax.Array) -> jax.Array:
             zeros = jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32))
-            found = {name: of[place] for name, of in self.of_params.items() if place in of}
-            return sum((coefficients[name] * gradient.astype(zeros.dtype) for name, gradient in found.items()), zeros)
+            gradients = {name: of[place] for name, of in self.of_params.items() if place in of}
+            return sum((coefficients[name] * gradient.astype(zeros.dtype) for name, gradient in gradients.items()), zeros)
 
         return jax.tree.unflatten(structure, [total(place, leaf) for place, leaf in enumerate(leaves)])
 
@@ -133,10 +133,10 @@ def differentiate(
 
         def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
             now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
-            given = through.latents | latents
-            read = given if through.has_names else given[_ALL]
-            found, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
-            return to_float32(jnp.asarray(found[name])), extra
+            inputs = through.latents | latents
+            read = inputs if through.has_names else inputs[_ALL]
+            by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
+            return to_float32(jnp.asarray(by_name[name])), extra
 
         # Each by itself, so that a compiler finds what the others compute in it to be of no use.
         chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
@@ -155,12 +155,12 @@ def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, throug
     of_leaf, rest = variables[:num_leaves], iter(variables[num_leaves:])
     # Leaves of a dictionary come in the order of its sorted keys.
     of_group = {group: [next(rest) for _ in jax.tree.leaves(through.latents[group])] for group in sorted(through.latents)}
-    found = {}
+    reads = {}
     for name, result in zip(sorted(losses), program.jaxpr.outvars):  # followed by what comes beside the losses
         needed = set() if isinstance(result, Literal) else {result}
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):
                 needed.update(variable for variable in equation.invars if not isinstance(variable, Literal))
         places = [place for place, variable in enumerate(of_leaf) if variable in needed]
-        found[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
-    return found
+        reads[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
+    return reads

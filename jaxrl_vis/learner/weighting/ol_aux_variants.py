@@ -69,12 +69,12 @@ def ol_aux_window(
         check_state(label, state)
         latest = _learned(weighting, losses, statistics)
         latest[MAIN] = _direction(main_grad, latest, state.weights)
-        kept = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
+        gradients = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
         count = jnp.minimum(state.updates + 1, window)  # the window begins with zeros
-        mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, kept)
+        mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, gradients)
         dots = {name: dot(mean[MAIN], mean[name]) for name in state.sums}
         sums = jax.tree.map(jnp.add, state.sums, dots)
-        after = move(state, scaled(sums, 1.0 / interval), sums, window=kept)
+        after = move(state, scaled(sums, 1.0 / interval), sums, window=gradients)
         return state.weights, after, report(state.weights, dots)
 
     weighting = checked(

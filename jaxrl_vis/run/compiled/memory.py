@@ -83,8 +83,8 @@ def _least_available(layout: Layout) -> int | None:
     if layout.devices[0].platform == "cpu":  # the host's memory is that of all of them
         there = available_bytes()
         return None if there is None else there // len(layout.devices)
-    found = [available_bytes(device) for device in layout.devices]
-    return None if None in found else min(each for each in found if each is not None)
+    available = [available_bytes(device) for device in layout.devices]
+    return None if None in available else min(count for count in available if count is not None)
 
 
 def check_memory(

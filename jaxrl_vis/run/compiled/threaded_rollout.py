@@ -70,5 +70,5 @@ class ThreadedRollout:
         outcome = {
             name: join_parts([part[name] for _, part in played], count, np, axis=1) for name in ("success", "goal_distance")
         }
-        kept = [episodes.observations for episodes, _ in played if episodes is not None]
-        return summarize(outcome, join_parts(kept, num_kept, np, axis=1), outcome["success"], frame_stack, np)
+        recorded = [episodes.observations for episodes, _ in played if episodes is not None]
+        return summarize(outcome, join_parts(recorded, num_kept, np, axis=1), outcome["success"], frame_stack, np)

@@ -170,8 +170,8 @@ def _on_gpu(
     )(cells, target, *cast)
     ends = list(itertools.accumulate(array.size for array in weights))
     *sums, squares = jnp.split(jnp.sum(partial_sums, axis=0), ends)
-    found = Weights(*(part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True)))
-    return scale * jnp.sum(squares), gradient, found
+    weight_gradients = Weights(*(part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True)))
+    return scale * jnp.sum(squares), gradient, weight_gradients
 
 
 def _plainly(cells: jax.Array, target: jax.Array, weights: Weights, scale: float) -> jax.Array:

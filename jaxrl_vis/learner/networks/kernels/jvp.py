@@ -24,10 +24,10 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     dot,
     joined,
     layer,
-    quarters_of,
     read,
     rows,
-    rows_of,
+    tile_quarters,
+    tile_rows,
     whole,
 )
 from jaxrl_vis.learner.networks.kernels.patches import divisor
@@ -39,12 +39,12 @@ def _tangent_kernel(x_ref, *refs):
     weights, along = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
 
     def one_tile(tile, _):
-        values, tangents = x_ref[quarters_of(tile), :], None
+        values, tangents = x_ref[tile_quarters(tile), :], None
         for level, parameters in enumerate(zip(*weights, *along, strict=True)):
             tangents = None if tangents is None else joined(tangents, level)
             values, tangents = _layer_along(joined(values, level), tangents, *parameters)
         assert tangents is not None  # there is a layer
-        out_ref[rows_of(tile), :], tangent_ref[rows_of(tile), :] = values, tangents
+        out_ref[tile_rows(tile), :], tangent_ref[tile_rows(tile), :] = values, tangents
 
     jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
@@ -86,7 +86,7 @@ def _along_on_gpu(
     outputs = weights.biases[-1].shape[0]
     block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
     data, data_spec = as_quarters(patches, first, block)
-    cast = jax.tree.leaves([cast_kernels(each, patches.dtype) for each in (weights, along)])
+    cast = jax.tree.leaves([cast_kernels(tree, patches.dtype) for tree in (weights, along)])
     out = jax.ShapeDtypeStruct((count, outputs), patches.dtype)
     return kernel_call(
         _tangent_kernel,

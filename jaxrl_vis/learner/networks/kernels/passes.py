@@ -106,11 +106,11 @@ def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
 
 def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
     """Return the output of each layer for [4 R, 16 C'] quarters of patches; `joined` says in which rows."""
-    found, values = [], quarters
+    outputs, values = [], quarters
     for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
         values = layer(joined(values, level), kernel, bias)
-        found.append(values)
-    return found
+        outputs.append(values)
+    return outputs
 
 
 def joined(values: jax.Array, level: int) -> jax.Array:
@@ -128,17 +128,17 @@ def _forward_kernel(x_ref, *refs):
     weights, out_ref = read(refs[:-1]), refs[-1]
 
     def one_tile(tile, _):
-        *_, out_ref[rows_of(tile), :] = _layers(x_ref[quarters_of(tile), :], weights)
+        *_, out_ref[tile_rows(tile), :] = _layers(x_ref[tile_quarters(tile), :], weights)
 
     jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
 
-def rows_of(tile: Any) -> Any:
+def tile_rows(tile: Any) -> Any:
     """Rows of a tile in the result."""
     return pl.ds(tile * TILE, TILE)
 
 
-def quarters_of(tile: Any) -> Any:
+def tile_quarters(tile: Any) -> Any:
     """Quarters of patches of a tile."""
     return pl.ds(4 * tile * TILE, 4 * TILE)
 
@@ -152,9 +152,9 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(tile, sums):
-        values = [x_ref[quarters_of(tile), :]]
-        values += [*_layers(values[0], hidden_layers), out_ref[rows_of(tile), :]]
-        gradient, of_kernels, of_biases = gradient_ref[rows_of(tile), :], list(sums.kernels), list(sums.biases)
+        values = [x_ref[tile_quarters(tile), :]]
+        values += [*_layers(values[0], hidden_layers), out_ref[tile_rows(tile), :]]
+        gradient, of_kernels, of_biases = gradient_ref[tile_rows(tile), :], list(sums.kernels), list(sums.biases)
         for level in reversed(range(LEVELS)):
             gradient = before(values[level + 1], gradient)
             of_kernels[level] += dot(joined(values[level], level), gradient, (0, 0))
