@@ -45,7 +45,7 @@ class Agent(Replaceable):
 
     Attributes:
         actor, critic: Online parameters. The actor is a head alone where it shares the critic's encoder.
-        target_actor, target_critic: Slowly following copies; heads alone where there is no target encoder.
+        target_actor, target_critic: Slowly following copies; heads alone without target encoders.
         actor_optimizer, critic_optimizer: optax states.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
         weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
@@ -77,7 +77,7 @@ class ActorParams(NamedTuple):
 
 
 class Working(NamedTuple):
-    """An agent between two gradient steps of one iteration.
+    """Agent between two gradient steps of one iteration.
 
     Attributes:
         agent: The agent; its counters are those of the beginning.
@@ -94,7 +94,7 @@ class Working(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """A batch as `GradientSteps.gradients` takes it.
+    """Batch in the form that `GradientSteps.gradients` takes.
 
     Attributes:
         batch: With rewards.
@@ -111,7 +111,7 @@ class Gradients(NamedTuple):
     """Gradients of a batch.
 
     Attributes:
-        critic, actor: For the optimisers, float32; None for an actor that stays as it is.
+        critic, actor: For the optimisers, float32; None if the actor is not updated.
         weighting: State of the weighting after this batch; None where there is nothing to remember.
         autoencoder: For the optimiser of the autoencoder that makes rewards; None where there is none.
     """
@@ -143,12 +143,12 @@ class GradientSteps(NamedTuple):
 
 
 def _network_parameters(state: Agent) -> tuple[Params, ...]:
-    """The four networks' parameters, in the order of `ComputeCopies`."""
+    """Return the parameters of the four networks, in the order of `ComputeCopies`."""
     return state.actor, state.critic, state.target_actor, state.target_critic
 
 
 def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, key: jax.Array) -> Agent:
-    """An agent that has learned nothing: targets equal the online networks."""
+    """Initialise an agent; its target networks equal the online networks."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
     target_actor, target_critic = networks.init_target(actor), networks.init_target(critic)
@@ -171,12 +171,12 @@ def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward
 
 
 def _stack_counts(agent: Agent) -> jax.Array:
-    """`Working.counts`: one array, because XLA has a kernel for each counter that is one number."""
+    """Stack `Working.counts` in one array: XLA would launch a kernel per scalar counter."""
     return jnp.stack([adam.count(agent.critic_optimizer), adam.count(agent.actor_optimizer), agent.updates])
 
 
 def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
-    """The agent with its own counters again."""
+    """Put the counters back into the agent."""
     return agent.replace(
         critic_optimizer=adam.with_count(agent.critic_optimizer, counts[0]),
         actor_optimizer=adam.with_count(agent.actor_optimizer, counts[1]),
@@ -185,17 +185,17 @@ def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
 
 
 def _compute_copies(networks: Networks, agent: Agent) -> ComputeCopies:
-    """All four networks as they are computed with."""
+    """Make the compute copies of all four networks."""
     return ComputeCopies(*map(networks.compute_copy, _network_parameters(agent)))
 
 
 def _begin(networks: Networks, agent: Agent, statistics: Statistics) -> Working:
-    """`GradientSteps.begin`."""
+    """Implement `GradientSteps.begin`."""
     return Working(agent, _compute_copies(networks, agent), networks.batch_scaling(statistics), _stack_counts(agent))
 
 
 def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config) -> Agent:
-    """One step of both optimisers, and the targets a little after the online networks; ``counts`` include this step."""
+    """Step both optimisers, and update the target networks; ``counts`` include this step."""
     corrections = adam.corrections(counts[:2])
     critic, critic_moments = adam.step(
         state.critic, gradients.critic, state.critic_optimizer, config.critic_learning_rate, corrections[0]
@@ -220,7 +220,7 @@ def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config
 
 
 def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, goals: jax.Array) -> Metrics:
-    """`Algorithm.diagnose`: the mean value of the policy's actions where the goal itself is observed."""
+    """Implement `Algorithm.diagnose`: the mean value of the policy's actions where the goal itself is observed."""
     own = (statistics.observations,) if statistics.own_goals is None else (statistics.observations, statistics.goals)
     inputs = [networks.prepare(networks.scaling(part), goals) for part in own]
 
@@ -233,7 +233,7 @@ def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, go
 
 
 def _loss_metrics(weighted: Weighted, value: jax.Array) -> Metrics:
-    """Return metrics of the critic's losses and their weighting, and the mean of its values [B]."""
+    """Return metrics: the critic's losses, their weighting, and the mean of its values [B]."""
     return {
         "train/critic_loss": weighted.losses[MAIN],
         "train/value": jnp.mean(value),
@@ -245,13 +245,13 @@ def _loss_metrics(weighted: Weighted, value: jax.Array) -> Metrics:
 def make_ddpg(
     networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None, shards: Shards = ONE
 ) -> GradientSteps:
-    """Make the gradient steps of DDPG for these networks.
+    """Build the gradient steps of DDPG for these networks.
 
     Args:
         networks: Architecture of the parameters.
         config: Learning rates, target decay, action penalty.
         resolved: Discount, bounds of the targets, filter threshold.
-        auxiliary: Auxiliary tasks; None for those that ``config`` asks for, without stacked images.
+        auxiliary: Auxiliary tasks; None: those of ``config``, without stacked images.
         shards: Shards of the learner: batches are those of one shard, gradients and metrics those of the whole.
     """
     if auxiliary is None:
@@ -329,7 +329,7 @@ def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Age
         names: list[str] = []
 
         def take(state: tuple[Working, Prepared], following: Any) -> tuple[tuple[Working, Prepared], jax.Array]:
-            """Take gradient steps of which the last is the actor's, too; unrolled, so that the body has no conditional.
+            """Take gradient steps, of which only the last updates the actor; unrolled, so that the body has no conditional.
 
             Each has its batch already, and reads and prepares the next one. A GPU does that while it computes; with its own
             batch it would have to begin with it.
@@ -365,7 +365,7 @@ def _mean(values: list[jax.Array]) -> jax.Array:
 
 
 def make(setup: Setup) -> Algorithm:
-    """Make DDPG."""
+    """Build DDPG."""
     config, resolved = setup.config, setup.resolved
     networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias)
     steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards)

@@ -1,4 +1,4 @@
-"""Rewards of a batch, measured against the truth that only a simulation knows.
+"""Diagnostics of a batch's rewards against the ground truth, which only a simulation knows.
 
 Shares of one batch are means of products, so that a quotient of two of them, averaged over many batches, is the share over all
 of these batches: precision of the filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
@@ -20,7 +20,7 @@ def count_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` makes shares of them.
+    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` turns them into shares.
 
     Where a batch is spread over devices, the mean of these over the devices comes in between.
 
@@ -28,7 +28,7 @@ def count_rewards(
         reward: [B] float32.
         keep: [B] float32, 0 for what the filter drops (`losses.keep_mask`).
         reward_positive, reward_negative: R+ and R-.
-        success: [B] float32, 1 where the goal was truly reached; None: nothing is said about the truth.
+        success: [B] float32, 1 where the goal was truly reached; None: no comparison with the truth.
         graded: True if rewards lie anywhere between R- and R+: one in the middle counts as half a positive.
     """
     if graded:
@@ -48,12 +48,12 @@ def count_rewards(
 
 
 def of_rewards(*args: Any, **kwargs: Any) -> Metrics:
-    """The `shares` of a batch that is in one place; arguments as of `count_rewards`."""
+    """Compute the `shares` of an undivided batch; arguments as for `count_rewards`."""
     return shares(count_rewards(*args, **kwargs))
 
 
 def shares(counts: Metrics, parts: int = 1) -> Metrics:
-    """Shares of a batch, [] float32 by name; docs/learner.md says what each one means.
+    """Compute shares of a batch, [] float32 by name; docs/learner.md defines them.
 
     Args:
         counts: From `count_rewards`; of a batch in several parts, the mean over these.

@@ -1,4 +1,4 @@
-"""Gradients of several losses, what weightings need to know about them, and their weighted sum.
+"""Gradients of several losses, the statistics that weightings need, and the weighted sum.
 
 `weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of two ways, which
 agree up to rounding:
@@ -71,10 +71,10 @@ def everything(params: Params) -> Params:
 def loss_gradients(
     losses_fn: LossesFunction, params: Params, *args: Any, has_aux: bool = False
 ) -> tuple[dict[str, jax.Array], dict[str, Params], Any]:
-    """Compute each loss, and its gradient by itself.
+    """Compute each loss with its own gradient.
 
     Args:
-        losses_fn: (params, *args) -> [] floats by name; with ``has_aux``, and anything else beside these.
+        losses_fn: (params, *args) -> [] floats by name; with ``has_aux``, followed by any auxiliary output.
         params: The parameters to differentiate by.
         args: More arguments.
         has_aux: See ``losses_fn``.
@@ -120,11 +120,11 @@ def weighted_grad(
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
     encode: Encode | None = None,
 ) -> Callable[..., Weighted]:
-    """Make the function that computes the weighted gradient of a dictionary of losses.
+    """Build the function that computes the weighted gradient of a dictionary of losses.
 
     Args:
-        losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, and anything else
-            beside these. A gradient is taken for each loss as a whole, heads and shared parameters alike. With ``encode``:
+        losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, followed by any
+            auxiliary output. A gradient is taken for each loss as a whole, heads and shared parameters alike. With ``encode``:
             (params, latents, *args).
         weighting: From `make_weighting`.
         shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
@@ -133,7 +133,7 @@ def weighted_grad(
         has_aux: See ``losses_fn``.
         reduce: Applied to losses, gradients and dots before the weighting reads them, where each device has its own part of
             the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
-        forwards: Makes the context in which what is differentiated forwards is traced.
+        forwards: Factory of the context for tracing forward-mode differentiation.
         encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
             through these alone. Way latents needs it; the other takes it, too. Or a dictionary of such functions, where latents
             are a dictionary of the same names: gradients then pass only through those that a loss reads.

@@ -1,7 +1,7 @@
-"""Rollouts in parts, which the threads of a CPU play side by side, and evaluations by the same program.
+"""Rollouts and evaluations in parts, which the threads of a CPU run in parallel by the same program.
 
-Each thread waits for the end of what it calls. Without, XLA would take one call after the other. A rollout that is one part is
-called and not waited for, so that a GPU's host is ahead of it.
+Each thread waits for the programs that it calls. Without, XLA would take one call after the other. A rollout that is one part
+is called and not waited for, so that a GPU's host is ahead of it.
 """
 
 import concurrent.futures
@@ -19,7 +19,7 @@ from jaxrl_vis_envs.cores import num_cores
 
 
 class ThreadedRollout:
-    """Any number of environments, played in parts of one size.
+    """Rollout of any number of environments, in parts of one size.
 
     Args:
         size: P, environments of a part.

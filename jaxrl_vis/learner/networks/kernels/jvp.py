@@ -1,6 +1,6 @@
-"""The kernel of the encoder's first layers that also makes their tangents: forward along a direction of the weights.
+"""Kernel of the encoder's first layers with tangents along a direction of the weights.
 
-And the same in plain JAX, as in `kernels.passes`. Weightings that need dot products of gradients ask for it
+And the same in plain JAX, as in `kernels.passes`. Used by weightings that need dot products of gradients
 (`learner.tangents`).
 """
 
@@ -57,7 +57,7 @@ def _layer_along(
     kernel_along: jax.Array,
     bias_along: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """`layer` and its tangent, for tangents of the values (None: they have none), of the kernel and of the bias."""
+    """Compute `layer` and its tangent, given tangents of the values (None for zero), kernel and bias."""
     out, change = layer(values, kernel, bias), dot(values, kernel_along) + bias_along[None, :]
     if tangents is not None:
         change += dot(tangents, kernel)
@@ -66,7 +66,7 @@ def _layer_along(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
 def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    """`apply`, differentiable forwards instead, with respect to the weights."""
+    """Compute `apply`, differentiable in forward mode with respect to the weights."""
     return apply(patches, weights, first, count, interpret)
 
 
