@@ -327,7 +327,7 @@ def test_every_page_is_in_the_menu_and_reached_from_the_readme() -> None:
             or f"(docs/{page.name})" in readme
             or f"({page.name})" in "".join(other.read_text() for other in DOCS.glob("*.md"))
         )
-    for guide in ("tasks", "learner", "configuration", "runs", "extending", "adapters", "renderer", "glossary"):
+    for guide in ("start", "tasks", "learner", "configuration", "runs", "extending", "adapters", "renderer", "glossary"):
         assert f"(docs/{guide}.md)" in readme
 
 
