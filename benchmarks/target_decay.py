@@ -10,12 +10,13 @@ import dataclasses
 import itertools
 import re
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.ledger.markers import fill
+from benchmarks.ledger.markers import WIDTH, fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.report.learning import curve, steps_to
@@ -142,7 +143,8 @@ def tables(results: Path = RESULTS) -> str:
     groups = read_groups(results / "studies")
     parts = [line for task in TASKS for line in [*task_table(task, groups), ""]]
     revisions = sorted({text for group in groups.values() for text in group.revisions})
-    return "\n".join([*parts, *comparison_table(groups), "", f"Runs: {', '.join(revisions)}."]) + "\n"
+    runs = textwrap.fill(f"Runs: {', '.join(revisions)}.", WIDTH)
+    return "\n".join([*parts, *comparison_table(groups), "", runs]) + "\n"
 
 
 def main() -> int:

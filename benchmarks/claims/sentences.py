@@ -15,7 +15,8 @@ from benchmarks.claims.records import DISTANCE, Record, ablation, learning, stud
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
 
-DECAY, GUIDE, REWARDS = "docs/lab/target_decay.md", ol_aux.GUIDE, indicator.GUIDE
+DECAY, RESULTS = "docs/lab/target_decay.md", "docs/lab/results.md"
+GUIDE, REWARDS = ol_aux.GUIDE, indicator.GUIDE
 
 
 def _all(verdict: str, records: Sequence[Record], reference: Record) -> bool:
@@ -81,7 +82,7 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(LAB, f"better than `paper` ({_p(several, ten, 240_000)})", several.name)
     first_five = float(np.median(ten.at(100_000)[:5]))
     three = (none[FETCH].median(100_000), learning("fetch_reach_paper").median(100_000), first_five)
-    for page in (LAB, "README.md"):
+    for page in (LAB, RESULTS):
         yield Sentence(page, "have {:.2f}, {:.2f} and {:.2f} at 100 k steps".format(*three), ten.name)
 
 

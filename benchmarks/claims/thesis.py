@@ -1,4 +1,4 @@
-"""Claims of the thesis beside the findings of the records: docs/claims.md, and in short README.md and docs/index.md.
+"""Claims of the thesis beside the findings of the records: docs/claims.md, and in short README.md.
 
 Verdicts are computed: ``better`` and ``worse`` where the exact permutation test says so, else ``level``.
 """
@@ -345,7 +345,7 @@ def _seeds(claim: Claim) -> str:
 
 
 def _table() -> str:
-    lines = ["| claim of the thesis | | what we find | interval | seeds | figure |", "|---|---|---|---|---|---|"]
+    lines = ["| claim of the thesis | here | what we find | interval | seeds | figure |", "|---|---|---|---|---|---|"]
     lines += [
         f"| {row.claim} | {row.answer} | {row.finding} | {row.interval} | {_seeds(row)} | {row.source} |" for row in claims()
     ]
@@ -353,12 +353,12 @@ def _table() -> str:
     return "\n".join([*lines, "", made])
 
 
-def _short(prefix: str) -> str:
+def _short() -> str:
     lines = ["| claim of the thesis | here | what we find |", "|---|---|---|"]
     lines += [f"| {row.claim} | {row.answer} | {row.finding} |" for row in claims() if row.main]
-    return "\n".join([*lines, "", f"Intervals, p-values, seeds and figures: [Claims of the thesis]({prefix}claims.md)."])
+    return "\n".join([*lines, "", "Intervals, p-values, seeds and figures: [Claims of the thesis](docs/claims.md)."])
 
 
 def tables() -> dict[str, dict[str, str]]:
     """Page -> marker -> text."""
-    return {PAGE: {"claims": _table()}, "README.md": {"claims": _short("docs/")}, "docs/index.md": {"claims": _short("")}}
+    return {PAGE: {"claims": _table()}, "README.md": {"claims": _short()}}

@@ -73,7 +73,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
 
 
 def _settled(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
-    """Return the call, synchronised if several devices of a CPU share its threads: two calls could wait for each other."""
+    """Wrap a call to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
     if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
         return call
     return lambda: jax.block_until_ready(call())

@@ -89,7 +89,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
 
 def updates_per_call(settings: Settings) -> int:
-    """Gradient steps of one timed call."""
+    """Number of gradient steps in one timed call."""
     return 200 if settings.on_accelerator else 20
 
 

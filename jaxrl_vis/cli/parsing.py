@@ -224,7 +224,7 @@ def _split(
 
 
 def _check_values(words: Sequence[str], options: Sequence[_Option]) -> None:
-    """Rejects true or false after a flag, and several numbers after an option that takes one: they would be taken for a task.
+    """Reject true or false after a flag, and several numbers after an option that takes one: they would pass for a task.
 
     Raises:
         RequestError: There are such values.

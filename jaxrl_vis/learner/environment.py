@@ -1,4 +1,4 @@
-"""The environment that a configuration asks for."""
+"""Environment of a configuration."""
 
 import dataclasses
 from typing import Any
@@ -23,10 +23,10 @@ def _own_option(name: str) -> str | None:
 
 
 def locate_env(config: Config) -> Config:
-    """Return ``config`` with the folder that its environment, and whatever else is ``module:Name``, was imported from.
+    """Return ``config`` with the folder of its ``module:Name`` parts filled in.
 
     Raises:
-        RequestError: There is no such environment, what holds it cannot be imported, or modules lie in several folders.
+        RequestError: There is no such environment, its module cannot be imported, or the modules are in several folders.
     """
     validate(config)
     try:

@@ -1,12 +1,12 @@
-"""One training iteration, for one or several seeds, as two compiled programs that are called one after the other.
+"""One training iteration, for one or several seeds, as two compiled programs that are called in turn.
 
     keys        random numbers that this iteration's rollout draws from: fold_in(seed's key, iteration)
     play        reset, then scan over T: act, advance, observe            -> episodes, of all environments or of a few
     learn       replay, statistics, gradient steps, metrics (`iteration`)
 
-XLA compiles the two side by side, and nothing is lost by the division: episodes lie in the device's memory in either case, and
+XLA compiles the two in parallel, and the division costs nothing: episodes are in the device's memory in either case, and
 neither program waits for the host. `vmap` over the seeds' axis trains several learners at once. `learn` is donated the loop
-state, so the replay is written where it lies. On several devices (`sharding`) each runs all of this on its part of the seeds,
+state, so the replay is updated in place. On several devices (`sharding`) each runs all of this on its part of the seeds,
 or of one learner.
 """
 
@@ -52,12 +52,12 @@ _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore
 
 @dataclasses.dataclass(frozen=True)
 class TrainStep:
-    """The programs of a run, jitted and not compiled yet, and what they were made of; see `make_train_step`.
+    """Programs of a run, jitted but not yet compiled, and their ingredients; see `make_train_step`.
 
     Attributes:
-        env, config, resolved, acting, auxiliary: Parts that the programs were made of.
+        env, config, resolved, acting, auxiliary: Parts that the programs were built from.
         replay: Sizes of one device's part of a learner's replay.
-        layout: Placement of seeds and shards; all programs take and return arrays that lie there.
+        layout: Placement of seeds and shards; all programs take and return arrays placed there.
         exploration: Noise of training; an evaluation has none.
         plays_any: True if ``play`` can begin with any environment, and so evaluate, too; else it plays a whole rollout.
         part_size: P, environments that one call of ``play`` plays, on all devices together.
@@ -187,7 +187,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         layout: Placement on devices; None: as ``config`` says.
 
     Raises:
-        RequestError: The configuration asks for something that cannot be.
+        RequestError: The configuration is contradictory.
     """
     resolved = resolve(validate(config), env.horizon)
     layout = make_layout(config) if layout is None else layout

@@ -41,7 +41,7 @@ def is_trusted(run_dir: Path, config: Config) -> bool:
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
-    """Store that the custom parts of a run may be imported.
+    """Remember that the custom parts of a run may be imported.
 
     Args:
         run_dir: The run folder.

@@ -204,9 +204,9 @@ def test_resuming_what_is_not_there_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_examples_of_the_readme_leave_nothing_untracked(checkout: Path) -> None:
-    readme = (checkout / "README.md").read_text()
-    files = re.findall(r"(?:--out|--gallery|--json|--run-dir) ([\w./]+)", readme)
+def test_examples_of_the_first_page_leave_nothing_untracked(checkout: Path) -> None:
+    page = (checkout / "docs" / "start.md").read_text()
+    files = re.findall(r"(?:--out|--gallery|--json|--run-dir) ([\w./]+)", page)
     assert {"reach.gif", "tasks.png", "runs/mine"} <= set(files)
     if provenance.is_checkout(checkout):
         for file in files:

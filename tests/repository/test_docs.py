@@ -325,7 +325,7 @@ def test_every_page_is_in_the_menu_and_reached_from_the_readme() -> None:
             or f"(docs/{page.name})" in readme
             or f"({page.name})" in "".join(other.read_text() for other in DOCS.glob("*.md"))
         )
-    for guide in ("tasks", "learner", "configuration", "runs", "extending", "adapters", "renderer", "glossary"):
+    for guide in ("start", "tasks", "learner", "configuration", "runs", "extending", "adapters", "renderer", "glossary"):
         assert f"(docs/{guide}.md)" in readme
 
 
@@ -399,6 +399,17 @@ def test_columns_of_the_site_are_wide_enough_to_read() -> None:
     assert fit("<td><code>image_size 16</code></td>") == "<td><code>image_size 16</code></td>"
 
 
+def test_rows_of_wide_tables_have_labels_for_phones() -> None:
+    label = load_tool("hooks").label_cells
+    head = "<table><thead><tr><th>a</th><th>b &amp; <code>c</code></th><th>d</th></tr></thead>"
+    narrow = head + "<tbody><tr><td>1</td><td>2</td><td>3</td></tr></tbody></table>"
+    assert label(narrow) == narrow
+    wide = label(narrow.replace("<td>2", '<td class="long">2'))
+    assert wide.startswith("<table data-cards>") and "<th>a</th>" in wide
+    assert '<td data-label="a">1</td><td data-label="b &amp; c" class="long">2</td>' in wide
+    assert "[data-cards] td" in (DOCS / "site.css").read_text()
+
+
 def test_pages_of_the_site_name_files_that_it_does_not_hold() -> None:
     hooks = load_tool("hooks")
     assert (
@@ -406,3 +417,4 @@ def test_pages_of_the_site_name_files_that_it_does_not_hold() -> None:
     )
     assert hooks.name_files_outside("[benchmarks/results](../benchmarks/results)") == "`benchmarks/results`"
     assert hooks.name_files_outside("![image](../x.png)") == "![image](../x.png)"
+    assert hooks.name_files_outside("[a](../b.md) [c](../../d.py)", depth=1) == "[a](../b.md) c (`d.py`)"

@@ -1,9 +1,9 @@
-"""From the replay to a batch that a loss can be taken of: sample, relabel, reward.
+"""Batches from the replay: sample, relabel, reward.
 
     choose     which transitions (`replay`), and which slot of its own episode is each one's goal (`relabel`)
-    batch      reads them, makes goals of what was observed in those slots, and rewards what was reached
+    batch      reads them, turns observations in those slots into goals, and computes rewards
 
-Rewards are computed anew from what the replay holds, by the same functions that score the environments. No MuJoCo here.
+Rewards are recomputed from the contents of the replay, by the same functions that score the environments. No MuJoCo here.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ _TRIVIAL, _SHIFT, _TARGETS = 0x747276, 0x736866, 0x617578
 
 
 class Choice(NamedTuple):
-    """Choice of transitions and of their goals; made ahead, for many batches at once.
+    """Chosen transitions and goals, drawn ahead for many batches at once.
 
     Attributes:
         indices: Places of the transitions, [B] each.
@@ -50,14 +50,15 @@ class Choice(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Sampler:
-    """Draws batches; all methods are pure.
+    """Sampler of batches; all methods are pure.
 
     Attributes:
         config: Batch size, method, and p1.
         resolved: p2, R+ and R-.
         replay: Sizes of the replay to read from.
         threshold: Threshold of the oracle's reward, in the unit of the true states.
-        as_goal: [...] -> [...], makes a goal of what was reached (`GoalEnv.as_goal`); None where an observation is one already.
+        as_goal: [...] -> [...], converts an achieved observation to a goal (`GoalEnv.as_goal`); None where an observation is
+            one already.
         auxiliary: Auxiliary tasks, whose targets batches carry.
         shards: Shards of the learner. ``replay`` is one, and so are batches; the configuration's batch size is that of all.
     """
@@ -71,7 +72,7 @@ class Sampler:
     shards: Shards = ONE
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
-        """Draw B transitions and their goals: all of them for every part of a learner, which then keeps its own.
+        """Draw B transitions and their goals; every shard draws those of the whole learner and keeps its own.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -113,7 +114,7 @@ class Sampler:
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 
     def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
-        """Return which relabelled goals [B] bool another episode's replace: most of those that are reached already.
+        """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
 
         Not to the original goals. Where these look different from what episodes show (VisualFingerTurn's finger always hangs
         down in them), all that is seldom reached would look like that, and a critic would tell rewards by it.
@@ -125,7 +126,7 @@ class Sampler:
         return is_trivial & ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
-        """Read what was chosen, with goals that stand still and rewards that belong to them.
+        """Read the chosen transitions, with goals at rest and the matching rewards.
 
         Args:
             state: The replay.
@@ -152,7 +153,7 @@ class Sampler:
         return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
     def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
-        """The oracle's rewards of up to ``n_step`` steps, discounted and summed, and the discount of what follows them."""
+        """Replace rewards by discounted sums of the oracle's over up to ``n_step`` steps, and adapt the discounts."""
         episode, time = choice.indices
         after = time[:, None] + 1 + jnp.arange(self.config.study.n_step)  # slots that the steps lead to, [B, n]
         is_step = after <= self.replay.horizon
@@ -166,11 +167,11 @@ class Sampler:
         )
 
     def reward(self, batch: Batch, reached: jax.Array, clutter_end: jax.Array | None = None) -> jax.Array:
-        """Rewards [B] float32.
+        """Compute the rewards [B] float32.
 
         Args:
             batch: The transitions, relabelled.
-            reached: [B, ...] what they have reached, as a goal would show it.
+            reached: [B, ...] the achieved observations, converted to goals.
             clutter_end: As of `Choice`.
         """
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
@@ -182,7 +183,7 @@ class Sampler:
         return goals.indicator_reward(reached, batch.goal, num_axes=reached.ndim - 1, **values)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
-        """The oracle's rewards, with the errors of an estimator where the configuration asks for some."""
+        """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""
         config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
         states = (
             reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1

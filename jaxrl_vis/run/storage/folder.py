@@ -264,7 +264,7 @@ class RunFolder:
 
 
 def _is_remainder(checkpoint: Path, run_id: str | None) -> bool:
-    """Return whether a checkpoint without its run's folder is half of one, or of the run ``run_id``."""
+    """Return True if a checkpoint left in a deleted run folder is unfinished, or belongs to the run ``run_id``."""
     manifest = checkpoint / "manifest"
     try:
         is_ours = not manifest.exists() or json.loads((manifest / "metadata").read_bytes()).get(RUN_ID) == run_id

@@ -87,7 +87,7 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
         path: metrics.jsonl.
         expected: Conditions on every row.
         is_written: Another process may be writing, so that the last line may be incomplete.
-        findings: Is added to.
+        findings: Findings, to which this adds.
     """
     *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
     if rest and not is_written:
@@ -181,7 +181,7 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     Args:
         record: Contents of the file.
         config: The configuration in it.
-        findings: Is added to.
+        findings: Findings, to which this adds.
     """
     if record.get("preset") != config.run.preset:
         findings.problems.append(
@@ -211,7 +211,7 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
         folder: The run folder.
         is_finished: The run is complete.
         shows_images: A complete run has a video.
-        findings: Is added to.
+        findings: Findings, to which this adds.
     """
     files = (folder.config, folder.metrics, folder.processes, folder.curve, folder.video)
     of_run = {file.name for file in files} | {LOCK_NAME, WANDB_STATE, *_PLAYED}

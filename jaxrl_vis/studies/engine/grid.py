@@ -1,4 +1,4 @@
-"""Engine of all studies: trains a grid of cells, each in a process, with one process per device.
+"""Engine of all studies, which trains a grid of cells, each in a process of its own, one per device.
 
     unfinished cells -> `python -m jaxrl_vis train ... [--resume]`, a free device each -> run folders (`cells`)
 
@@ -99,7 +99,7 @@ def run_cells(
     say: Callable[[str], None] = streams.say,
     start: Start = start_process,
 ) -> list[str]:
-    """Train unfinished cells; resumes those already started.
+    """Train unfinished cells; resume those already started.
 
     Args:
         cells: Cells to train: longest first, so that devices finish at about the same time, otherwise in this order.

@@ -65,7 +65,7 @@ def make_cells(request: Request) -> list[Cell]:
 
 
 def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> bool:
-    """Train missing cells, resumes unfinished ones, and print a table.
+    """Train missing cells, resume unfinished ones, and print a table.
 
     Returns:
         True if everything is finished.

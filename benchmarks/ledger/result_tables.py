@@ -1,4 +1,4 @@
-"""Tables of the README, written from the records: the rows are declared in `readme_rows`, the figures are not.
+"""Tables of docs/lab/results.md, written from the records: the rows are declared in `result_rows`, the figures are not.
 
 A figure without a record reads `MISSING`, and `make stale` lists it.
 """
@@ -10,13 +10,14 @@ from typing import Any
 
 from benchmarks.ledger import evidence
 from benchmarks.ledger.evidence import Evidence
-from benchmarks.ledger.readme_rows import DEVICES, LEARNING, SPEED, Figure, Learning
 from benchmarks.ledger.records import read_all
+from benchmarks.ledger.result_rows import DEVICES, LEARNING, SPEED, Figure, Learning
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.run.command import training_command
 
+PAGE = "docs/lab/results.md"
 MISSING = "not measured yet"
 
 
@@ -99,7 +100,7 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
         if made_with != config:
             differing = [name for name, value in config.flat().items() if made_with.value(name) != value]
             raise RequestError(
-                f"evidence {name} was made by `{run.record['command']}`, and the README says `{training_command(config)}`, "
+                f"evidence {name} was made by `{run.record['command']}`, and the table says `{training_command(config)}`, "
                 f"which has other {', '.join(differing)}: train again, then python -m benchmarks.ledger keep"
             )
         runs.append(run)
