@@ -46,7 +46,7 @@ def run(options: Run) -> int:
     from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 
     runs = find_plots(options.folder)
-    calibrations = {folder.name: options.read_calibration(folder.folder) for folder in runs}
+    calibrations = {folder.name: options.read_calibration(folder) for folder in runs}
     for name, calibration in calibrations.items():
         if calibration is None:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")

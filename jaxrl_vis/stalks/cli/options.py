@@ -13,6 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
 
 if TYPE_CHECKING:
+    from jaxrl_vis.stalks.phenotyping.io.folders import PlotFolder
     from jaxrl_vis_envs.plants import Calibration, Family
 
 # Module -> package, for the packages of an extra.
@@ -185,23 +186,23 @@ class CameraOptions:
     """Options of a command that reads folders of stereo pairs."""
 
     calibration: Path | None = None
-    """Calibration of all folders (OpenCV, or ROS left.yaml and right.yaml); calibration.yaml of each folder if not given.
-    Without one there are no metric lengths."""
+    """Calibration of all folders: a file of OpenCV, RealSense, Middlebury or KITTI, or a folder with left.yaml and right.yaml
+    of ROS. If not given, the one that lies in each folder: calibration.yaml, extrinsics.yml, calib.txt, left.yaml and
+    right.yaml. Without one there are no metric lengths."""
     calibration_unit: Literal["m", "mm"] | None = None
     """Unit of the calibration's baseline, where the file does not say it."""
     speed: float | None = None
     """Speed of the robot in m/s, for an odometry.csv that holds times only."""
 
-    def read_calibration(self, folder: Path) -> Calibration | None:
+    def read_calibration(self, plot: PlotFolder) -> Calibration | None:
         """Return the calibration of one folder of pairs; None where there is none.
 
         Raises:
             RequestError: The file cannot be read.
         """
         from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+        from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import own_calibration
 
-        if self.calibration is not None:
-            return read_calibration(self.calibration, self.calibration_unit)
-        own = [folder / name for name in ("calibration.yaml", "calibration.yml", "calibration.xml")]
-        path = next((path for path in own if path.exists()), None)
-        return None if path is None else read_calibration(path, self.calibration_unit)
+        path = self.calibration or own_calibration(plot.folder)
+        image = next((pair.left for pair in plot.pairs if pair.left is not None), None)
+        return None if path is None else read_calibration(path, self.calibration_unit, image)

@@ -59,7 +59,7 @@ def run(options: Run) -> int:
     plots = find_plots(options.folder or SAMPLE)
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
-    calibrations = {plot.name: options.read_calibration(plot.folder) for plot in plots}
+    calibrations = {plot.name: options.read_calibration(plot) for plot in plots}
     if options.workers > 1:
         share_accelerator()
     check_devices()
