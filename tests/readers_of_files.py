@@ -69,7 +69,8 @@ def read_annotations(folder: Path) -> None:
 
 
 def read_odometry(folder: Path) -> None:
-    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
+    from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometries
 
     pairs = tuple(PairFiles(name, folder / f"left_{name}.png", folder / f"right_{name}.png") for name in PAIRS)
     plot = PlotFolder("plot", folder, pairs)
@@ -106,7 +107,8 @@ def read_image(folder: Path) -> None:
 
 def read_names(folder: Path) -> None:
     """Plots of a folder of empty files: each image is at most one side of one pair, and what is not found is no pair's."""
-    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
+    from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometries
 
     plots = find_plots(folder)
     pairs = [(plot, pair) for plot in plots for pair in plot.pairs]

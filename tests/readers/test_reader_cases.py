@@ -11,8 +11,9 @@ import pytest
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import weights_file
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, find_plots, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image
+from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometry
 
 SIZE = {"width": 20, "height": 12}
 OUTLINE = [2, 3, 8, 3, 8, 9]
@@ -65,6 +66,10 @@ def test_rows_of_odometry_are_those_of_pairs(tmp_path):
     "table, told",
     [
         ("", "needs a column distance_m, or time_s and --speed"),
+        ("left,distance\nleft_0.png,1\n", "its column distance does not say its unit"),
+        ("time_s\n1608946479573159936\n1608946479673159936\n", "name the column time_ns"),
+        ("distance_m\n1\n\n,\nfar\n", "no number in line 5 ('far')"),
+        ("left;distance_m\nleft_0.png;1,2,3\n", "no number in line 2 ('1,2,3')"),
         ("left,metres\nleft_0.png,1\n", "needs a column distance_m, or time_s and --speed"),
         ("distance_m\n1\n", "has 1 rows for 2 pairs, so nobody can tell which is which"),
         ("distance_m\n1\n2\n3\n", "has 3 rows for 2 pairs, so nobody can tell which is which"),

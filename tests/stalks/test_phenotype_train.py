@@ -152,8 +152,8 @@ def test_what_is_wrong_with_an_annotation_is_told_with_its_number(tmp_path, anno
 @pytest.mark.parametrize(
     ("image", "part"),
     [
-        ({"width": None}, "image row.png needs a width and a height in pixels, not None and 60"),
-        ({"height": 0}, "image row.png needs a width and a height in pixels, not 64 and 0"),
+        ({"width": None, "file_name": "a.png"}, "image a.png needs a width and a height in pixels, not None and 60"),
+        ({"height": 0, "file_name": "a.png"}, "image a.png needs a width and a height in pixels, not 64 and 0"),
         ({"file_name": None}, "image number 1 needs an id and a file_name"),
     ],
 )

@@ -45,7 +45,7 @@ def run(options: Run) -> int:
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 
-    runs = find_plots(options.folder)
+    runs = find_plots(options.folder, options.patterns())
     calibrations = {folder.name: options.read_calibration(folder) for folder in runs}
     for name, calibration in calibrations.items():
         if calibration is None:

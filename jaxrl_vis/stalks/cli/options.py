@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
 
 if TYPE_CHECKING:
-    from jaxrl_vis.stalks.phenotyping.io.folders import PlotFolder
+    from jaxrl_vis.stalks.phenotyping.io.folders import Patterns, PlotFolder
     from jaxrl_vis_envs.plants import Calibration, Family
 
 # Module -> package, for the packages of an extra.
@@ -193,6 +193,25 @@ class CameraOptions:
     """Unit of the calibration's baseline, where the file does not say it."""
     speed: float | None = None
     """Speed of the robot in m/s, for an odometry.csv that holds times only."""
+
+    left: str | None = None
+    """Pattern of the left images within each plot's folder, as 'image_02/*.png', with --right; what the stars stand for is the
+    same for both images of a pair, or the times that are nearest. If not given, names say left and right, L and R, cam0 and
+    cam1, ..."""
+    right: str | None = None
+    """Pattern of the right images, with --left."""
+
+    def patterns(self) -> Patterns | None:
+        """Return the patterns of the images' names; None where names say it themselves.
+
+        Raises:
+            RequestError: Only one side is given.
+        """
+        from jaxrl_vis.stalks.phenotyping.io.folders import Patterns
+
+        if (self.left is None) != (self.right is None):
+            raise RequestError("--left and --right go together: give a pattern for each side")
+        return None if self.left is None or self.right is None else Patterns(self.left, self.right)
 
     def read_calibration(self, plot: PlotFolder) -> Calibration | None:
         """Return the calibration of one folder of pairs; None where there is none.

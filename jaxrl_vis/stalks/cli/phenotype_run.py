@@ -56,7 +56,7 @@ def run(options: Run) -> int:
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE, find_plots
 
-    plots = find_plots(options.folder or SAMPLE)
+    plots = find_plots(options.folder or SAMPLE, options.patterns())
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
     calibrations = {plot.name: options.read_calibration(plot) for plot in plots}

@@ -8,28 +8,28 @@ Side = Literal["left", "right"]
 _WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
 _LAST_LETTER = re.compile(r"(?<=[a-z])[LR](?![A-Za-z])")
-_NUMBER = re.compile(
-    r"(?<![a-z])((?:cam|camera|image|im|img|infra|infrared|ir|view|sensor|stereo)_?)(0?[0-3])(?![0-9])", re.IGNORECASE
-)
+_CAMERAS = r"(?<![a-z])((?:cam|camera|im|infra|infrared|ir|view|sensor|stereo{})_?)(0?[0-3])(?![0-9])"
+_NUMBER = re.compile(_CAMERAS.format("|image|img"), re.IGNORECASE)
+_NUMBER_IN_FILES = re.compile(_CAMERAS.format(""), re.IGNORECASE)  # image_0 and image_1 may be the first two of many
 _OTHER = {"left": "right", "right": "left", "l": "r", "r": "l"}
 
 
-def partners(name: str, numbered: bool = True) -> Iterator[tuple[Side, str]]:
+def partners(name: str, files: bool = False) -> Iterator[tuple[Side, str]]:
     """Sides that a name may say, each with the name that the other camera's would have; the likeliest first.
 
     Args:
         name: Stem of a file, or name of a folder.
-        numbered: If false, numbers of cameras are no sides.
+        files: If true, the name is that of one image of many: only numbers of cameras and letters at its end are looked at.
     """
-    for pattern in (_WORD, _LETTER, _LAST_LETTER):
+    for pattern in (_LAST_LETTER,) if files else (_WORD, _LETTER, _LAST_LETTER):
         for match in reversed(list(pattern.finditer(name))):
             word = match.group()
             other = _OTHER[word.lower()]
             other = other.upper() if word.isupper() else other.capitalize() if word.istitle() else other
             side: Side = "left" if word.lower().startswith("l") else "right"
             yield side, name[: match.start()] + other + name[match.end() :]
-    for match in reversed(list(_NUMBER.finditer(name))) if numbered else ():
+    for match in reversed(list((_NUMBER_IN_FILES if files else _NUMBER).finditer(name))):
         number, digits = int(match[2]), len(match[2])
-        for side, other in (("left", number + 1), ("right", number - 1)):
-            if other >= 0:
-                yield side, name[: match.start(2)] + f"{other:0{digits}d}" + name[match.end() :]  # pyright: ignore
+        yield "left", name[: match.start(2)] + f"{number + 1:0{digits}d}" + name[match.end() :]
+        if number:
+            yield "right", name[: match.start(2)] + f"{number - 1:0{digits}d}" + name[match.end() :]
