@@ -81,7 +81,8 @@ def test_images_of_one_camera_are_no_pairs(tmp_path, names):
         ([f"image_0{number}/data/0.png" for number in range(4)], "holds pairs of image_00 and image_01 and of"),
         (["cam0/0.png", "cam1/0.png", "cam2/0.png"], "say which with --left"),
         (["left_raw_0.png", "left_rect_0.png", "right_raw_0.png", "right_rect_0.png"], "raw images (raw_0) and rectified ones"),
-        (["left/1608946479.10.png", "left/1608946479.20.png", "right/1608946479.14.png", "right/1608946479.24.png"], "40 ms apart"),
+        ([f"{side}/1608946479.{cents}.png" for side, cents in (("left", 10), ("left", 20), ("right", 14), ("right", 24))],
+         "40 ms apart"),
     ],
 )  # fmt: skip
 def test_where_names_do_not_say_it_the_user_is_asked(tmp_path, names, part):

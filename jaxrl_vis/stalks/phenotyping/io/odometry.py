@@ -5,9 +5,7 @@ odometry.csv     distance_m (_cm, _mm), or time_s (_ms, _us, _ns) with --speed, 
 odometry.txt     the same, parted by tabs, semicolons or spaces; or what rostopic echo or ros2 topic echo prints
 """
 
-import csv
 import dataclasses
-import io
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -17,10 +15,10 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.spreadsheets import unescape_cell
+from jaxrl_vis.stalks.phenotyping.io.cells import cells, read_table_text
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis.stalks.phenotyping.io.stamps import seconds_in
-from jaxrl_vis_envs.documents import read_bytes
 
 _MAX_ODOMETRY = 8_000_000  # bytes
 _NAMES = tuple(f"{stem}{end}" for stem in ("odometry", "odom", "gps") for end in (".csv", ".tsv", ".txt", ".yaml"))
@@ -178,16 +176,7 @@ def _read(path: Path) -> _Table | None:
     """
     if not path.exists():
         return None
-    try:
-        data = read_bytes(path, _MAX_ODOMETRY)
-        # Spreadsheets write a mark of the byte order before the first column's name.
-        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
-    except OSError as error:
-        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 (is not UTF-8 text)") from error
-    except ValueError as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
+    text = read_table_text(path, _MAX_ODOMETRY)
     return _printed(path, text) or _tabled(path, text)
 
 
@@ -215,7 +204,8 @@ def _tabled(path: Path, text: str) -> _Table:
     Raises:
         RequestError: A column or a number is missing.
     """
-    columns, rows, comma = _cells(path, text)
+    columns, rows, comma = cells(path, text)
+    columns = [name.lower() for name in columns]
     metres = [(place, _METRES[match[1]]) for place, name in enumerate(columns) if (match := _DISTANCE.fullmatch(name))]
     time = _time_column(columns)
     places = next((names for names in (*_POSITIONS, *_GLOBE) if set(names[:2]) <= set(columns)), None)
@@ -292,29 +282,3 @@ def _number(cell: str, path: Path, line: int, comma: bool) -> float:
             f"{path} holds something that is no number in line {line} ('{shown}'): distances and times must be finite"
         )
     return value
-
-
-def _cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[str]]], bool]:
-    """Names of the columns, in small letters; rows with the numbers of their lines; and whether commas are decimal points.
-
-    Raises:
-        RequestError: The text is no table.
-    """
-    lines = text.splitlines()
-    first = next((place for place, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), len(lines))
-    comment = next((line.lstrip("# ") for line in reversed(lines[:first]) if line.strip(" #")), "")
-    head = lines[first] if first < len(lines) else ""
-    if re.match(r"\s*[-+.\d]", head) and comment:
-        first, head = first - 1, comment  # as in trajectories of TUM: the columns are named in a comment
-    counts = {mark: head.count(mark) for mark in ("\t", ";", ",")}
-    mark = max(counts, key=lambda mark: counts[mark]) if any(counts.values()) else None
-    if mark is None and len(head.split()) > 1 and not _DISTANCE.fullmatch(head.strip().lower()):
-        mark = " "
-    body = "\n".join([head, *lines[first + 1 :]])
-    try:
-        reader = csv.reader(io.StringIO(body, newline=""), delimiter=mark or ",", skipinitialspace=True)
-        columns = [unescape_cell(name.strip()).strip().lower() for name in next(reader, [])]
-        rows = [(first + reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
-    return columns, rows, mark in ("\t", ";", " ")
