@@ -104,7 +104,7 @@ def test_miappe_has_what_its_checklist_asks_for(tmp_path):
 
 
 def test_plantcv_is_as_its_own_reader_walks_through_it(tmp_path):
-    """plantcv.utils.json2csv: each variable has a category and a type; entities have metadata by name and observations by sample."""
+    """plantcv.utils.json2csv: variables have a category and a type; entities have metadata by name, observations by sample."""
     assert write(tmp_path, "plantcv") == "plantcv.json"
     data = json.loads((tmp_path / "plantcv.json").read_text())
     kinds = {"<class 'int'>": int, "<class 'float'>": float, "<class 'str'>": str}
@@ -134,10 +134,13 @@ PLANS = {
     "a number": "plot\trange\tgenotype\n1\t1\tA\n2\t2\tB\n",
     "a number with zeros": "unique_id,plot,range,genotype\nX7,001,1,A\nX9,002,2,B\n",
     "Field Book, table": '"plot_id","range","genotype","height"\n"plot_0001","1","A","99"\n"plot_0002","2","B",""\n',
-    "Field Book, observations": "plot_id,range,genotype,trait,userValue,timeTaken\n" + "".join(
-        f"plot_000{plot},{plot},{name},height,{value},2024-08-0{value}\n" for plot, name in ((1, "A"), (2, "B")) for value in (1, 2)
+    "Field Book, observations": "plot_id,range,genotype,trait,userValue,timeTaken\n"
+    + "".join(
+        f"plot_000{plot},{plot},{name},height,{value},2024-08-0{value}\n"
+        for plot, name in ((1, "A"), (2, "B"))
+        for value in (1, 2)
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("form", PLANS)
@@ -164,7 +167,7 @@ def test_ranges_and_rows_name_plots(tmp_path):
         ("plot_id,genotype\nx,A\ny,B\n", "its plot_id has x, y, and the folders are field 1/plot_0001"),
         ("plot_id,genotype,genotype\n1,A,B\n", "must name columns, each once"),
         ("", "must name columns"),
-        ("plot_id,genotype\nplot_0001,A\nplot_0001,B\nplot_0002,B\n", "says two things of genotype of plot field 1/plot_0001: A and B"),
+        ("plot_id,genotype\nplot_0001,A\nplot_0001,B\nplot_0002,B\n", "two things of genotype of plot field 1/plot_0001: A"),
     ],
 )  # fmt: skip
 def test_plans_that_cannot_be_joined_are_told_in_one_line(tmp_path, text, part):

@@ -98,10 +98,8 @@ def test_images_that_show_both_sides_are_told(tmp_path):
 
 
 def test_plots_in_nested_folders_have_the_way_to_them_as_name(tmp_path):
-    touch(
-        tmp_path,
-        *(f"field 1/range{row}/plot{plot}/{side}_0.png" for row in (1, 2) for plot in (1, 2) for side in ("left", "right")),
-    )
+    plots = [f"field 1/range{row}/plot{plot}" for row in (1, 2) for plot in (1, 2)]
+    touch(tmp_path, *(f"{plot}/{side}_0.png" for plot in plots for side in ("left", "right")))
     touch(tmp_path, "field 1/notes.txt", ".hidden/left_0.png", ".hidden/right_0.png")
     assert list(pairs(tmp_path)) == plots
 

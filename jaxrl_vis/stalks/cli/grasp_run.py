@@ -43,9 +43,8 @@ def run(options: Run) -> int:
     check_masks(options.masks, options.weights)
     check_extra("grasping")
     check_writable(options.out, "--out", folder=True)
-    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 
-    runs = find_plots(options.folder, options.patterns())
+    runs = options.find_plots(options.folder, options.out)
     calibrations = {folder.name: options.read_calibration(folder) for folder in runs}
     for name, calibration in calibrations.items():
         if calibration is None:

@@ -197,7 +197,7 @@ class CameraOptions:
     left: str | None = None
     """Pattern of the left images within each plot's folder, as 'image_02/*.png', with --right; what the stars stand for is the
     same for both images of a pair, or the times that are nearest. If not given, names say left and right, L and R, cam0 and
-    cam1, ..."""
+    cam1, ... Of a recording of ROS (.bag, .mcap, .db3): its topic."""
     right: str | None = None
     """Pattern of the right images, with --left."""
 
@@ -212,6 +212,21 @@ class CameraOptions:
         if (self.left is None) != (self.right is None):
             raise RequestError("--left and --right go together: give a pattern for each side")
         return None if self.left is None or self.right is None else Patterns(self.left, self.right)
+
+    def find_plots(self, folder: Path, out: Path) -> list[PlotFolder]:
+        """Return the plots of a folder, or of a recording, which is taken apart into the folder ``recording`` in ``out``.
+
+        Raises:
+            RequestError: There are none.
+        """
+        from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
+        from jaxrl_vis.stalks.phenotyping.io.recording import Topics, is_recording, take_apart
+
+        patterns = self.patterns()
+        if not is_recording(folder):
+            return find_plots(folder, patterns)
+        topics = None if patterns is None else Topics(patterns.left, patterns.right)
+        return find_plots(take_apart(folder, out / "recording", topics))
 
     def read_calibration(self, plot: PlotFolder) -> Calibration | None:
         """Return the calibration of one folder of pairs; None where there is none.

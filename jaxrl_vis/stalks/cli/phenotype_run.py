@@ -24,8 +24,8 @@ class Run(CameraOptions):
     """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
 
     folder: Annotated[Path | None, AlsoPositional()] = None
-    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that
-    comes with the package if not given."""
+    """A plot's folder of pairs (left_000.png, right_000.png, ...), a folder of such folders, or a recording of ROS (.bag,
+    .mcap, .db3; needs the extra `bags`); the short synthetic row that comes with the package if not given."""
     out: Path = Path("phenotype_results")
     """Folder for the results; a command that was stopped continues where it was."""
     weights: Path | None = None
@@ -63,11 +63,11 @@ def run(options: Run) -> int:
     check_extra("phenotyping")
     check_writable(options.out, "--out", folder=True)
     from jaxrl_vis.stalks.phenotyping.io.field_plan import missing_plots, read_field_plan
-    from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE, find_plots
+    from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
     from jaxrl_vis.stalks.phenotyping.report.exchange import with_terms, write_exchange
 
     traits = with_terms(options.term)
-    plots = find_plots(options.folder or SAMPLE, options.patterns())
+    plots = options.find_plots(options.folder or SAMPLE, options.out)
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
     calibrations = {plot.name: options.read_calibration(plot) for plot in plots}
@@ -122,7 +122,6 @@ def run(options: Run) -> int:
             )
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
-    print(
-        f"{options.out}: stalks.csv, plots.csv, {written}, qc.html and overlays (plots: {len(plots)}, pairs skipped: {len(skipped)})"
-    )
+    counts = f"plots: {len(plots)}, pairs skipped: {len(skipped)}"
+    print(f"{options.out}: stalks.csv, plots.csv, {written}, qc.html and overlays ({counts})")
     return SKIPPED if skipped else 0

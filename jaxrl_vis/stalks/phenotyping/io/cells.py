@@ -1,4 +1,4 @@
-"""Tables as spreadsheets, robots and field programs save them: parted by commas, semicolons, tabs or spaces, UTF-8 or UTF-16."""
+"""Tables as spreadsheets, robots and field programs save them: parted by commas, semicolons, tabs or spaces."""
 
 import csv
 import io

@@ -42,8 +42,8 @@ class Trait:
     whole: bool = False
 
 
-# The term of diameters is that of the Plant Trait Ontology for the thickness of stems. For the number of stalks in a plot no term
-# is known to us, neither there nor in the Crop Ontology of sorghum (CO_324): `--term` names what a programme uses.
+# The term of diameters is that of the Plant Trait Ontology for the thickness of stems. No term is known to us for the number of
+# stalks in a plot, neither there nor in the Crop Ontology of sorghum (CO_324): `--term` names what a programme uses.
 _DIAMETER = "TO:0000339"
 TRAITS = (
     Trait("stalks", "stalk number", "1", "count in the plot", whole=True),
