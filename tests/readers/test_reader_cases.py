@@ -1,6 +1,7 @@
 """What readers of files from outside say of cases that spoilt files (test_readers.py) seldom come to, one by one."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -179,13 +180,13 @@ def test_annotations_that_are_not_there_or_cannot_be_read_are_told(tmp_path):
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(RequestError, match="there are no annotations in "):
             read_annotations(folder)
-    for name in ("a.xml", "annotations.json"):
-        (tmp_path / name).mkdir()
+    for name, make in (("a.xml", os.mkfifo), ("annotations.json", os.mkdir)):
+        make(tmp_path / name)
         with pytest.raises(RequestError, match=f"cannot read .*{name}: "):
             read_annotations(tmp_path)
 
 
-def test_shapes_of_labelme_that_enclose_nothing_are_left_out(tmp_path):
+def test_shapes_of_labelme_that_enclose_nothing_are_told(tmp_path):
     shapes = [
         {"label": "stalk", "points": [[1, 2], [3, 2], [3, 5]]},
         {"label": "stalk", "points": [[1, 2], [3, 2]]},
@@ -193,6 +194,12 @@ def test_shapes_of_labelme_that_enclose_nothing_are_left_out(tmp_path):
         {"label": "stalk", "shape_type": "circle", "points": [[1, 2], [3, 2], [3, 5]]},
     ]
     data = {"imagePath": "x\\a.png", "imageWidth": 20, "imageHeight": 12, "shapes": shapes}
+    for place, told in ((1, "annotation 2 is a polygon of 2 points"), (3, "annotation 4 is a circle, which has no width")):
+        data["shapes"] = [shapes[0]] * place + [shapes[place]]
+        (tmp_path / "a.json").write_text(json.dumps(data))
+        with pytest.raises(RequestError, match=told):
+            read_annotations(tmp_path)
+    data["shapes"] = [shapes[0], shapes[2]]
     (tmp_path / "a.json").write_text(json.dumps(data))
     assert [each["bbox"] for each in read_annotations(tmp_path)["annotations"]] == [[1, 2, 2, 3], [2, 3, 4, 4]]
 

@@ -1,4 +1,4 @@
-"""Recordings of ROS 1 and ROS 2 as `phenotype run` takes them: images of both cameras, their calibration, and the way driven."""
+"""Recordings of ROS 1 and ROS 2 as `phenotype run` takes them: images of both cameras, their calibration, and the way."""
 
 from pathlib import Path
 
@@ -189,7 +189,7 @@ def test_files_that_are_no_recordings_are_told_in_one_line(tmp_path, name, kind)
         whole = write(tmp_path / "good.bag", 1).read_bytes()
     data = {
         "cut": whole[: len(whole) // 2],
-        "spoilt": whole[:100] + b"\xff" * 200 + whole[300:],
+        "spoilt": whole[:4150] + b"\xff" * 400 + whole[4550:],
         "empty": b"",
         "text": b"hello",
     }

@@ -184,6 +184,7 @@ def _write_message(folder: Path, message: Any, source: str) -> None:
             raise RequestError(f"{source}: images are compressed as {str(message.format)[:40]}, neither JPEG nor PNG")
         write_atomically(folder / f"{name}{suffix}", data)
         return
+    folder.mkdir(parents=True, exist_ok=True)
     write_image(folder / f"{name}.png", _pixels(message, source))
 
 

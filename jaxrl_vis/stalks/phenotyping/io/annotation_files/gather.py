@@ -47,7 +47,7 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     found: list[tuple[Any, Annotated]] = []
     names: list[str] | None = None
     numbers = itertools.count()
-    images = {image.with_suffix("").name: image for image in _files(folder, _IMAGES)}
+    images = {image.stem: image for image in _files(folder, _IMAGES) if image.is_file()}
     for file in files:
         if file.suffix.lower() == ".json":
             found += [] if file.name in _OTHERS else _json(file, numbers)
@@ -147,7 +147,7 @@ def _files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
         if any(path.name.lower() == "train" for path in folders):
             folders = [path for path in folders if path.name.lower() not in _HELD_BACK]
         for path in inside:
-            if path.suffix.lower() in suffixes and path.is_file():
+            if path.suffix.lower() in suffixes and not path.is_dir():
                 count += 1
                 if count > _MAX_FILES:
                     raise RequestError(f"{folder} holds more than {_MAX_FILES} files: name the folder of the annotations")
@@ -162,7 +162,7 @@ class _Index:
         self._folder = folder
         self._by_name: dict[str, list[Path]] = {}
         self._taken: dict[Path, Path] = {}
-        for path in _files(folder, _IMAGES):
+        for path in filter(Path.is_file, _files(folder, _IMAGES)):
             self._by_name.setdefault(path.name.lower(), []).append(path)
             self._by_name.setdefault(path.stem.lower() + "\0", []).append(path)
 
