@@ -53,8 +53,8 @@ def _voc_image(path: Path, root: Element) -> Annotated:
             # Pixels count from 1, and the last ones belong to the box.
             left, top, right, bottom = (float(_text(element, f"bndbox/{edge}")) for edge in _EDGES)
             annotations.append(boxed(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
-    size = [_whole(root.findtext(f"size/{side}")) for side in ("width", "height")]
-    return Annotated(_text(root, "filename"), *size, path, annotations)
+    width, height = (_whole(root.findtext(f"size/{side}")) for side in ("width", "height"))
+    return Annotated(_text(root, "filename"), width, height, path, annotations)
 
 
 def _whole(text: str | None) -> int | None:
