@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
-from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import own_calibration
+from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 from jaxrl_vis_envs.plants import Calibration
 
 CAMERAS = Calibration(640, 480, 500.0, (319.5, 239.5), 0.1)
@@ -181,10 +180,10 @@ def test_every_form_says_the_same_cameras(tmp_path, form):
 def test_calibrations_beside_images_are_found(tmp_path):
     """Under the names that programs give them, and no other file is taken for one."""
     none = put(tmp_path / "none", {"plot.json": "{}", "annotations.json": "{}", "odometry.csv": "", "notes.txt": ""})
-    assert own_calibration(none) is None
+    assert find_calibration(none) is None
     for form in ("stereo_calib of OpenCV", "rostopic echo", "cam0 and cam1", "Middlebury", "KITTI, raw data"):
         folder = put(tmp_path / form, {**FORMS[form], "plot.json": "{}"})
-        found = own_calibration(folder)
+        found = find_calibration(folder)
         assert found is not None and read_calibration(found, None, image(folder)).baseline == pytest.approx(0.1)
 
 

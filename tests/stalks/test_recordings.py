@@ -8,8 +8,7 @@ import pytest
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io import recording
-from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
-from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import own_calibration
+from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
 from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometry
@@ -128,7 +127,7 @@ def test_a_recording_is_a_plot(tmp_path, name, version, storage):
             assert pair.left is not None and pair.right is not None
             np.testing.assert_array_equal(read_image(pair.left), both[0])
             np.testing.assert_array_equal(read_image(pair.right), both[1])
-        calibration = own_calibration(folder)
+        calibration = find_calibration(folder)
         assert calibration is not None
         assert read_calibration(calibration).baseline == pytest.approx(0.1)
         driven = read_odometry(plot)

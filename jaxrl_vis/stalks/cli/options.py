@@ -234,9 +234,8 @@ class CameraOptions:
         Raises:
             RequestError: The file cannot be read.
         """
-        from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
-        from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import own_calibration
+        from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 
-        path = self.calibration or own_calibration(plot.folder)
+        path = self.calibration or find_calibration(plot.folder)
         image = next((pair.left for pair in plot.pairs if pair.left is not None), None)
         return None if path is None else read_calibration(path, self.calibration_unit, image)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Size, Unit
-from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import read_cameras
+from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import both_sides, files_in, named_pair, read_cameras
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis_envs.plants import Calibration
@@ -73,6 +73,16 @@ def _size_by_image(path: Path, left: np.ndarray, image: Path | None) -> Size:
             f"the middle of {readable(image.name)}, {width} x {height}: add image_width and image_height, as it was calibrated"
         )
     return width, height
+
+
+def find_calibration(folder: Path) -> Path | None:
+    """Return the file of the calibration in a folder of images, or that of its left camera; None where there is none."""
+    files = files_in(folder)
+    named = named_pair(files)
+    if named is not None:
+        return named
+    sides = (both_sides(file) for file in files if file.suffix.lower() in (".yaml", ".yml", ".ini"))
+    return next((left for left, _ in filter(None, sides)), None)
 
 
 def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:

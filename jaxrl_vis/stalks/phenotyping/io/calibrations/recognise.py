@@ -40,7 +40,7 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPa
         return found
     if len(found) == 2:
         return ros.read_pair(found, [path, path], path)
-    pair = _both_sides(path)
+    pair = both_sides(path)
     if pair is None:
         other = next((name for _, name in partners(path.stem)), None)
         if other is None:
@@ -53,24 +53,12 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPa
     return _of_sides(pair, path, image)
 
 
-def own_calibration(folder: Path) -> Path | None:
-    """The calibration that lies in a folder of images, under one of the names that calibrations have; None if there is none."""
-    files = _files(folder)
-    named = _named(files)
-    if named is not None:
-        return named
-    for file in files:
-        pair = _both_sides(file) if file.suffix.lower() in (".yaml", ".yml", ".ini") else None
-        if pair is not None:
-            return pair[0]
-    return None
-
-
-def _files(folder: Path) -> list[Path]:
+def files_in(folder: Path) -> list[Path]:
+    """Files of a folder that may be calibrations by what their names end with, in order."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file())
 
 
-def _named(files: list[Path]) -> Path | None:
+def named_pair(files: list[Path]) -> Path | None:
     """The file whose name says that it is the calibration of a pair; None if there is none."""
     stems = {path: path.stem.lower() for path in files}
     zed_files = [path for path in files if path.suffix.lower() == ".conf"]
@@ -82,14 +70,14 @@ def _named(files: list[Path]) -> Path | None:
 
 
 def _in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
-    files = _files(folder)
-    pairs = {pair for pair in map(_both_sides, files) if pair is not None}
+    files = files_in(folder)
+    pairs = {pair for pair in map(both_sides, files) if pair is not None}
     if len(pairs) == 1:
         return _of_sides(pairs.pop(), folder, image)
     if len(pairs) > 1:
         names = " and ".join(readable(left.name) for left, _ in sorted(pairs))
         raise RequestError(f"{folder} holds several pairs of calibrations, of {names}: name one of the files")
-    alone = _named(files) or (files[0] if len(files) == 1 else None)
+    alone = named_pair(files) or (files[0] if len(files) == 1 else None)
     if alone is None:
         raise RequestError(
             f"there is no calibration {folder / 'left.yaml'}: name a file of a pair, or a folder with left.yaml and right.yaml"
@@ -97,7 +85,7 @@ def _in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
     return read_cameras(alone, image)
 
 
-def _both_sides(path: Path) -> tuple[Path, Path] | None:
+def both_sides(path: Path) -> tuple[Path, Path] | None:
     """The files of the left and of the right camera, one of which is ``path``; None where there is no other."""
     try:
         there = {file.name.lower(): file for file in path.parent.iterdir()}
