@@ -82,7 +82,7 @@ def test_brapi_has_what_its_calls_ask_for(tmp_path):
     )
     unit = data["observationunits"][0]
     assert unit["germplasmName"] == "BTx623" and unit["observationUnitPosition"]["observationLevel"]["levelName"] == "plot"
-    assert unit["observationUnitPosition"]["positionCoordinateY"] == "12"
+    assert [unit["observationUnitPosition"][f"positionCoordinate{axis}"] for axis in "XY"] == ["3", "12"]
     units = {entry["observationUnitDbId"] for entry in data["observationunits"]}
     assert {entry["observationUnitDbId"] for entry in data["observations"]} <= units
     assert {entry["observationVariableDbId"] for entry in data["observations"]} <= set(variables)

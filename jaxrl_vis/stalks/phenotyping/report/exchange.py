@@ -266,8 +266,8 @@ _GENOTYPES = (
     "pedigree",
 )
 _PLACES = ("range", "row", "column", "col", "pass", "rep", "replicate", "block")
-_X = ("column", "col", "pass", "plot_column")
-_Y = ("row", "range", "plot_row")
+_X = ("column", "col", "pass", "plot_column", "range")
+_Y = ("row", "plot_row", "range")
 
 
 def _genotype(about: Mapping[str, str]) -> str:
@@ -279,6 +279,7 @@ def _position(about: Mapping[str, str]) -> dict[str, str]:
     """Where a plot stands in its field, in the names of BrAPI."""
     small = {name.lower(): value for name, value in about.items()}
     x, y = (next((name for name in names if small.get(name)), "") for names in (_X, _Y))
+    y = "" if y == x else y
     place = {"positionCoordinateX": small.get(x, ""), "positionCoordinateY": small.get(y, "")}
     kinds = {"column": "GRID_COL", "col": "GRID_COL", "plot_column": "GRID_COL", "row": "GRID_ROW", "plot_row": "GRID_ROW"}
     place["positionCoordinateXType"] = kinds.get(x, "MEASURED_COL") if x else ""

@@ -134,7 +134,7 @@ def _read(path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict
     except OSError as error:
         raise RequestError(f"there is no calibration {path}: {error.strerror or error}") from error
     except ValueError as error:
-        why = " ".join(str(error).split())
+        why = " ".join(str(error).split())[:200]
         raise RequestError(
             f"{path} is not a calibration: it is neither YAML nor XML as OpenCV and ROS write it ({why})"
         ) from error
