@@ -66,14 +66,14 @@ def _recognised(path: Path) -> None:
 
 
 def read_plan(folder: Path) -> None:
-    from jaxrl_vis.stalks.phenotyping.io.field_plan import read_field_plan
+    from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import read_field_plan
 
     columns, plan = read_field_plan(_only(folder), [f"plot_{name}" for name in PAIRS])
     assert plan and all(set(values) == set(columns) for values in plan.values())
 
 
 def _plan(path: Path) -> None:
-    from jaxrl_vis.stalks.phenotyping.io.cells import cells, read_table_text
+    from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
 
     assert cells(path, read_table_text(path, 1_000_000))[1]
 
@@ -120,7 +120,7 @@ def read_annotations(folder: Path) -> None:
 
 def read_odometry(folder: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
-    from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 
     pairs = tuple(PairFiles(name, folder / f"left_{name}.png", folder / f"right_{name}.png") for name in PAIRS)
     plot = PlotFolder("plot", folder, pairs)
@@ -158,7 +158,7 @@ def read_image(folder: Path) -> None:
 def read_names(folder: Path) -> None:
     """Plots of a folder of empty files: each image is at most one side of one pair, and what is not found is no pair's."""
     from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-    from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 
     plots = find_plots(folder)
     pairs = [(plot, pair) for plot in plots for pair in plot.pairs]

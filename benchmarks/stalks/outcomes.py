@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 
 
 def calibration(path: Path) -> str:

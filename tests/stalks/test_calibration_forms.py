@@ -143,6 +143,16 @@ FORMS: dict[str, dict[str, str]] = {
     "rig_L and rig_R": both(ros2, ".yaml", ("rig_L", "rig_R")),
     "ost.txt of both": {"ost.txt": ost(0.0, "left") + ost(-50.0, "right")},
     "left.ini and right.ini": {"left.ini": ost(0.0, "left"), "right.ini": ost(-50.0, "right")},
+    "a table for each side": {
+        "stereo.yaml": as_yaml({side: yaml.safe_load(ros2(shift)) for side, shift in (("left", 0.0), ("right", -50.0))})
+    },
+    "ORB-SLAM": {
+        "EuRoC.yaml": "%YAML:1.0\n"
+        + "".join(
+            f"{side}.height: 480\n{side}.width: 640\n{side}.P: {matrix(p(shift))}\n"
+            for side, shift in (("LEFT", 0.0), ("RIGHT", -50.0))
+        )
+    },
     "kalibr, of rectified images": {"camchain-rig.yaml": as_yaml(CHAIN)},
     "RealSense": {"d435.json": json.dumps(REALSENSE)},
     "Middlebury": {"calib.txt": MIDDLEBURY},

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.field_plan import missing_plots, read_field_plan
+from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots, read_field_plan
 from jaxrl_vis.stalks.phenotyping.report.exchange import TRAITS, with_terms, write_exchange
 from jaxrl_vis.stalks.phenotyping.report.tables import PLOT_COLUMNS
 

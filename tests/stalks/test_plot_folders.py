@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, Patterns, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
-from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometry, why_no_odometry
-from jaxrl_vis.stalks.phenotyping.io.stamps import nearest, seconds_in
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import nearest, seconds_in
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry, why_no_odometry
 
 
 def touch(folder: Path, *names: str) -> Path:

@@ -11,8 +11,8 @@ from jaxrl_vis.stalks.phenotyping.io import recording
 from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
-from jaxrl_vis.stalks.phenotyping.io.odometry import read_odometry
 from jaxrl_vis.stalks.phenotyping.io.recording import Topics, is_recording, take_apart
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 
 SIZE = (24, 32)
 FRAMES = 3

@@ -62,8 +62,8 @@ def run(options: Run) -> int:
     check_counts(workers=options.workers)
     check_extra("phenotyping")
     check_writable(options.out, "--out", folder=True)
-    from jaxrl_vis.stalks.phenotyping.io.field_plan import missing_plots, read_field_plan
     from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
+    from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots, read_field_plan
     from jaxrl_vis.stalks.phenotyping.report.exchange import with_terms, write_exchange
 
     traits = with_terms(options.term)

@@ -14,8 +14,8 @@ from pathlib import Path, PureWindowsPath
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import check_length, readable
-from jaxrl_vis.stalks.phenotyping.io.sides import partners
-from jaxrl_vis.stalks.phenotyping.io.stamps import nearest, seconds_in
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import nearest, seconds_in
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 SAMPLE = Path(__file__).parents[1] / "sample_row"

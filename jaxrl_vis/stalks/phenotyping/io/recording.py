@@ -24,7 +24,7 @@ from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.provenance import install_command
 from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG
 from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS, write_image
-from jaxrl_vis.stalks.phenotyping.io.sides import partners
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
 
 _SUFFIXES = (".bag", ".mcap", ".db3")
 _IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")

@@ -9,7 +9,7 @@ from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Rectif
 from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
-from jaxrl_vis.stalks.phenotyping.io.sides import partners
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
 from jaxrl_vis_envs.documents import read_text
 
 _MAX_BYTES = 2_000_000  # of a file
@@ -150,6 +150,9 @@ def _of_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | Raw
         return opencv.read_projections(store, path)
     if kalibr.is_chain(store):
         return kalibr.read_chain(store, path)
+    both = ros.both_in_one(store)
+    if both is not None:
+        return both
     if realsense.is_table(store):
         return realsense.read_table(store, path, _size(image))
     if ros.is_camera(store):

@@ -20,6 +20,8 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, named_size, numbers, plain_numbers
 
 _MATRIX_NAMES = ("projection_matrix", "P", "p")
+_SIDES = (("left", "right"), ("LEFT", "RIGHT"), ("Left", "Right"), ("cam0", "cam1"))
+"""Names of the two cameras in files that hold both."""
 _HEADER = re.compile(r"^header:", re.MULTILINE)
 _PRINTED = re.compile(r"CameraInfo\(.*?\bheight=(\d{1,9}), ?width=(\d{1,9})", re.DOTALL)
 _PRINTED_MATRIX = re.compile(r"\bp=array\(\[([^\]]*)\]")
@@ -55,6 +57,22 @@ def message(text: str) -> str:
 def is_camera(store: dict[str, Any]) -> bool:
     """Return whether a file's contents are those of one camera of ROS."""
     return any(store.get(name) is not None for name in _MATRIX_NAMES)
+
+
+def both_in_one(store: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """Both cameras of a file with a table for each, or with ``LEFT.P`` and ``RIGHT.P`` as of ORB-SLAM; None if not so."""
+    for left, right in _SIDES:
+        cameras = [store.get(left), store.get(right)]
+        if not all(isinstance(camera, dict) for camera in cameras):
+            cameras = [_beginning_with(store, f"{name}.") for name in (left, right)]
+        tables = [camera for camera in cameras if isinstance(camera, dict) and is_camera(camera)]
+        if len(tables) == 2:
+            return tables
+    return None
+
+
+def _beginning_with(store: dict[str, Any], begin: str) -> dict[str, Any]:
+    return {name.removeprefix(begin): value for name, value in store.items() if name.startswith(begin)}
 
 
 def from_print(text: str) -> dict[str, Any] | None:

@@ -15,10 +15,10 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.spreadsheets import unescape_cell
-from jaxrl_vis.stalks.phenotyping.io.cells import cells, read_table_text
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.names import readable
-from jaxrl_vis.stalks.phenotyping.io.stamps import seconds_in
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import seconds_in
+from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
 
 _MAX_ODOMETRY = 8_000_000  # bytes
 _NAMES = tuple(f"{stem}{end}" for stem in ("odometry", "odom", "gps") for end in (".csv", ".tsv", ".txt", ".yaml"))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.spreadsheets import unescape_cell
-from jaxrl_vis.stalks.phenotyping.io.cells import cells, read_table_text
 from jaxrl_vis.stalks.phenotyping.io.names import readable
+from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
 
 _MAX_BYTES = 50_000_000
 _IDS = (
