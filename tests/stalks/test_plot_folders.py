@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, Patterns, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
@@ -122,6 +123,17 @@ def test_patterns_name_images_of_each_plot(tmp_path):
             find_plots(tmp_path, Patterns(pattern, "b/*.png"))
     with pytest.raises(RequestError, match="holds no images for --left 'none/.*.png' and --right"):
         find_plots(tmp_path, Patterns("none/*.png", "b/*.png"))
+
+
+def test_patterns_and_terms_are_checked_before_anything_is_computed(tmp_path, capsys):
+    touch(tmp_path, "left_0.png", "right_0.png")
+    for words, told in (
+        (["--left", "a*.png"], "--left and --right go together"),
+        (["--term", "stalks"], "--term takes COLUMN=TERM"),
+        (["--field", str(tmp_path / "none.csv")], "cannot read"),
+    ):
+        assert cli.main(["phenotype", "run", str(tmp_path), "--out", str(tmp_path / "out"), *words]) == 2
+        assert told in capsys.readouterr().err
 
 
 def test_sizes_of_bitmaps_are_read_before_they_are_decoded(tmp_path):

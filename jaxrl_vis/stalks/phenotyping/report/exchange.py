@@ -242,7 +242,7 @@ def _write_plantcv(
                 "scale": trait.unit,
                 "datatype": kinds[trait.column],
                 "value": int(row[trait.column]) if trait.whole else float(row[trait.column]),
-                "label": trait.unit,
+                "label": "count" if trait.unit == "1" else trait.unit,
             }
             for trait in there
             if row.get(trait.column, "") != ""
