@@ -278,7 +278,14 @@ def test_masks_of_labelme_and_cvat_are_the_pixels_that_were_painted(tmp_path):
 def test_files_of_several_forms_are_read_together(tmp_path):
     folder = put(
         tmp_path,
-        {"a.xml": voc("a.png"), "b.json": labelme("b.png"), "c.txt": yolo(), "classes.txt": "leaf\nstalk"},
+        {
+            "a.xml": voc("a.png"),
+            "b.json": labelme("b.png"),
+            "c.txt": yolo(),
+            "classes.txt": "leaf\nstalk",
+            "calibration.json": "{}",
+            "calibration.xml": "<opencv_storage/>",
+        },
         *(f"{name}.png" for name in "abc"),
     )
     found = read_annotations(folder)
@@ -299,7 +306,8 @@ def test_files_of_several_forms_are_read_together(tmp_path):
         ({"r.json": '{"shapes": [{"label": "stalk", "points": [[0, 0], [5, 5]], "shape_type": "mask", "mask": "$$"}], '
           '"imagePath": "r.png", "imageWidth": 9, "imageHeight": 9}'}, ["r.png"], "a mask that is not base64"),
         ({"r.json": '[1, 2]'}, ["r.png"], "is no annotation of LabelMe"),
-        ({"notes.txt": "hello", "plot.json": "{}"}, ["r.png"], "there are no annotations in"),
+        ({"r.xml": "<opencv_storage/>"}, ["r.png"], "is no annotation of Pascal VOC, but called as an image is"),
+        ({"notes.txt": "hello", "plot.json": "{}"}, ["r.png"], "(plot.json is none): put annotations.json of COCO there"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_read_is_told_in_one_line(tmp_path, files, images, part):

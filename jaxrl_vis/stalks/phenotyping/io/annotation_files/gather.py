@@ -18,8 +18,6 @@ _MAX_FILES = 200_000
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 _HELD_BACK = {"valid", "val", "test", "testing", "validation"}
 """Folders that hold what is kept from training, where there is one called train."""
-_OTHERS = {"plot.json", "notes.json", "info.json", "truth.json", "package.json"}
-"""JSON beside annotations that is none."""
 _WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError)
 """Errors that reading a file of another form raises."""
 
@@ -43,24 +41,31 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     path = folder / "annotations.json"
     if path.exists():
         return _one(path, lambda: _coco(path, read_json(path)), "COCO")
-    files = list(_files(folder, {".json", ".xml", ".txt"}))
     found: list[tuple[Any, Annotated]] = []
+    others: list[Path] = []
     names: list[str] | None = None
     numbers = itertools.count()
     images = {image.stem: image for image in _files(folder, _IMAGES) if image.is_file()}
-    for file in files:
+    for file in _files(folder, {".json", ".xml", ".txt"}):
         if file.suffix.lower() == ".json":
-            found += [] if file.name in _OTHERS else _json(file, numbers)
+            read = _json(file, numbers)
         elif file.suffix.lower() == ".xml":
-            read = _one(file, lambda file=file: voc.read_xml(file, parse_xml(read_bytes(file))), "Pascal VOC")
-            found += zip(numbers, read)
+            read = _xml(file, numbers)
         elif file.stem in images and file.name not in yolo.NAMES:
             names = _class_names(folder) if names is None else names
-            read = _one(file, lambda file=file, names=names: _yolo(file, images[file.stem], names), "YOLO")
-            found += zip(numbers, read)
+            read = list(zip(numbers, _one(file, lambda file=file, names=names: _yolo(file, images[file.stem], names), "YOLO")))
+        else:
+            continue
+        found += read or []
+        others += [file] if read is None else []
+    broken = next((file for file in others if file.stem in images), None)
+    if broken is not None:  # another one, as of a calibration, may lie there
+        kinds = "Pascal VOC" if broken.suffix.lower() == ".xml" else "LabelMe"
+        raise RequestError(f"{broken} is no annotation of {kinds}, but called as an image is")
     if not found:
+        there = f" ({others[0].name} is none)" if others else ""
         raise RequestError(
-            f"there are no annotations in {folder}: put annotations.json of COCO there, or .xml of Pascal VOC, .json of "
+            f"there are no annotations in {folder}{there}: put annotations.json of COCO there, or .xml of Pascal VOC, .json of "
             "LabelMe or .txt of YOLO beside each image"
         )
     return found
@@ -95,22 +100,26 @@ def _coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
     return coco.read_coco(path, data)
 
 
-def _json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]]:
-    """Images of a file of JSON: COCO's, LabelMe's or Label Studio's."""
-    # Only LabelMe's, which may hold the image itself, are of one image.
+def _json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+    """Images of a file of JSON: COCO's, LabelMe's or Label Studio's; None if it is another one."""
     data = _one(file, lambda: parse_json(read_text(file)), "LabelMe")
     if coco.is_coco(data):
         read = _one(file, lambda: _coco(file, data), "COCO")
-        ids = [number for number, _ in read]
         # Of several such files, ids may be the same.
-        return [
-            ((str(file), number) if isinstance(number, (int, str)) else number, image) for number, (_, image) in zip(ids, read)
-        ]
+        return [((str(file), number) if isinstance(number, (int, str)) else number, image) for number, image in read]
     if label_studio.is_label_studio(data):
         return list(zip(numbers, _one(file, lambda: label_studio.read_label_studio(file, data), "Label Studio")))
-    if file.stat().st_size > _MAX_BYTES * 10:
-        raise RequestError(f"{file} is no annotation of LabelMe (is larger than {_MAX_BYTES / 1e5:g} MB)")
-    return list(zip(numbers, _one(file, lambda: labelme.read_labelme(file, data), "LabelMe")))
+    if labelme.is_labelme(data):
+        return list(zip(numbers, _one(file, lambda: labelme.read_labelme(file, data), "LabelMe")))
+    return None
+
+
+def _xml(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+    """Images of a file of XML: Pascal VOC's or CVAT's; None if it is another one."""
+    root = _one(file, lambda: parse_xml(read_bytes(file)), "Pascal VOC")
+    if root.tag not in ("annotation", "annotations"):
+        return None
+    return list(zip(numbers, _one(file, lambda: voc.read_xml(file, root), "Pascal VOC")))
 
 
 def _yolo(file: Path, image: Path, names: list[str]) -> list[Annotated]:
