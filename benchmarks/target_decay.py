@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks.ledger.markers import WIDTH, fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
+from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.run.storage.folder import read_record
@@ -84,7 +85,7 @@ def read_groups(studies: Path) -> dict[tuple[str, str, float], Group]:
 
 def _read_group(decay: float, folders: list[Path]) -> Group:
     records = [read_record(folder) for folder in folders]
-    assert all(record["config"]["target_decay"] == decay for record in records), folders
+    assert all(config_from_dict(record["config"]).ddpg.target_decay == decay for record in records), folders
     rows = [row for folder in folders for row in read_rows(folder / "metrics.jsonl") if SUCCESS in row]
     revisions = {f"{record['git_revision'][:7]} on {record['device']['kind']}" for record in records}
     return Group(rows, frozenset(revisions))

@@ -3,7 +3,6 @@
 A figure without a record reads `MISSING`, and `make stale` lists it.
 """
 
-import dataclasses
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -96,11 +95,10 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
         if run is None:
             return []
         made_with = config_from_dict(run.record["config"])
-        no_matter = (*_NEUTRAL, *_LOGARITHMIC) if config.weighting in ("none", "sum") else _NEUTRAL
-        made_with = made_with.replace(**{field: getattr(config, field) for field in no_matter})
+        no_matter = (*_NEUTRAL, *_LOGARITHMIC) if config.auxiliary.weighting in ("none", "sum") else _NEUTRAL
+        made_with = made_with.replace(**{name: config.value(name) for name in no_matter})
         if made_with != config:
-            names = [field.name for field in dataclasses.fields(config)]
-            differing = [field for field in names if getattr(made_with, field) != getattr(config, field)]
+            differing = [name for name, value in config.flat().items() if made_with.value(name) != value]
             raise RequestError(
                 f"evidence {name} was made by `{run.record['command']}`, and the table says `{training_command(config)}`, "
                 f"which has other {', '.join(differing)}: train again, then python -m benchmarks.ledger keep"

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaxrl_vis import fields
+from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import make_private, user_cache
 from jaxrl_vis.host.provenance import child_environment

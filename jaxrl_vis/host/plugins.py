@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from types import ModuleType
 from typing import Any, TypeVar
 
-from jaxrl_vis import fields
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, fields
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis_envs import task_modules
 
@@ -18,11 +17,11 @@ T = TypeVar("T")
 
 def own_names(config: Config) -> dict[str, str]:
     """Return the names of a configuration that are ``module:Name``, by what they name: task, algorithm, aux_tasks 1, ..."""
-    names = {"task": config.env}
+    names = {"task": config.environment.env}
     for field, hint in fields.hints(Config).items():
         if not fields.names_parts(hint):
             continue
-        value = getattr(config, field)
+        value = config.value(field)
         names |= (
             {f"{field} {number}": name for number, name in enumerate(value, 1)} if isinstance(value, tuple) else {field: value}
         )

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
-from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, Statistics
 
 Agent = Any

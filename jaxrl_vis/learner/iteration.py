@@ -54,20 +54,20 @@ def split_key(key: jax.Array, iteration: jax.Array) -> jax.Array:
 
 def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> Batches:
     """Choose the batches of all gradient steps at once: in a loop, drawing numbers would be a dozen tiny kernels a step."""
-    keys = jax.random.split(key, config.updates_per_iteration)
+    keys = jax.random.split(key, config.run.updates_per_iteration)
     choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
     return Batches(choices, lambda choice: sampler.batch(replay, choice))
 
 
 def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
     """Update the normaliser with the observations of a rollout."""
-    if config.normalizer_source == "rollouts":
+    if config.study.normalizer_source == "rollouts":
         observations, goals = episodes.observations, episodes.observations[:, -1:]
         if train.goal_normalizer is not None:
             observations = observations[:, :-1]
         axes = (0, 1)
     else:  # as the authors' release: as many transitions as the rollout has, relabelled
-        count = config.num_envs * sampler.replay.horizon
+        count = config.run.num_envs * sampler.replay.horizon
         latest = sampler.replay._replace(num_rollouts=1, mean_age=None)
         sampler = dataclasses.replace(sampler, config=config.replace(batch_size=count), replay=latest)
         rollout = latest.of_rollout(episodes)

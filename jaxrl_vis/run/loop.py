@@ -106,7 +106,7 @@ class RunLoop:
         self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
         self._started, self._compile_s = time.monotonic(), 0.0
-        self._pace = Pace(self._program.steps_per_iteration * self._config.seeds)
+        self._pace = Pace(self._program.steps_per_iteration * self._config.run.seeds)
         self._is_left_alone = False
         self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
         self._evaluates_ahead = False  # while the iteration before is still learned from
@@ -206,7 +206,7 @@ class RunLoop:
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
         """Restore and compile; return the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
-        self._say(f"{self._config.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
+        self._say(f"{self._config.environment.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
         if restored is not None:
@@ -317,8 +317,8 @@ class RunLoop:
             self._unread.append((self._done, self._programs.pending(values)))
             if len(self._unread) > 1:
                 yield self._read()
-            evaluation = self._is_due(config.eval_interval) or self._done == self._total
-            light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
+            evaluation = self._is_due(config.run.eval_interval) or self._done == self._total
+            light, full = self._is_due(config.run.checkpoint_interval), self._is_due(config.run.full_checkpoint_interval)
             recent = self._saver.is_recent_due(light)
             if not (evaluation or light or full or recent or (interruption and not distributed.are_several())):
                 continue
@@ -357,9 +357,9 @@ class RunLoop:
             NonFiniteError: A guard has counted something.
         """
         iteration, pending = self._unread[0]
-        values = pending.read_per_seed(self._config.seeds)
+        values = pending.read_per_seed(self._config.run.seeds)
         guards = [values.pop(name) for name in list(values) if name.startswith(GUARD)]
-        bad = sorted({self._config.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
+        bad = sorted({self._config.run.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
         if bad:
             self._stop_nonfinite(f"iteration {iteration}, seed {', '.join(map(str, bad))}", values)
         self._progress.since_evaluation.append(values)
@@ -377,7 +377,7 @@ class RunLoop:
     def _evaluate(self, report: Report, outcome: Pending) -> Report:
         """Read the results of an evaluation, write a line per seed, and add the figures to the report."""
         progress, speed = self._progress, self._pace.speed(self._done)
-        values = outcome.read_per_seed(self._config.seeds)
+        values = outcome.read_per_seed(self._config.run.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
         means = metrics.with_precision(metrics.average_metrics(progress.since_evaluation))
@@ -387,7 +387,7 @@ class RunLoop:
             "time/env_steps_per_s": speed,
             "time/goodput": self._goodput.account(self._done).goodput or math.nan,
         }
-        rounded = {name: [round(value, 3)] * self._config.seeds for name, value in times.items()}
+        rounded = {name: [round(value, 3)] * self._config.run.seeds for name, value in times.items()}
         counts = {"iteration": self._done, "updates": report.updates, "env_steps": report.env_steps}
         if progress.replay_lost_at is not None:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
@@ -402,7 +402,7 @@ class RunLoop:
         progress.evaluation_due = False
         self._warn_if_filtered(means)
         # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
-        if self._is_due(self._config.eval_interval):
+        if self._is_due(self._config.run.eval_interval):
             progress.since_evaluation = []
         self._show(values, speed)
         self._pace.mark(self._done)
@@ -459,7 +459,7 @@ class RunLoop:
         assert self._loop is not None
         if self._owed_evaluation or not self._saver.has(LIGHT, self._done):
             self._saver.light(self._loop, self._done, self._progress_now())
-        if self._config.full_checkpoint_interval and (self._owed_evaluation or not self._saver.has(FULL, self._done)):
+        if self._config.run.full_checkpoint_interval and (self._owed_evaluation or not self._saver.has(FULL, self._done)):
             self._saver.full(self._loop, self._done, self._progress_now())
         self._saver.finish()
         self._console.stop()

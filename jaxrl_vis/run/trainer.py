@@ -81,7 +81,7 @@ class Trainer:
 
     @property
     def run_keys(self) -> jax.Array:
-        """[S] typed keys: seed i of `run` starts from ``jax.random.key(config.seed + i)``."""
+        """[S] typed keys: seed i of `run` starts from ``jax.random.key(config.run.seed + i)``."""
         return self.programs.run_keys
 
     @property
@@ -105,9 +105,9 @@ class Trainer:
         """
         _check_key("init", key)
         if key.ndim == 0:
-            key = key[None] if self.config.seeds == 1 else jax.random.split(key, self.config.seeds)
-        if key.shape != (self.config.seeds,):
-            raise RequestError(f"init takes one key, or one for each of {self.config.seeds} seeds, not {key.shape} of them")
+            key = key[None] if self.config.run.seeds == 1 else jax.random.split(key, self.config.run.seeds)
+        if key.shape != (self.config.run.seeds,):
+            raise RequestError(f"init takes one key, or one for each of {self.config.run.seeds} seeds, not {key.shape} of them")
         return self.programs.init(key)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
@@ -194,7 +194,7 @@ def make_trainer(
         hush_cache()
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
             start_devices()
-            if is_built_in(config.env) and not own_names(config):
+            if is_built_in(config.environment.env) and not own_names(config):
                 locate_env(config)  # imports MuJoCo, meanwhile
             check_devices()
         config = locate_env(config)

@@ -267,7 +267,7 @@ def rows_of(success: list[float], seed: int = 0, every: int = 1000) -> list[dict
 def make_run(folder: Path, rows: list[dict[str, Any]], **overrides: Any) -> Path:
     folder.mkdir(parents=True)
     about = {
-        "schema": 1,
+        "schema": 2,
         "preset": "debug",
         "git_revision": "a" * 40,
         "versions": {"jax": "1"},
@@ -337,7 +337,7 @@ def test_a_row_says_what_its_runs_reached(tmp_path: Path) -> None:
 
 def test_rows_ask_for_five_seeds_on_a_gpu() -> None:
     for row in LEARNING:
-        assert sum(config.seeds for config in row.runs.values()) == (3 if "cpu" in next(iter(row.runs)) else 5)
+        assert sum(config.run.seeds for config in row.runs.values()) == (3 if "cpu" in next(iter(row.runs)) else 5)
 
 
 @pytest.mark.usefixtures("page")

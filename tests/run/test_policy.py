@@ -96,7 +96,7 @@ def test_it_acts_as_the_learner_does(name: str, seeds: tuple[int, ...], runs: di
         assert np.ptp(actions[-1]) > 1e-4
     if len(seeds) > 1:
         assert not np.allclose(*actions)
-        assert policies[name].seed == 3 and policies[name].config.seeds == 2
+        assert policies[name].seed == 3 and policies[name].config.run.seeds == 2
 
 
 def test_it_works_inside_a_scan(policies: dict[str, jaxrl_vis.Policy]) -> None:

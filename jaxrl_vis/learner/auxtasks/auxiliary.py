@@ -143,47 +143,50 @@ def make_auxiliary(
     Raises:
         RequestError: They do not go together, or not with the rest of the configuration.
     """
-    if config.weighting in WEIGHTINGS:
-        weighting = make_weighting(config.weighting, **_options(config))
+    if config.auxiliary.weighting in WEIGHTINGS:
+        weighting = make_weighting(config.auxiliary.weighting, **_options(config))
     else:
-        maker = find("weighting", config.weighting, WEIGHTINGS, config.env_folder)
-        weighting = call("weighting", config.weighting, maker, of=Weighting)
-    if config.aux_tasks and not weighting.auxiliary:
+        maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
+        weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
+    if config.auxiliary.aux_tasks and not weighting.auxiliary:
         raise RequestError(
-            f"aux_tasks are given, but weighting {config.weighting} learns none: choose --weighting ol_aux, or leave them out"
+            f"aux_tasks are given, but weighting {config.auxiliary.weighting} learns none: choose --weighting ol_aux, or leave "
+            "them out"
         )
-    if weighting.auxiliary and not config.aux_tasks:
+    if weighting.auxiliary and not config.auxiliary.aux_tasks:
         raise RequestError(
-            f"weighting {config.weighting} has no auxiliary tasks to weight: add --aux-tasks with some of "
+            f"weighting {config.auxiliary.weighting} has no auxiliary tasks to weight: add --aux-tasks with some of "
             f"{' '.join(auxtasks.NAMES)}, or use --weighting none"
         )
-    if config.updates_per_iteration % weighting.interval:
+    if config.run.updates_per_iteration % weighting.interval:
         raise RequestError(
-            f"weighting_interval ({weighting.interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
+            f"weighting_interval ({weighting.interval}) must divide updates_per_iteration ({config.run.updates_per_iteration})"
         )
-    if config.aux_tasks and config.n_step > 1:
+    if config.auxiliary.aux_tasks and config.study.n_step > 1:
         raise RequestError("n_step and aux_tasks exclude each other: targets are of single steps")
-    options = auxtasks.RELEASE if config.aux_form == "release" else auxtasks.Options()
-    spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype, options)
+    options = auxtasks.RELEASE if config.study.aux_form == "release" else auxtasks.Options()
+    spec = Spec(
+        observation, action_size, config.network.latent_size, frame_stack, len(config.network.encoder_filters), dtype, options
+    )
     way: Way = "per_loss" if weighting.needs == "gradients" else "latents"
-    return Auxiliary(auxtasks.make(config.aux_tasks, spec, config.env_folder), weighting, way)
+    return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, way)
 
 
 def _options(config: Config) -> dict[str, Any]:
     """Return the arguments for the constructor of the configuration's weighting."""
     options: dict[str, Any] = {}
-    if config.weighting in ("ol_aux", "ol_aux_ablation"):
+    if config.auxiliary.weighting in ("ol_aux", "ol_aux_ablation"):
         options |= {
-            "interval": config.weighting_interval,
-            "learning_rate": config.critic_learning_rate,
-            "beta": config.weighting_beta,
+            "interval": config.auxiliary.weighting_interval,
+            "learning_rate": config.ddpg.critic_learning_rate,
+            "beta": config.auxiliary.weighting_beta,
         }
-        if config.weighting_main_grad != "main":
-            options["main_grad"] = config.weighting_main_grad
-        if config.weighting_window != 1:
-            options["window"] = config.weighting_window
-    if config.weighting == "fixed":
-        options["weights"] = config.weighting_fixed
-    if config.weighting == "cosine":
-        options["log"] = config.weighting_log
+        if config.study.weighting_main_grad != "main":
+            options["main_grad"] = config.study.weighting_main_grad
+        if config.study.weighting_window != 1:
+            options["window"] = config.study.weighting_window
+    if config.auxiliary.weighting == "fixed":
+        options["weights"] = config.auxiliary.weighting_fixed
+    if config.auxiliary.weighting == "cosine":
+        options["log"] = config.study.weighting_log
     return options

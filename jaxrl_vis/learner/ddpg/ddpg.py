@@ -28,8 +28,8 @@ from jaxrl_vis.learner.ddpg.latent_reward import LatentReward, make_latent_rewar
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
-from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
@@ -198,12 +198,12 @@ def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config
     """Step both optimisers, and update the target networks; ``counts`` include this step."""
     corrections = adam.corrections(counts[:2])
     critic, critic_moments = adam.step(
-        state.critic, gradients.critic, state.critic_optimizer, config.critic_learning_rate, corrections[0]
+        state.critic, gradients.critic, state.critic_optimizer, config.ddpg.critic_learning_rate, corrections[0]
     )
     actor, actor_moments = state.actor, state.actor_optimizer
     if gradients.actor is not None:
-        actor, actor_moments = adam.step(actor, gradients.actor, actor_moments, config.actor_learning_rate, corrections[1])
-    follow = jnp.where(counts[2] % config.target_update_interval == 0, 1.0 - config.target_decay, 0.0)
+        actor, actor_moments = adam.step(actor, gradients.actor, actor_moments, config.ddpg.actor_learning_rate, corrections[1])
+    follow = jnp.where(counts[2] % config.ddpg.target_update_interval == 0, 1.0 - config.ddpg.target_decay, 0.0)
 
     def followed(online: Params, target: Params) -> Params:
         return optax.incremental_update({part: online[part] for part in target}, target, follow)
@@ -323,7 +323,7 @@ def make_ddpg(
 
 def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Agent, Metrics]]:
     """Make `Algorithm.update` of gradient steps."""
-    interval = config.actor_interval
+    interval = config.ddpg.actor_interval
 
     def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
         names: list[str] = []

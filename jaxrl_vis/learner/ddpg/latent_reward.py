@@ -18,7 +18,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.networks.normalizer import Scaling
-from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Params, Replaceable
 
 _SMALL = 1e-6  # of a latent's length: the direction of a shorter one means nothing
@@ -130,12 +130,12 @@ def make_latent_reward(networks: Networks, config: Config, resolved: Resolved) -
     method = resolved.method
     if method.needs_images and not networks.sees_images:
         raise RequestError(
-            f"method {config.method} encodes images, and {config.env} shows states: train on Visual{config.env}, or use "
-            "--method indicator"
+            f"method {config.reward.method} encodes images, and {config.environment.env} shows states: train on "
+            f"Visual{config.environment.env}, or use --method indicator"
         )
     if method.reward != "autoencoder":
         return None
-    shape = networks.observation_spec, networks.action_size, config.latent_size
-    spec = auxtasks.Spec(*shape, levels=len(config.encoder_filters), dtype=networks.dtype)
+    shape = networks.observation_spec, networks.action_size, config.network.latent_size
+    spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
-    return LatentReward(networks, resolved, task, optax.adam(config.critic_learning_rate))
+    return LatentReward(networks, resolved, task, optax.adam(config.ddpg.critic_learning_rate))

@@ -24,8 +24,8 @@ from jaxrl_vis.learner.ddpg import losses
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
-from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params
 
 
@@ -108,13 +108,13 @@ def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latent
 
     Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
     """
-    if networks.config.target_encoder:
+    if networks.config.network.target_encoder:
         of_critic = _encode(networks, now.target_critic, inputs, "goal", "after")[::-1]
     else:
         after = latents.after
         after = _encode(networks, now.critic, inputs, "after") if after is None else after[None]
         of_critic = jnp.concatenate([after, latents.pair[1:]])
-    if networks.config.encoders == "shared":
+    if networks.config.network.encoders == "shared":
         return of_critic, of_critic
     of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, "goal", "after")[::-1]
     return of_actor, of_critic
@@ -191,7 +191,7 @@ class Objectives:
         weights: dict[str, jax.Array],
     ) -> tuple[jax.Array, jax.Array]:
         """The actor's loss, those of its auxiliary tasks with the critic's weights added, and its actions [B, A]."""
-        has_encoder = self.config.encoders == "separate"
+        has_encoder = self.config.network.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
@@ -201,7 +201,9 @@ class Objectives:
         action = self.networks.act(actor, latents.pair)
         value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
-        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole, self.config.actor_log)
+        loss = losses.actor_loss(
+            value, action, self.config.ddpg.action_penalty, best, self.shards.whole, self.config.ddpg.actor_log
+        )
         return loss + self.auxiliary.weighting.objective(weights, others), action
 
     def _auxiliary(

@@ -20,7 +20,7 @@ from jaxrl_vis.learner.memory.random_integers import scaled
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import Indices, Replay
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
-from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
 
@@ -80,18 +80,18 @@ class Sampler:
             iteration: [] int32.
         """
         sample_key, goal_key = jax.random.split(key)
-        indices = self.replay.sample_indices(state, sample_key, iteration, self.config.batch_size)
+        indices = self.replay.sample_indices(state, sample_key, iteration, self.config.run.batch_size)
         goal_slot = self.goal_slots(goal_key, indices.time)
         choice = Choice(indices, goal_slot)
-        if self.config.trivial_goals < 1.0:
+        if self.config.goals.trivial_goals < 1.0:
             is_replaced = self._replaced(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
             # Transitions are drawn at random, so those of the next one's episode are, too.
             choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
-        if self.config.random_shift:
-            most, shape = self.config.random_shift, (self.config.batch_size, 2)
+        if self.config.network.random_shift:
+            most, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
             choice = choice._replace(shift=scaled(fraction, 2 * most + 1) - most)
-        if self.config.reward_clutter < 1.0:
+        if self.config.study.reward_clutter < 1.0:
             choice = choice._replace(clutter_end=self._clutter_end(state, iteration))
         parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))
         choice = parted._replace(clutter_end=choice.clutter_end)
@@ -102,7 +102,7 @@ class Sampler:
     def _clutter_end(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
         goal_states = self.shards.gather(state.episodes.states[:, -1])
         is_stored = self.shards.gather(self.replay.is_stored(state, iteration))
-        return reward_errors.find_clutter_end(goal_states, is_stored, self.config.reward_clutter)
+        return reward_errors.find_clutter_end(goal_states, is_stored, self.config.study.reward_clutter)
 
     @property
     def _has_targets(self) -> bool:
@@ -110,7 +110,7 @@ class Sampler:
 
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
         """Goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
-        shares = self.config.relabel_probability, self.resolved.balance_probability
+        shares = self.config.goals.relabel_probability, self.resolved.balance_probability
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 
     def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
@@ -123,7 +123,7 @@ class Sampler:
         states = state.episodes.states
         is_trivial = goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
         is_trivial &= goal_slot <= self.replay.horizon
-        return is_trivial & ~jax.random.bernoulli(key, self.config.trivial_goals, time.shape)
+        return is_trivial & ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
         """Read the chosen transitions, with goals at rest and the matching rewards.
@@ -135,7 +135,7 @@ class Sampler:
         Returns:
             B transitions with rewards.
         """
-        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step, choice.goal_episode)
+        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.study.n_step, choice.goal_episode)
         batch = batch.replace(shift=choice.shift)
         if choice.target_key is not None:
             assert self.auxiliary is not None
@@ -145,7 +145,7 @@ class Sampler:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.
             reached = jax.vmap(self.as_goal)(batch.observation_tp1)
             batch = batch.replace(reached=reached)
-        if self.config.n_step > 1:
+        if self.config.study.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
         if self.resolved.method.reward == "autoencoder":
@@ -155,12 +155,12 @@ class Sampler:
     def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
         """Replace rewards by discounted sums of the oracle's over up to ``n_step`` steps, and adapt the discounts."""
         episode, time = choice.indices
-        after = time[:, None] + 1 + jnp.arange(self.config.n_step)  # slots that the steps lead to, [B, n]
+        after = time[:, None] + 1 + jnp.arange(self.config.study.n_step)  # slots that the steps lead to, [B, n]
         is_step = after <= self.replay.horizon
         reached = state.episodes.states[episode[:, None], jnp.minimum(after, self.replay.horizon)]
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
         rewards = goals.oracle_reward(reached, batch.goal_state[:, None], self.threshold, **values)
-        weights = is_step * self.resolved.discount ** jnp.arange(self.config.n_step)
+        weights = is_step * self.resolved.discount ** jnp.arange(self.config.study.n_step)
         return batch.replace(
             reward=jnp.sum(weights * rewards, axis=1),
             discount=self.resolved.discount ** jnp.sum(is_step, axis=1).astype(jnp.float32),
@@ -185,12 +185,14 @@ class Sampler:
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
         """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""
         config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
-        states = reward_errors.estimate(batch.state_tp1, config.reward_noise) if config.reward_noise else batch.state_tp1
+        states = (
+            reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1
+        )
         reward = goals.oracle_reward(states, batch.goal_state, self.threshold, positive, negative)
-        shares = config.reward_false_positives, config.reward_false_negatives
+        shares = config.study.reward_false_positives, config.study.reward_false_negatives
         if not any(shares):
             return reward
         is_positive = reward_errors.flip(
-            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.reward_clutter, clutter_end
+            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.study.reward_clutter, clutter_end
         )
         return jnp.where(is_positive, positive, negative).astype(jnp.float32)

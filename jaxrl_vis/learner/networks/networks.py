@@ -94,7 +94,7 @@ class _Dense(nn.Module):
 
 def compute_dtype(config: Config) -> Any:
     """Return the dtype that networks of a configuration compute in."""
-    chosen = config.compute_dtype
+    chosen = config.network.compute_dtype
     if chosen == "auto":
         chosen = "float32" if jax.default_backend() == "cpu" else "bfloat16"
     return jnp.dtype(chosen)
@@ -190,9 +190,11 @@ class Networks:
             RequestError: The image is smaller than one block of the encoder, or could be moved out of sight; or there is no
                 image to be moved.
         """
-        shift = self.config.random_shift
+        shift = self.config.network.random_shift
         if shift and not self.sees_images:
-            raise RequestError(f"random_shift {shift} moves images, and {self.config.env} observes states: leave it out")
+            raise RequestError(
+                f"random_shift {shift} moves images, and {self.config.environment.env} observes states: leave it out"
+            )
         if self.sees_images:
             *_, height, width = self.observation_spec.shape
             least = 2**self._levels
@@ -218,13 +220,13 @@ class Networks:
         return (
             self.sees_images
             and self.dtype == jnp.bfloat16
-            and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
+            and encoder_kernel.supports(self.config.network.encoder_filters, self.observation_spec.shape)
             and encoder_kernel.is_available()
         )
 
     @property
     def _levels(self) -> int:
-        return len(self.config.encoder_filters)
+        return len(self.config.network.encoder_filters)
 
     @property
     def dtype(self) -> Any:
@@ -233,14 +235,14 @@ class Networks:
 
     @property
     def _encoder(self) -> Any:
-        return _Encoder(self.config.encoder_filters, self.config.latent_size, self.dtype)
+        return _Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
 
     def _head(self, outputs: int, output_bias: float) -> Any:
-        return _Head(self.config.hidden_sizes, outputs, output_bias, self.dtype)
+        return _Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype)
 
     @property
     def _latent_size(self) -> int:
-        return self.config.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
+        return self.config.network.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
 
     def _init(self, key: jax.Array, head: _Head, head_inputs: int, has_encoder: bool = True) -> Params:
         encoder_key, head_key = jax.random.split(key)
@@ -256,7 +258,7 @@ class Networks:
 
     def init_actor(self, key: jax.Array) -> Params:
         """Fresh actor parameters: without an encoder where it shares the critic's."""
-        has_encoder = self.config.encoders == "separate"
+        has_encoder = self.config.network.encoders == "separate"
         return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size, has_encoder=has_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
@@ -265,7 +267,7 @@ class Networks:
 
     def init_target(self, online: Params) -> Params:
         """A copy of online parameters for a target network to start with: the head alone where targets have no encoders."""
-        kept = online if self.config.target_encoder else {"head": online["head"]}
+        kept = online if self.config.network.target_encoder else {"head": online["head"]}
         return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
 
     def with_encoder(self, params: Params, other: Params) -> Params:
@@ -295,7 +297,7 @@ class Networks:
 
     def scaling(self, statistics: NormalizerState) -> Scaling:
         """Return the scaling that `prepare` and `normalize` take."""
-        return Scaling(statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
+        return Scaling(statistics.mean, normalizer.scale(statistics, self.config.network.normalizer_floor))
 
     def batch_scaling(self, statistics: Statistics) -> BatchScaling:
         """Return the scaling that `prepare_batch` takes. It stays the same for all gradient steps of an iteration."""
@@ -324,7 +326,7 @@ class Networks:
         if not self.sees_images:
             return self._normalized(observations, mean, scale)
         if self.uses_kernel:
-            limit = self.config.normalizer_clip
+            limit = self.config.network.normalizer_clip
             return encoder_kernel.prepare(observations, mean, scale, self._levels, limit, self.dtype, shift)
         if shift is not None:
             return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
@@ -336,7 +338,7 @@ class Networks:
         return normalized if shift is None else shifted(normalized, shift)
 
     def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
-        limit = self.config.normalizer_clip
+        limit = self.config.network.normalizer_clip
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:

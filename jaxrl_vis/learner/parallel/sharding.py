@@ -21,7 +21,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 
-from jaxrl_vis.config import Config, data_devices_of
+from jaxrl_vis.config import Config, data_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.parallel.shards import DATA, ONE, Shards
 from jaxrl_vis.types import LoopState, ReplayState
@@ -203,18 +203,20 @@ def make_layout(config: Config) -> Layout:
     Raises:
         RequestError: There are too few devices.
     """
-    if config.devices == 1 and jax.process_count() == 1:
+    if config.run.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE
     there = jax.devices()
-    if config.devices > len(there):
+    if config.run.devices > len(there):
         what = "there is 1" if len(there) == 1 else f"there are {len(there)}"
-        raise RequestError(f"devices {config.devices} asks for more than {what} ({there[0].device_kind}): write --devices all")
-    if jax.process_count() > 1 and config.devices < len(there):
         raise RequestError(
-            f"devices {config.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes without "
-            "work: write --devices all, or start fewer processes"
+            f"devices {config.run.devices} asks for more than {what} ({there[0].device_kind}): write --devices all"
+        )
+    if jax.process_count() > 1 and config.run.devices < len(there):
+        raise RequestError(
+            f"devices {config.run.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes "
+            "without work: write --devices all, or start fewer processes"
         )
     _avoid_shardy()
-    along_data = data_devices_of(config)
-    devices = np.asarray(there[: config.devices], dtype=object).reshape(-1, along_data)
+    along_data = data_devices(config)
+    devices = np.asarray(there[: config.run.devices], dtype=object).reshape(-1, along_data)
     return Layout(Mesh(devices, (SEED, DATA)), Shards(along_data))

@@ -111,14 +111,14 @@ def check_memory(
     Raises:
         RequestError: It does not fit. Says what would.
     """
-    capacity = math.ceil(config.replay_transitions / steps_per_iteration) * steps_per_iteration
+    capacity = math.ceil(config.run.replay_transitions / steps_per_iteration) * steps_per_iteration
     parts = layout.shards.count
     share = parts / layout.num_devices  # of the seeds, on each device
-    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.seeds) * share
-    replay = replay_bytes * config.seeds * share / parts
+    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.run.seeds) * share
+    replay = replay_bytes * config.run.seeds * share / parts
     bytes_per_rollout = replay * steps_per_iteration / capacity
     collected = bytes_per_rollout * frame_stack
-    batch = collected / steps_per_iteration * config.batch_size * 4
+    batch = collected / steps_per_iteration * config.run.batch_size * 4
     beside = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
     there, each = _least_available(layout), "" if layout.num_devices == 1 else " a device"
     if there is None:
@@ -129,9 +129,9 @@ def check_memory(
             mend = f"--replay-transitions {fitting} fits"
         else:
             mend = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
-        seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
+        seeds = "1 seed" if config.run.seeds == 1 else f"{config.run.seeds} seeds"
         raise RequestError(
-            f"a replay of {config.replay_transitions} transitions for {seeds} needs "
+            f"a replay of {config.run.replay_transitions} transitions for {seeds} needs "
             f"{show_bytes(replay)}{each}, and networks and rollouts {show_bytes(beside)} more; there are "
             f"{show_bytes(there)}{each}: {mend}"
         )

@@ -74,7 +74,7 @@ class Programs:
     def __init__(self, config: Config, program: Any, keep: bool = False, cache: bool = True):
         self.config, self.program, self.env = config, program, program.env
         self.layout = program.layout
-        self.seeds = range(config.seed, config.seed + config.seeds)
+        self.seeds = range(config.run.seed, config.run.seed + config.run.seeds)
         self._compiled: dict[str, Any] = {}
         self._stacks: dict[frozenset[str], Any] = {}
         self._traces: TraceCache | None = None
@@ -83,7 +83,7 @@ class Programs:
 
     @functools.cached_property
     def run_keys(self) -> jax.Array:
-        """[S] typed keys: seed i of a run starts from ``jax.random.key(config.seed + i)``."""
+        """[S] typed keys: seed i of a run starts from ``jax.random.key(config.run.seed + i)``."""
         return self.layout.put(jnp.stack([jax.random.key(seed) for seed in self.seeds]), self.layout.by_seed)
 
     @functools.cached_property
@@ -232,7 +232,7 @@ class Programs:
 
     def play(self, train: TrainState, keys: jax.Array) -> list[Any]:
         """The parts of a rollout of training, in their order (`rollout_parts.Played`), with typed keys [S]."""
-        count, exploration = self.config.num_envs, self.program.exploration
+        count, exploration = self.config.run.num_envs, self.program.exploration
         return self._rollout.play(self.compiled("play"), train, keys, count, exploration)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
@@ -253,7 +253,7 @@ class Programs:
         if not self.program.plays_any:
             return self.compiled("evaluate")(train, chosen)
         keys = jnp.stack([chosen] * len(self.seeds))
-        return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.eval_episodes, self.env.frame_stack)
+        return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.run.eval_episodes, self.env.frame_stack)
 
     def pending(self, metrics: Metrics) -> Pending:
         """Prepare metrics of `train_iteration` or `evaluate` for reading by the host, without compiling anything."""

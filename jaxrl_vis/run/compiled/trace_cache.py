@@ -12,7 +12,6 @@ that another user has written or could have written, and a file's digest covers 
 """
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import importlib.util
@@ -28,7 +27,7 @@ from jax import export
 from jax.extend.core import jaxpr_as_fun
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import HOST, Config, marked
 from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to
 from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.host.provenance import device_record, versions
@@ -42,9 +41,6 @@ from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_de
 VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
 MOST_FILES = 300
 """Largest number of files, of half a megabyte each; the oldest are deleted."""
-
-HOST_FIELDS = ("env_steps", "eval_interval", "checkpoint_interval", "full_checkpoint_interval")
-"""Fields of `Config` that only the host reads: no compiled program depends on them."""
 
 _PACKAGES = ("jaxrl_vis", "jaxrl_vis_envs")
 _DIGEST_BYTES = 32
@@ -66,7 +62,7 @@ def fingerprint(config: Config, env: GoalEnv) -> str | None:
     with tracing_for_default_device():
         target = [target_platform(), use_gpu_kernels()]
     # The seed is an argument, in the form of keys.
-    compiled_in = {name: value for name, value in dataclasses.asdict(config).items() if name not in (*HOST_FIELDS, "seed")}
+    compiled_in = {name: value for name, value in config.flat().items() if name not in (*marked(HOST), "seed")}
     depends_on = [compiled_in, versions(), device_record(), target, settings, _code()]
     return hashlib.sha256(json.dumps(depends_on, sort_keys=True, default=repr).encode()).hexdigest()
 
