@@ -1,7 +1,7 @@
 """Five figures of the README beside what one would use instead, written from the records."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -83,12 +83,19 @@ def _learning_cells(results: Path) -> tuple[str, str, str] | None:
     if run is None:
         return None
     ours = steps_to(curve(run.rows, "eval/success"), _LEARNT)
-    repeated = ol_aux.run(ol_aux.FETCH, "ol_aux_5").steps_to(_LEARNT)
+    repetition = ol_aux.run(ol_aux.FETCH, "ol_aux_5")
+    repeated = repetition.steps_to(_LEARNT)
     theirs = steps_to(released_curves()[ol_aux.FETCH, "ol_aux_5"], _LEARNT)
     if ours is None or repeated is None or theirs is None:
         return None
-    here = f"{short(ours)} steps with `fast`; {short(repeated)} with the authors' settings"
+    fast, paper = (_steps_per_update(rows) for rows in (run.rows, repetition.rows))
+    here = f"{short(ours)} steps with `fast`, {fast} an update; {short(repeated)} with the authors' settings, {paper} an update"
     return here, f"the authors' release, OL-AUX-5: {short(theirs)} steps", f"{theirs / ours:.3g} times fewer"
+
+
+def _steps_per_update(rows: Sequence[dict[str, Any]]) -> int:
+    last = max(rows, key=lambda row: row["env_steps"])
+    return round(last["env_steps"] / last["updates"])
 
 
 def comparison_table(results: Path = RESULTS) -> str:
