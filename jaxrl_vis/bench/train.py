@@ -127,7 +127,7 @@ def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
 
 
 def share_of_one(config: Config) -> Config:
-    """Configuration of one device's share of a run, as a run on one device."""
+    """Return the configuration of one device's share of a run, as a run on one device."""
     parts = data_devices(config)
     return config.replace(
         devices=1,

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def own_names(config: Config) -> dict[str, str]:
-    """Return the names of a configuration that are ``module:Name``, by what they name: task, algorithm, aux_tasks 1, ..."""
+    """Return the custom parts ``module:Name`` of a configuration, by their role: task, algorithm, aux_tasks 1, ..."""
     names = {"task": config.environment.env}
     for field, hint in fields.hints(Config).items():
         if not fields.names_parts(hint):

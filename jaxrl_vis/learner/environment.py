@@ -68,7 +68,7 @@ def make_env(config: Config) -> GoalEnv:
 
 
 def _read_options(environment: EnvironmentOptions) -> dict[str, Any]:
-    """``env_options`` as the fields of the environment's configuration hold them.
+    """Convert ``env_options`` to the fields of the environment's configuration.
 
     Raises:
         RequestError: One is not ``name=value``, names no field, or has a value that does not suit.

@@ -53,7 +53,7 @@ def split_key(key: jax.Array, iteration: jax.Array) -> jax.Array:
 
 
 def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> Batches:
-    """Choose the batches of all gradient steps at once: in a loop, drawing numbers would be a dozen tiny kernels a step."""
+    """Choose the batches of all gradient steps at once: inside the loop, sampling would take a dozen tiny kernels per step."""
     keys = jax.random.split(key, config.run.updates_per_iteration)
     choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
     return Batches(choices, lambda choice: sampler.batch(replay, choice))

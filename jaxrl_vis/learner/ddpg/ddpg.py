@@ -322,7 +322,7 @@ def make_ddpg(
 
 
 def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Agent, Metrics]]:
-    """Make `Algorithm.update` of gradient steps."""
+    """Build `Algorithm.update` from gradient steps."""
     interval = config.ddpg.actor_interval
 
     def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:

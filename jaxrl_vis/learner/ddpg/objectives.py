@@ -190,7 +190,7 @@ class Objectives:
         batch: Batch,
         weights: dict[str, jax.Array],
     ) -> tuple[jax.Array, jax.Array]:
-        """The actor's loss, those of its auxiliary tasks with the critic's weights added, and its actions [B, A]."""
+        """Compute the actor's loss, including its auxiliary losses with the critic's weights, and its actions [B, A]."""
         has_encoder = self.config.network.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:

@@ -109,7 +109,7 @@ class Sampler:
         return self.auxiliary is not None and bool(self.auxiliary.tasks)
 
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
-        """Goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
+        """Choose goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
         shares = self.config.goals.relabel_probability, self.resolved.balance_probability
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 

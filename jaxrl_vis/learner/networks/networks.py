@@ -93,7 +93,7 @@ class _Dense(nn.Module):
 
 
 def compute_dtype(config: Config) -> Any:
-    """Return the dtype that networks of a configuration compute in."""
+    """Return the compute dtype of a configuration's networks."""
     chosen = config.network.compute_dtype
     if chosen == "auto":
         chosen = "float32" if jax.default_backend() == "cpu" else "bfloat16"
@@ -257,7 +257,7 @@ class Networks:
         return self._encoder.init(key, blocks)["params"]
 
     def init_actor(self, key: jax.Array) -> Params:
-        """Fresh actor parameters: without an encoder where it shares the critic's."""
+        """Initialise the actor: without an encoder if it shares the critic's."""
         has_encoder = self.config.network.encoders == "separate"
         return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size, has_encoder=has_encoder)
 
@@ -266,7 +266,7 @@ class Networks:
         return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
 
     def init_target(self, online: Params) -> Params:
-        """A copy of online parameters for a target network to start with: the head alone where targets have no encoders."""
+        """Copy online parameters for a target network: the head alone if targets have no encoders."""
         kept = online if self.config.network.target_encoder else {"head": online["head"]}
         return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
 

@@ -231,7 +231,7 @@ class Programs:
         return {name: compiled[name] for name in _TRAINING}
 
     def play(self, train: TrainState, keys: jax.Array) -> list[Any]:
-        """The parts of a rollout of training, in their order (`rollout_parts.Played`), with typed keys [S]."""
+        """Play a training rollout with typed keys [S]; return its parts in order (`rollout_parts.Played`)."""
         count, exploration = self.config.run.num_envs, self.program.exploration
         return self._rollout.play(self.compiled("play"), train, keys, count, exploration)
 

@@ -13,7 +13,7 @@ from jaxrl_vis.run.storage.progress import Progress
 
 
 def describe(config: Config) -> str:
-    """Summarises a configuration in a few words: method, preset and seeds."""
+    """Summarise a configuration in a few words: method, preset and seeds."""
     seeds = (
         f"seed {config.run.seed}"
         if config.run.seeds == 1
