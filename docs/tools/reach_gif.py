@@ -55,7 +55,7 @@ def main() -> None:
         for _ in range(env.horizon // 2):  # then it rests at its goal
             observed = np.asarray(state.obs["observation"])[-1]
             panels = {"robot": np.moveaxis(np.asarray(draw(state))[-3:], 0, -1), "what it observes (depth)": observed}
-            images.append(compose(panels | {"the goal, known as an image only": goal}))
+            images.append(compose(panels | {"goal image (it sees its depth)": goal}))
             seconds.append(SECONDS)
             state = step(state, policy(state.obs["observation"], state.obs["desired_goal"]))
         seconds[-1] = LAST_SECONDS
