@@ -4,6 +4,7 @@
     readme_rows      rows of the README's tables             staleness    records that are older than the measured code
     readme_tables    tables of the README                    ablations    learning curves of the ablations, one table
     scaling_table    tables of docs/scaling.md               render_table tables of docs/renderer_speed.md
+    pixels_table     table of docs/pixels.md
     pages            every page with tables from records     markers      position of a table in its page
 
     python -m benchmarks.ledger tables     write the tables of README and docs (`make tables`)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from benchmarks import target_decay
 from benchmarks.claims import pages as claims
-from benchmarks.ledger import ablations, readme_tables, render_table, scaling_table
+from benchmarks.ledger import ablations, pixels_table, readme_tables, render_table, scaling_table
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
@@ -36,6 +36,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/renderer_speed.md": {"warp": render_table.warp_table, "mujoco": render_table.mujoco_table},
     "docs/reliability.md": {"soak": soak},
     "docs/renderer_parity.md": {"table": renderer_parity},
+    "docs/pixels.md": {"tasks": pixels_table.tasks_table},
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }
