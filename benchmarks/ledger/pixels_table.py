@@ -17,8 +17,10 @@ _MEASURES = (
 )
 
 
-def tasks_table(results: Path) -> str:
-    """Write camera, parity and, for each device with records, steps per second of all tasks, as Markdown."""
+def tasks_table(results: Path) -> str | None:
+    """Write camera, parity and, for each device with records, steps per second of all tasks, as Markdown; None without rows."""
+    if not (results / _PARITY).exists():
+        return None
     rows = json.loads((results / _PARITY).read_text())["rows"]
     speeds = {title: _speeds(results / name) for title, name in _SPEED.items() if (results / name).exists()}
     head = ["task", "camera", *(title for _, title, _, _ in _MEASURES), *(f"steps/s, {title}" for title in speeds)]

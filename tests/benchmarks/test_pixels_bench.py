@@ -77,7 +77,9 @@ def test_the_table_has_camera_parity_and_speeds(tmp_path: Path) -> None:
     for name, value in (("pixels/steps", 1234.5), ("pixels/steps_with_images", 56.7)):
         measurement = Measurement(name, value, "env-steps/s", {"task": "FishSwim"})
         keep(tmp_path / "pixels-amd-epyc-2-cores.json", to_record(measurement))
-    head, _, cartpole, fish = pixels_table.tasks_table(tmp_path).splitlines()
+    table = pixels_table.tasks_table(tmp_path)
+    assert table is not None and pixels_table.tasks_table(tmp_path / "empty") is None
+    head, _, cartpole, fish = table.splitlines()
     assert head.endswith("| steps/s, two cores |")
     assert cartpole == "| CartpoleBalance | `fixed` | 99.91 | **0.700** |  | 1.23 |  |"
     assert fish == "| FishSwim | `eye` | 99.91 | 0.700 |  | 1.23 | 1.23 k / 56.7 |"
