@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+from types import SimpleNamespace
 from typing import Any
 
 import brax.envs
@@ -20,6 +21,7 @@ from flax import struct
 from gymnasium.utils.env_checker import check_env
 from mujoco import mjx
 from render_comparison import Tally, near_edges, surface_kinds
+from render_models import poses_of
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs import pixels
@@ -190,7 +192,7 @@ def test_materials_and_textures_of_randomized_models_are_drawn() -> None:
     env._mj_model = mujoco.MjModel.from_xml_string(TEXTURED_XML)
     env._mjx_model = model = mjx.put_model(env._mj_model)
     wrapped = pixels.wrap(env, "front", SIZE, textures=("stripes",))
-    role = mujoco.mjtTextureRole.mjTEXROLE_RGB
+    role = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
     stripes, rgba = env._mj_model.texture("stripes").id, jnp.array([0.2, 1.0, 0.2, 1.0])
     textures = jnp.stack([model.mat_texid, model.mat_texid.at[0, role].set(stripes)])
     colours = jnp.stack([model.mat_rgba, model.mat_rgba.at[0].set(rgba)])
@@ -483,19 +485,23 @@ def test_normals_are_those_of_the_depths_of_mujoco(name: str) -> None:
     """Normals of the surface through the points of MuJoCo's depth image, where one object fills a pixel's neighbourhood."""
     model = make_pixels_references.MODELS[name]
     mj_model, references = model.load(), render_references.load(name)
-    mj_data = mujoco.MjData(mj_model)
-    mj_data.qpos[:] = references.qpos[0]
-    mujoco.mj_forward(mj_model, mj_data)
     views = pixels.Views(mj_model, model.camera, references.rgb.shape[1:3], ("normals", "segmentation"))
-    ours = jax.tree.map(np.asarray, jaxrl_vis_envs.jit(lambda: views(mj_data))())[model.camera]
-    points = np.asarray(views.scenes[model.camera].points(references.depth[0]), np.float64) * [1.0, -1.0, -1.0]
-    across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+    mj_data, poses = mujoco.MjData(mj_model), []
+    for qpos in references.qpos:
+        mj_data.qpos[:] = qpos
+        mujoco.mj_forward(mj_model, mj_data)
+        poses.append(poses_of(mj_data))
+    draw = jaxrl_vis_envs.jit(jax.vmap(lambda arrays: views(SimpleNamespace(**arrays))[model.camera]))
+    ours = jax.tree.map(np.asarray, draw(jax.tree.map(lambda *rows: np.stack(rows), *poses)))
+    scene = views.scenes[model.camera]
+    points = np.stack([np.asarray(scene.points(depth), np.float64) for depth in references.depth]) * [1.0, -1.0, -1.0]
+    across, down = points[:, 1:-1, 2:] - points[:, 1:-1, :-2], points[:, 2:, 1:-1] - points[:, :-2, 1:-1]
     expected = np.cross(down, across)
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
-    labels = references.segmentation[0]
-    smooth = ~near_edges(labels)[1:-1, 1:-1] & (labels >= 0)[1:-1, 1:-1]
-    angles = np.rad2deg(np.arccos(np.clip(np.sum(expected * ours["normals"][1:-1, 1:-1], axis=-1), -1.0, 1.0)))
-    floor = smooth & (mj_model.geom_type[np.maximum(labels, 0)] == mujoco.mjtGeom.mjGEOM_PLANE)[1:-1, 1:-1]
+    inner, labels = np.s_[:, 1:-1, 1:-1], references.segmentation
+    smooth = (~near_edges(labels) & (labels >= 0))[inner]
+    angles = np.rad2deg(np.arccos(np.clip(np.sum(expected * ours["normals"][inner], axis=-1), -1.0, 1.0)))
+    floor = smooth & (mj_model.geom_type[np.maximum(labels, 0)] == mujoco.mjtGeom.mjGEOM_PLANE)[inner]
     assert floor.sum() > 200 and np.median(angles[floor]) < 1.0
     # Differences over two pixels blur the curvature of thin capsules.
     assert (smooth & ~floor).sum() > 30 and np.median(angles[smooth & ~floor]) < 8.0

@@ -144,5 +144,5 @@ def _geom_textures(model: Any) -> jax.Array:
     material = jnp.asarray(model.geom_matid, jnp.int32)
     if not len(model.mat_rgba):
         return jnp.full(material.shape, -1, jnp.int32)
-    texture = jnp.asarray(model.mat_texid, jnp.int32)[material, mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    texture = jnp.asarray(model.mat_texid, jnp.int32)[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
     return jnp.where(material >= 0, texture, -1)
