@@ -48,8 +48,9 @@ def measure_parity(tasks: Sequence[str], results: pathlib.Path, page: pathlib.Pa
         ordered = [rows[name] for name in playground.tasks() if name in rows]
         path.write_text(json.dumps({"versions": versions(), "rows": ordered}, indent=1) + "\n")
         pairs[task] = comparison.ours[0].rgb, comparison.theirs[0].rgb
+        if page is not None:
+            gallery.save(pairs, page)  # pyright: ignore[reportArgumentType]
     if page is not None:
-        gallery.save(pairs, page)  # pyright: ignore[reportArgumentType]
         print(f"{page}: {page.stat().st_size / 1000:.0f} kB")
     return sum(bool(rows[task]["failures"]) for task in tasks)
 

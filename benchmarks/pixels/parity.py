@@ -48,14 +48,14 @@ def compare(task: str, size: int) -> Comparison:
     """
     env = playground.load(task)
     mj_model, camera = env.mj_model, playground.camera(env)
-    options = dict(site_groups=playground.SITE_GROUPS, lights="mujoco")
-    wrapped = pixels.wrap(env, camera, size, ("rgb", "depth", "segmentation"), **options)
+    outputs = ("rgb", "depth", "segmentation")
+    wrapped = pixels.wrap(env, camera, size, outputs, site_groups=playground.SITE_GROUPS, lights="mujoco")
     first, last = (jax.tree.map(np.asarray, part) for part in _run(wrapped))
     ours, theirs, tally = [], [], Tally(surface_kinds(mj_model))
     with ReferenceRenderer(_finely_drawn(mj_model, size), size, size, site_groups=playground.SITE_GROUPS) as reference:
         for poses, images in (first, last):
             for index in range(ENVIRONMENTS):
-                frame = Frame(*(images[output][index] for output in ("rgb", "depth", "segmentation")))
+                frame = Frame(*(images[output][index] for output in outputs))
                 ours.append(frame)
                 theirs.append(reference(_mj_data(mj_model, poses, index), camera))
                 tally.add(frame, theirs[-1])

@@ -15,7 +15,7 @@ import os
 import pathlib
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -29,6 +29,7 @@ from jaxrl_vis.bench.conditions import Watch  # noqa: E402
 from jaxrl_vis.bench.record import Measurement, compare_and_keep  # noqa: E402
 from jaxrl_vis.errors import RequestError  # noqa: E402
 from jaxrl_vis_envs import pixels  # noqa: E402
+from jaxrl_vis_envs.adapters.brax import lend_jax  # noqa: E402
 
 TASK, IMAGE_SIZE, FRAMES = "CartpoleBalance", 64, 3
 TARGET = 900.0  # of 1,000
@@ -88,7 +89,7 @@ def train(settings: dict[str, Any], seed: int) -> list[dict[str, float]]:
     evaluations: list[dict[str, float]] = []
     start = time.perf_counter()
 
-    def report(env_steps: int, metrics: dict[str, Any]) -> None:
+    def report(env_steps: int, metrics: Mapping[str, Any]) -> None:
         evaluation = {
             "env_steps": int(env_steps),
             "episode_return": round(float(metrics["eval/episode_reward"]), 1),
@@ -98,21 +99,24 @@ def train(settings: dict[str, Any], seed: int) -> list[dict[str, float]]:
         evaluations.append(evaluation)
         print(", ".join(f"{name} {value:,}" for name, value in evaluation.items()), flush=True)
 
-    networks = functools.partial(
+    # Of any type: brax's protocols know their own environments and networks alone.
+    env: Any = make_env()
+    networks: Any = functools.partial(
         networks_vision.make_ppo_networks_vision,
         policy_hidden_layer_sizes=HIDDEN_LAYERS,
         value_hidden_layer_sizes=HIDDEN_LAYERS,
         normalise_channels=True,
     )
-    ppo.train(
-        environment=make_env(),
-        wrap_env_fn=wrapper.wrap_for_brax_training,
-        network_factory=networks,
-        progress_fn=report,
-        vision=True,
-        seed=seed,
-        **settings,
-    )
+    with lend_jax():
+        ppo.train(
+            environment=env,
+            wrap_env_fn=wrapper.wrap_for_brax_training,
+            network_factory=networks,
+            progress_fn=report,
+            vision=True,
+            seed=seed,
+            **settings,
+        )
     return evaluations
 
 

@@ -160,7 +160,7 @@ def test_playground_state_in_and_out(playground: pixels.PixelEnv) -> None:
 
 
 @pytest.mark.parametrize("layout", ["dict", "images", "image"])
-def test_several_frames_show_the_last_images(layout: str) -> None:
+def test_several_frames_show_the_last_images(layout: Any) -> None:
     env = pixels.wrap(PlaygroundEnv(), "front", SIZE, goal_image=jnp.array([0.4]), frames=3, layout=layout)
 
     @jaxrl_vis_envs.jit

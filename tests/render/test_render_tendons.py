@@ -81,7 +81,7 @@ def distances(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", _TENDONS)
 def test_capsules_and_colours_are_those_of_the_visualiser(name: str) -> None:
-    mj_model, mj_data = model_of(name), None
+    mj_model = model_of(name)
     scene = Scene.from_mjmodel(mj_model, "cam", 8, 8)
 
     @jaxrl_vis_envs.jit
@@ -91,7 +91,8 @@ def test_capsules_and_colours_are_those_of_the_visualiser(name: str) -> None:
         drawn = (0,) if mj_model.nsite + mj_model.ngeom in scene.object_ids else ()
         return cords.capsules(scene, poses, drawn) if drawn else None, cords.coloured(scene, poses).rgba[-1]
 
-    states, theirs = [], []
+    states: list[dict[str, np.ndarray]] = []
+    theirs: list[list[Any]] = []
     for qpos in _POSES:
         mj_data = mujoco.MjData(mj_model)
         mj_data.qpos[:] = qpos
