@@ -48,9 +48,14 @@ BOUNDS = {
 
 
 def surface_kinds(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return [ngeom + nsite] of PLANE, BARE or TEXTURED, indexed like the segmentation."""
+    """Return [ngeom + nsite + ntendon] of PLANE, BARE or TEXTURED, indexed like the segmentation."""
     kinds = []
-    for types, materials in ((mj_model.geom_type, mj_model.geom_matid), (mj_model.site_type, mj_model.site_matid)):
+    capsules = np.full(mj_model.ntendon, mujoco.mjtGeom.mjGEOM_CAPSULE)
+    for types, materials in (
+        (mj_model.geom_type, mj_model.geom_matid),
+        (mj_model.site_type, mj_model.site_matid),
+        (capsules, mj_model.tendon_matid),
+    ):
         for kind, material in zip(types, materials, strict=True):
             textured = material >= 0 and mj_model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] >= 0
             is_plane = kind == mujoco.mjtGeom.mjGEOM_PLANE

@@ -9,7 +9,7 @@ _SKY = '<texture type="skybox" builtin="gradient" rgb1=".4 .6 .9" rgb2=".1 .1 .2
 
 
 class Limit(NamedTuple):
-    """A scene: what stands under its picture, its MJCF, and whether MuJoCo shows effects (tendons, reflections) in it."""
+    """A scene: what stands under its picture, its MJCF, and whether MuJoCo shows effects (shadows, reflections) in it."""
 
     title: str
     xml: str
@@ -23,16 +23,6 @@ def _scene(body: str, assets: str = "", more: str = "", lamp: str = _LAMP, camer
     )
 
 
-_ARM = """
-<site name="a" pos="-.5 0 .2" size=".001"/><site name="c" pos=".4 0 .6" size=".001"/>
-<body pos="0 0 .3">
-  <joint axis="0 1 0"/><geom type="capsule" size=".04 .25" euler="0 60 0"/><site name="b" pos=".1 0 .2" size=".001"/>
-</body>
-"""
-_TENDON = (
-    '</worldbody><tendon><spatial width=".015" rgba=".9 .2 .1 1">'
-    '<site site="a"/><site site="b"/><site site="c"/></spatial></tendon><worldbody>'
-)
 LIMITS = {
     "spot": Limit(
         "edge of a spot light",
@@ -46,7 +36,6 @@ LIMITS = {
             '<material name="c" texture="c"/>',
         ),
     ),
-    "tendons": Limit("tendons", _scene(_ARM + _TENDON), effects=True),
     "reflections": Limit(
         "reflections, shadows",
         _scene(

@@ -22,6 +22,7 @@ _ENVS = "envs/jaxrl_vis_envs"
 _PHYSICS = tuple(f"{_ENVS}/{name}" for name in ("base.py", "goals.py", "compiling", "physics", "tasks/mjx_env.py"))
 _RENDERER = (f"{_ENVS}/render",)
 _IMAGES = (*_RENDERER, f"{_ENVS}/pixels/observations.py")
+_WRAPPED = (*_RENDERER, f"{_ENVS}/pixels", "benchmarks/pixels/playground.py")
 _TASK = (f"{_ENVS}/tasks/{{task}}.py", f"{_ENVS}/tasks/assets/{{task}}.xml")
 _LEARNER = ("jaxrl_vis/learner", "jaxrl_vis/config")
 _TIMING = "jaxrl_vis/bench/timing.py"
@@ -35,6 +36,9 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "render/peer_warp": (*_SCENES, f"{_PEERS}/warp.py"),
     "physics/steps": (*_PHYSICS, *_TASK, "jaxrl_vis/bench/physics.py", _TIMING),
     "physics/peer_playground": (f"{_PEERS}/playground.py", _TIMING),
+    "pixels/steps": ("benchmarks/pixels/playground.py", "benchmarks/pixels/speed.py", _TIMING),
+    "pixels/steps_with_images": (*_WRAPPED, "benchmarks/pixels/speed.py", _TIMING),
+    **{f"pixels/{figure}": (*_WRAPPED, "benchmarks/pixels/train.py") for figure in ("return", "speed_to_900")},
     "env/steps": (*_PHYSICS, *_IMAGES, *_TASK, "jaxrl_vis/bench/env.py", _TIMING),
     "update/gradient_steps": (*_LEARNER, "jaxrl_vis/bench/update.py", _TIMING),
     "update/peer_torch": (f"{_PEERS}/torch", _TIMING),

@@ -2,7 +2,7 @@
 
 Each MJCF or URDF file is drawn at its start and in a scattered pose: by its camera `cam`, or else by the free camera and all of
 its own. Sites are drawn in a row of their own where there are any, and so is haze. Where a camera or a light moves, the poses
-come from `mjx.kinematics`, as in a task. Shadows, reflections, tendons, skins, flexes and multisampling are off.
+come from `mjx.kinematics`, as in a task. Shadows, reflections, skins, flexes and multisampling are off.
 
 What counts as a pass is in `Measures.failures`. A model that does not load, one of which next to nothing is seen, and one where
 MuJoCo's own image is not to be trusted have a verdict of their own, and fail nothing.

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+from types import SimpleNamespace
 from typing import Any
 
 import brax.envs
@@ -19,7 +20,8 @@ from brax.training.agents.ppo.networks_vision import make_ppo_networks_vision
 from flax import struct
 from gymnasium.utils.env_checker import check_env
 from mujoco import mjx
-from render_comparison import Tally, surface_kinds
+from render_comparison import Tally, near_edges, surface_kinds
+from render_models import poses_of
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs import pixels
@@ -44,6 +46,15 @@ _XML = """
   <actuator><motor joint="slide" gear="20"/></actuator>
 </mujoco>
 """
+
+TEXTURED_XML = _XML.replace(
+    "<worldbody>",
+    """<asset>
+    <texture name="checker" type="2d" builtin="checker" rgb1="1 1 1" rgb2=".1 .1 .6" width="32" height="32"/>
+    <texture name="stripes" type="2d" builtin="gradient" rgb1=".9 .9 .1" rgb2=".5 0 .5" width="16" height="64"/>
+    <material name="cover" texture="checker" texrepeat="2 2"/>
+  </asset><worldbody>""",
+).replace('rgba=".9 .1 .1 1"', 'material="cover"')
 
 
 @pytest.fixture(scope="module")
@@ -146,6 +157,61 @@ def test_playground_state_in_and_out(playground: pixels.PixelEnv) -> None:
             assert_same_colours(end.obs[f"pixels/{camera}"][index], truth(playground.mj_model, end.data.qpos[index], camera))
             assert_same_colours(end.obs[f"pixels/{camera}/goal"][index], truth(playground.mj_model, [0.4], camera))
     assert playground.action_size == 1 and playground.mjx_model is playground.env.mjx_model
+
+
+@pytest.mark.parametrize("layout", ["dict", "images", "image"])
+def test_several_frames_show_the_last_images(layout: Any) -> None:
+    env = pixels.wrap(PlaygroundEnv(), "front", SIZE, goal_image=jnp.array([0.4]), frames=3, layout=layout)
+
+    @jaxrl_vis_envs.jit
+    def episode(key: jax.Array) -> list[Any]:
+        states = [env.reset(key)]
+        for _ in range(2):
+            states.append(env.step(states[-1], jnp.array([2.0])))
+        return states
+
+    def stack(state: Any) -> np.ndarray:
+        """The three images, then that of the goal: [4, H, W, 3]."""
+        names = ("pixels/front", "pixels/front/goal")
+        joined = state.obs if layout == "image" else jnp.concatenate([state.obs[name] for name in names], axis=-1)
+        return np.moveaxis(np.asarray(joined).reshape(SIZE, SIZE, 4, 3), 2, 0)
+
+    states = episode(jax.random.PRNGKey(0))
+    assert stack(states[0]).shape == (4, SIZE, SIZE, 3)
+    images = [truth(env.mj_model, state.data.qpos, "front") for state in states]
+    goal = truth(env.mj_model, [0.4], "front")
+    for shown, expected in zip([*stack(states[0]), *stack(states[2])], [*images[:1] * 3, goal, *images, goal], strict=True):
+        assert_same_colours(shown, expected)
+    sizes = env.observation_size
+    assert (sizes if layout == "image" else sizes["pixels/front"])[-1] == (12 if layout == "image" else 9)
+
+
+def test_materials_and_textures_of_randomized_models_are_drawn() -> None:
+    """As Playground's randomisation of images does it: other colours and textures of a material in each environment."""
+    env = PlaygroundEnv()
+    env._mj_model = mujoco.MjModel.from_xml_string(TEXTURED_XML)
+    env._mjx_model = model = mjx.put_model(env._mj_model)
+    wrapped = pixels.wrap(env, "front", SIZE, textures=("stripes",))
+    role = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
+    stripes, rgba = env._mj_model.texture("stripes").id, jnp.array([0.2, 1.0, 0.2, 1.0])
+    textures = jnp.stack([model.mat_texid, model.mat_texid.at[0, role].set(stripes)])
+    colours = jnp.stack([model.mat_rgba, model.mat_rgba.at[0].set(rgba)])
+
+    def reset(texture: jax.Array, colour: jax.Array) -> Any:
+        inner = wrapped.unwrapped
+        inner._mjx_model = model.replace(mat_texid=texture, mat_rgba=colour)
+        try:
+            return inner.reset(jax.random.PRNGKey(0)).obs["pixels/front"]
+        finally:
+            inner._mjx_model = model
+
+    images = jaxrl_vis_envs.jit(jax.vmap(reset))(textures, colours)
+    other = mujoco.MjModel.from_xml_string(TEXTURED_XML)
+    qpos = jaxrl_vis_envs.jit(env.reset)(jax.random.PRNGKey(0)).data.qpos
+    assert_same_colours(images[0], truth(other, qpos, "front"))
+    other.mat_texid[0, role], other.mat_rgba[0] = stripes, rgba
+    assert_same_colours(images[1], truth(other, qpos, "front"))
+    assert np.abs(np.asarray(images[1] - images[0])).max() > 0.2
 
 
 def test_randomized_models_are_drawn(playground: pixels.PixelEnv) -> None:
@@ -282,6 +348,11 @@ def test_gymnasium_environments_stay_on_the_host() -> None:
     assert all(observation[name].flags.writeable for name in observation)
 
 
+def test_frames_on_the_host_are_gymnasiums() -> None:
+    with pytest.raises(ValueError, match="FrameStackObservation"):
+        pixels.wrap(gymnasium.make("InvertedPendulum-v5"), frames=3)
+
+
 def test_wrapped_environments_can_be_pickled(playground: pixels.PixelEnv) -> None:
     copy = pickle.loads(pickle.dumps(playground))
     assert copy.observation_size == playground.observation_size
@@ -300,6 +371,8 @@ def test_wrapped_environments_can_be_pickled(playground: pixels.PixelEnv) -> Non
         (dict(depth_range=(2.0, 1.0)), "depth_range must be"),
         (dict(layout="tuple"), "layout must be one of"),
         (dict(dtype="int8"), "dtype must be one of"),
+        (dict(frames=0), "frames must be a whole number"),
+        (dict(textures=("wood",)), "textures must be among the model's"),
         (dict(step=lambda data, action: data), "step is for a mujoco.MjModel"),
     ],
 )
@@ -405,3 +478,31 @@ def test_images_of_wrapped_environments_equal_those_of_mujoco(name: str) -> None
         ours = Frame(colours, images[f"{prefix}/depth"][index, :, :, 0], images[f"{prefix}/segmentation"][index, :, :, 0])
         tally.add(ours, Frame(references.rgb[index], references.depth[index], references.segmentation[index]))
     assert not tally.failures(), tally.measures()
+
+
+@pytest.mark.parametrize("name", make_pixels_references.MODELS)
+def test_normals_are_those_of_the_depths_of_mujoco(name: str) -> None:
+    """Normals of the surface through the points of MuJoCo's depth image, where one object fills a pixel's neighbourhood."""
+    model = make_pixels_references.MODELS[name]
+    mj_model, references = model.load(), render_references.load(name)
+    views = pixels.Views(mj_model, model.camera, references.rgb.shape[1:3], ("normals", "segmentation"))
+    mj_data, poses = mujoco.MjData(mj_model), []
+    for qpos in references.qpos:
+        mj_data.qpos[:] = qpos
+        mujoco.mj_forward(mj_model, mj_data)
+        poses.append(poses_of(mj_data))
+    draw = jaxrl_vis_envs.jit(jax.vmap(lambda arrays: views(SimpleNamespace(**arrays))[model.camera]))
+    ours = jax.tree.map(np.asarray, draw(jax.tree.map(lambda *rows: np.stack(rows), *poses)))
+    scene = views.scenes[model.camera]
+    points = np.stack([np.asarray(scene.points(depth), np.float64) for depth in references.depth]) * [1.0, -1.0, -1.0]
+    across, down = points[:, 1:-1, 2:] - points[:, 1:-1, :-2], points[:, 2:, 1:-1] - points[:, :-2, 1:-1]
+    expected = np.cross(down, across)
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    inner, labels = np.s_[:, 1:-1, 1:-1], references.segmentation
+    smooth = (~near_edges(labels) & (labels >= 0))[inner]
+    angles = np.rad2deg(np.arccos(np.clip(np.sum(expected * ours["normals"][inner], axis=-1), -1.0, 1.0)))
+    floor = smooth & (mj_model.geom_type[np.maximum(labels, 0)] == mujoco.mjtGeom.mjGEOM_PLANE)[inner]
+    assert floor.sum() > 200 and np.median(angles[floor]) < 1.0
+    # Differences over two pixels blur the curvature of thin capsules.
+    assert (smooth & ~floor).sum() > 30 and np.median(angles[smooth & ~floor]) < 8.0
+    assert np.all(ours["normals"][ours["segmentation"] < 0] == 0)

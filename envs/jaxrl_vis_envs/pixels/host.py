@@ -18,7 +18,7 @@ from jaxrl_vis_envs.pixels.views import Views
 
 _POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "xpos", "xmat", "xipos")
 # Bounds of observations other than colours and encoded depths.
-_BOUNDS = {"segmentation": (-1, np.iinfo(np.int32).max), "bodies": (-1, np.iinfo(np.int32).max), "normals": (-1.0, 1.0)}
+_BOUNDS = {"segmentation": (-1, np.iinfo(np.int32).max), "bodies": (-2, np.iinfo(np.int32).max), "normals": (-1.0, 1.0)}
 
 
 class _Drawn:

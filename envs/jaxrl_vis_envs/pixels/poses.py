@@ -113,7 +113,7 @@ def traced_model(env: Any) -> Any:
 
 
 def randomized_scene(scene: Scene, model: Any, mj_model: mujoco.MjModel) -> Scene:
-    """Return ``scene`` with the sizes and colours of geoms of a randomised model.
+    """Return ``scene`` with the sizes, colours and textures of the geoms of a randomised model.
 
     Args:
         scene: Scene of ``mj_model``.
@@ -123,6 +123,26 @@ def randomized_scene(scene: Scene, model: Any, mj_model: mujoco.MjModel) -> Scen
     count = mj_model.ngeom
     # By differences, because sizes in a scene are not all those of the model: infinite planes have a large one.
     size = scene.size.at[:count].add(model.geom_size - jnp.asarray(mj_model.geom_size, jnp.float32))
-    changed = jnp.any(model.geom_rgba != jnp.asarray(mj_model.geom_rgba, jnp.float32), axis=1, keepdims=True)
-    rgba = scene.rgba.at[:count].set(jnp.where(changed, model.geom_rgba, scene.rgba[:count]))
-    return scene.replace(size=size, rgba=rgba)
+    colours, before = _geom_colours(model), _geom_colours(mj_model)
+    changed = jnp.any(colours != before, axis=1, keepdims=True)
+    rgba = scene.rgba.at[:count].set(jnp.where(changed, colours, scene.rgba[:count]))
+    texture = scene.texture.at[:count].set(_geom_textures(model))
+    return scene.replace(size=size, rgba=rgba, texture=texture)
+
+
+def _geom_colours(model: Any) -> jax.Array:
+    """Return the colours of geoms or, where those are not set, of their materials: [ngeom, 4] float32."""
+    own, material = jnp.asarray(model.geom_rgba, jnp.float32), jnp.asarray(model.geom_matid)
+    if not len(model.mat_rgba):
+        return own
+    is_unset = jnp.all(own == jnp.array([0.5, 0.5, 0.5, 1.0], jnp.float32), axis=1) & (material >= 0)
+    return jnp.where(is_unset[:, None], jnp.asarray(model.mat_rgba, jnp.float32)[material], own)
+
+
+def _geom_textures(model: Any) -> jax.Array:
+    """Return the index of the colour texture of each geom, -1 for none: [ngeom] int32."""
+    material = jnp.asarray(model.geom_matid, jnp.int32)
+    if not len(model.mat_rgba):
+        return jnp.full(material.shape, -1, jnp.int32)
+    texture = jnp.asarray(model.mat_texid, jnp.int32)[material, int(mujoco.mjtTextureRole.mjTEXROLE_RGB)]
+    return jnp.where(material >= 0, texture, -1)

@@ -81,8 +81,9 @@ class Views:
 
         Returns:
             Images by name of the camera and output: ``rgb`` [H, W, 3] uint8; ``depth`` [H, W] float32, planar, m;
-            ``segmentation`` [H, W] int32: geom id, ngeom + site id for a site, -1 for the sky; ``bodies`` [H, W] int32: body
-            id, -1 for the sky; ``normals`` [H, W, 3] float32 in the camera's frame (x right, y up, z towards the viewer).
+            ``segmentation`` [H, W] int32: geom id, ngeom + site id for a site, ngeom + nsite + tendon id for a tendon, -1 for
+            the sky; ``bodies`` [H, W] int32: body id, -1 for the sky, -2 for a tendon; ``normals`` [H, W, 3] float32 in the
+            camera's frame (x right, y up, z towards the viewer).
         """
         scenes = self.scenes if scenes is None else scenes
         return {name: self._render(scenes[name], data, outputs) for name, outputs in self.outputs.items()}

@@ -32,6 +32,7 @@ def wrap(
     outputs: Output | Iterable[Output] | Mapping[str, Output | Iterable[Output]] = "rgb",
     goal_image: GoalImage = None,
     *,
+    frames: int = 1,
     layout: Layout = "dict",
     dtype: Dtype | None = None,
     depth_range: tuple[float, float] | None = None,
@@ -51,6 +52,8 @@ def wrap(
             dictionary of these by camera. See `Views`.
         goal_image: Joint positions [nq] of a goal, or a function from the state after a reset (of Gymnasium: from the
             unwrapped environment) to joint positions. Its images are rendered at the reset, and stay for the episode.
+        frames: Number of images that an observation holds of each kind, the latest last, along the channels: positions are in
+            one image, velocities in several. A reset repeats its image. Goals have one image.
         layout: ``dict``: the own observation (as ``state``, if it is an array) and the images ``pixels/CAMERA`` (colours),
             ``pixels/CAMERA/OUTPUT`` and, of goals, ``.../goal``. ``images``: the images alone. ``image``: one array [H, W, C].
         dtype: ``float32`` (colours from 0 to 1, as brax's agents take them) or ``uint8``. None: uint8 for Gymnasium, else
@@ -74,19 +77,23 @@ def wrap(
         raise ValueError(f"{type(env).__name__} renders itself: see image_observer, and make('Visual...') for built-in tasks")
     if step is not None and not isinstance(env, mujoco.MjModel):
         raise ValueError(f"step is for a mujoco.MjModel; {type(env).__name__} has its own")
+    if not isinstance(frames, int) or frames < 1:
+        raise ValueError(f"frames must be a whole number, at least 1, got {frames!r}")
     is_model = isinstance(env, mujoco.MjModel)
     mj_model = env if is_model else poses.find_model(env)
     options = dict(cameras=cameras, image_size=image_size, outputs=outputs, clip_range=clip_range, **scene_options)
     if not is_model and isinstance(getattr(getattr(env, "unwrapped", None), "data", None), mujoco.MjData):
         from jaxrl_vis_envs.pixels.host import GymnasiumPixels
 
+        if frames > 1:
+            raise ValueError("frames is for pure functions: put gymnasium.wrappers.FrameStackObservation around this wrapper")
         return GymnasiumPixels(env, goal_image, dict(layout=layout, dtype=dtype or "uint8", depth_range=depth_range), **options)
     views = Views(mj_model, **options)
     if is_model:
         from jaxrl_vis_envs.pixels.model_env import ModelEnv
 
         env = ModelEnv(env, step)
-    return PixelEnv(env, views, Format(layout, dtype or "float32", depth_range), goal_image)
+    return PixelEnv(env, views, Format(layout, dtype or "float32", depth_range), goal_image, frames)
 
 
 class PixelEnv:
@@ -102,13 +109,14 @@ class PixelEnv:
         views: Cameras, outputs and scenes.
     """
 
-    def __init__(self, env: Any, views: Views, form: Format, goal_image: GoalImage = None) -> None:
+    def __init__(self, env: Any, views: Views, form: Format, goal_image: GoalImage = None, frames: int = 1) -> None:
         """See `wrap`."""
         own = dict(
             env=env,
             views=views,
             _form=form,
             _goal_image=goal_image,
+            _frames=frames,
             _poses=poses.Poses(views.mj_model),
             _model=poses.traced_model(env),
             _names=formats.image_names(views.outputs),
@@ -122,16 +130,15 @@ class PixelEnv:
         if self._goal_image is not None:
             source = formats.goal_poses(self._goal_image, state)
             goals = self._form.images(self._render(source), formats.GOAL)
-        return self._with_images(state, self._form.images(self._render(state)), goals)
+        return self._with_images(state, None, goals)
 
     def step(self, state: Any, action: jax.Array) -> Any:
         """Step the wrapped environment, and render."""
-        own, goals = self._split(state)
+        own, earlier, goals = self._split(state)
         changes: dict[str, Any] = {"obs": own}
         if self._form.layout != "dict":
             changes["info"] = {name: value for name, value in state.info.items() if name != HIDDEN}
-        state = self.env.step(_replace(state, **changes), action)
-        return self._with_images(state, self._form.images(self._render(state)), goals)
+        return self._with_images(self.env.step(_replace(state, **changes), action), earlier, goals)
 
     @property
     def observation_size(self) -> Any:
@@ -156,33 +163,50 @@ class PixelEnv:
         scenes = {name: poses.randomized_scene(scene, model, mj_model) for name, scene in self.views.scenes.items()}
         return self.views(self._poses(source, model), scenes)
 
-    def _with_images(self, state: Any, images: dict[str, jax.Array], goals: Any) -> Any:
-        """Return ``state`` with images in the observation; ``goals`` are images, or the goal's channels of the one image."""
-        own, layout = state.obs, self._form.layout
-        if layout == "dict":
+    def _with_images(self, state: Any, earlier: Any, goals: Any) -> Any:
+        """Return ``state`` with its images in the observation.
+
+        Args:
+            state: State of the wrapped environment.
+            earlier: Images of the observation before, by name or as channels of the one image; None at the start of an episode.
+            goals: Goal images, in the same form or by name.
+        """
+        layout, own = self._form.layout, state.obs
+        images: Any = self._form.images(self._render(state))
+        if layout == "image":
+            images = self._form.joined(images)
+            goals = self._form.joined(goals) if isinstance(goals, dict) and goals else goals
+        if self._frames > 1:
+            images = jax.tree.map(self._first if earlier is None else _next, images, images if earlier is None else earlier)
+        if layout == "image":
+            obs = images if isinstance(goals, dict) else jnp.concatenate([images, goals], axis=-1)
+        elif layout == "images":
+            obs = images | goals
+        else:
             named = dict(own) if isinstance(own, Mapping) else {OWN: own}
             if clash := set(named) & {*images, *goals}:
                 raise ValueError(f"the environment has observations of the same name: {', '.join(clash)}")
             return _replace(state, obs=named | images | goals)
-        obs: Any = images | goals if layout == "images" else self._form.joined(images)
-        if layout == "image" and isinstance(goals, jax.Array):
-            obs = jnp.concatenate([obs, goals], axis=-1)
-        elif layout == "image" and goals:
-            obs = jnp.concatenate([obs, self._form.joined(goals)], axis=-1)
         return _replace(state, obs=obs, info={**state.info, HIDDEN: own})
 
-    def _split(self, state: Any) -> tuple[Any, Any]:
-        """Return the environment's own observation, and the goal images or channels, of a state of this environment."""
+    def _first(self, image: jax.Array, _: jax.Array) -> jax.Array:
+        """Repeat an image at the start of an episode."""
+        return jnp.concatenate([image] * self._frames, axis=-1)
+
+    def _split(self, state: Any) -> tuple[Any, Any, Any]:
+        """Return the environment's own observation, and the images and goal images, of a state of this environment."""
         layout, obs = self._form.layout, state.obs
+        has_goals = self._goal_image is not None
         if layout == "image":
-            # Each image has a goal image of as many channels.
-            return state.info[HIDDEN], obs[:, :, obs.shape[-1] // 2 :] if self._goal_image is not None else {}
-        names = [name + formats.GOAL for name in self._names] if self._goal_image is not None else []
-        goals = {name: obs[name] for name in names}
+            # Each image, of one frame, has a goal image of as many channels.
+            end = obs.shape[-1] // (self._frames + has_goals) * self._frames
+            return state.info[HIDDEN], obs[:, :, :end], obs[:, :, end:] if has_goals else {}
+        images = {name: obs[name] for name in self._names}
+        goals = {name + formats.GOAL: obs[name + formats.GOAL] for name in self._names if has_goals}
         if layout == "images":
-            return state.info[HIDDEN], goals
-        own = {name: leaf for name, leaf in obs.items() if name not in self._names and name not in goals}
-        return own if self._observes_mapping else own[OWN], goals
+            return state.info[HIDDEN], images, goals
+        own = {name: leaf for name, leaf in obs.items() if name not in images and name not in goals}
+        return own if self._observes_mapping else own[OWN], images, goals
 
     @functools.cached_property
     def _observes_mapping(self) -> bool:
@@ -202,3 +226,8 @@ class PixelEnv:
 def _replace(state: Any, **changes: Any) -> Any:
     """Return a state of any library with some fields changed."""
     return state.replace(**changes) if hasattr(state, "replace") else dataclasses.replace(state, **changes)
+
+
+def _next(image: jax.Array, earlier: jax.Array) -> jax.Array:
+    """Append an image to the ``earlier`` ones, and drop the first of those."""
+    return jnp.concatenate([earlier[..., image.shape[-1] :], image], axis=-1)

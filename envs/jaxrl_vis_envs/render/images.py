@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, target_platform, tracing_for
-from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render import camera, cords
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.cpu import passes
 from jaxrl_vis_envs.render.gpu import kernel
@@ -26,7 +26,7 @@ from jaxrl_vis_envs.render.pixel.prepare import check_poses, prepare
 from jaxrl_vis_envs.render.scene import Scene
 
 # Scene leaves that are not float32.
-_INTEGERS = {"texels": jnp.uint32, "cluster_places": jnp.int32}
+_INTEGERS = {"texels": jnp.uint32, "texture": jnp.int32, "cluster_places": jnp.int32}
 
 
 class _View(NamedTuple):
@@ -82,6 +82,8 @@ def render_planes(
     if not any(outputs[:-1]):  # the fast paths cannot render nothing
         return Planes(None, None, None)
     scene = _in_32_bits(scene)
+    if rgb and any(path.shows_limits for path in scene.tendon_paths):
+        scene = cords.coloured(scene, data)
     if not scene.object_ids:
         return _quantized(outputs, _draw_nothing(scene, data, outputs))
 

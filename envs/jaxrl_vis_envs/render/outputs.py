@@ -11,7 +11,7 @@ class Frame(NamedTuple):
     Attributes:
         rgb: [H, W, 3] uint8.
         depth: [H, W] float32, planar depth in metres (along the camera's axis); the scene's ``zfar`` for the sky.
-        segmentation: [H, W] int32: geom id, ngeom + site id for a site, -1 for the sky.
+        segmentation: [H, W] int32: geom id, ngeom + site id for a site, ngeom + nsite + tendon id for a tendon, -1 for the sky.
         normals: [H, W, 3] float32, unit vectors in the camera's frame (x right, y up, z towards the viewer), 0 for the sky; or
             None.
         distance: [H, W] float32, metres along the ray, ``zfar`` for the sky; or None.

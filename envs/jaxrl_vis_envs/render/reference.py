@@ -21,8 +21,9 @@ class ReferenceRenderer:
         mj_model: MuJoCo model. Its ``vis.global_.offwidth`` and ``offheight`` limit the image size.
         height: H, pixels.
         width: W, pixels.
-        effects: Render what `render` does not: shadows, reflections, haze, tendons, skins, flexes and rangefinders.
+        effects: Render what `render` does not: shadows, reflections, haze, skins, flexes and rangefinders.
         site_groups: Visible site groups.
+        tendon_groups: Visible groups of tendons.
         haze: Render the haze at the horizon even without ``effects``.
 
     Raises:
@@ -37,6 +38,7 @@ class ReferenceRenderer:
         width: int,
         effects: bool = False,
         site_groups: tuple[int, ...] = (),
+        tendon_groups: tuple[int, ...] = (0, 1, 2),
         haze: bool = False,
     ):
         check_size(height=height, width=width)
@@ -53,10 +55,10 @@ class ReferenceRenderer:
             raise RuntimeError(f"no usable GL library (set MUJOCO_GL to egl or osmesa): {error}") from error
         self._options = mujoco.MjvOption()
         self._options.sitegroup[:] = [group in site_groups for group in range(len(self._options.sitegroup))]
-        # Objects other than geoms and sites have no segmentation label and are not supported by `render`.
+        self._options.tendongroup[:] = [group in tendon_groups for group in range(len(self._options.tendongroup))]
+        # Other objects have no segmentation label and are not supported by `render`.
         vis_flags = mujoco.mjtVisFlag
         for flag in (
-            vis_flags.mjVIS_TENDON,
             vis_flags.mjVIS_RANGEFINDER,
             vis_flags.mjVIS_SKIN,
             vis_flags.mjVIS_FLEXEDGE,
@@ -88,7 +90,11 @@ class ReferenceRenderer:
         ids, kinds = np.moveaxis(self._renderer.render(), -1, 0)
         self._renderer.disable_segmentation_rendering()
         labels = np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, ids, -1)
-        labels = np.where(kinds == mujoco.mjtObj.mjOBJ_SITE, ids + self._model.ngeom, labels)
+        for kind, first in (
+            (mujoco.mjtObj.mjOBJ_SITE, self._model.ngeom),
+            (mujoco.mjtObj.mjOBJ_TENDON, self._model.ngeom + self._model.nsite),
+        ):
+            labels = np.where(kinds == kind, ids + first, labels)
         return Frame(colour, depth, labels.astype(np.int32))  # pyright: ignore[reportArgumentType]
 
     def close(self) -> None:

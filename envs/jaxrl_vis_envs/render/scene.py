@@ -3,8 +3,9 @@
 A `Scene` is a pytree. Sizes, colours, materials, lights and camera parameters are leaves, so a batch of appearances is a
 ``jax.vmap`` over ``scene.replace(rgba=...)``; geom types, ids and the image size are static and determine the compiled program.
 
-Arrays over objects are indexed like the segmentation: object ``i`` is geom ``i`` of the model, and object ``ngeom + i`` is site
-``i``. Objects that are never visible keep their row, so that indexing needs no lookup table.
+Arrays over objects are indexed like the segmentation: object ``i`` is geom ``i`` of the model, object ``ngeom + i`` is site
+``i``, and object ``ngeom + nsite + i`` is tendon ``i``. Objects that are never visible keep their row, so that indexing needs
+no lookup table. A tendon is rendered as several capsules.
 """
 
 import dataclasses
@@ -15,7 +16,8 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs.render import mounts, viewpoint
-from jaxrl_vis_envs.render.model import cameras, meshes, reading, textures
+from jaxrl_vis_envs.render.model import cameras, meshes, reading, tendons
+from jaxrl_vis_envs.render.model import textures as atlases
 
 
 def _leaf() -> Any:
@@ -31,10 +33,12 @@ def _static() -> Any:
 class Scene:
     """One camera's view of one model, without the poses. Construct it with `Scene.from_mjmodel`.
 
-    N is ngeom + nsite, L the number of active lights (without the headlight), G the number of rendered objects.
+    N is ngeom + nsite + ntendon, L the number of active lights (without the headlight), G the number of rendered objects, of
+    which each capsule of a tendon is one.
 
     Attributes:
-        size: [N, 3] float32, metres, as in `mjModel.geom_size` for each type (infinite planes: a very large half-size).
+        size: [N, 3] float32, metres, as in `mjModel.geom_size` for each type (infinite planes: a very large half-size; tendons:
+            their width, thrice).
         bound: [N] float32, metres, radius of each object's bounding sphere, for sorting transparent objects.
         rgba: [N, 4] float32 in [0, 1], colour of the geom or its material. Alpha is used only for the objects marked in
             ``transparent``, which is fixed when the scene is constructed.
@@ -42,6 +46,8 @@ class Scene:
         specular: [N] float32 in [0, 1], specular reflectance.
         shininess: [N] float32 in [0, 1]; the Phong exponent is 128 times this.
         texture_repeat: [N, 2] float32, repetitions of the texture per object (per metre if ``atlas.uniform``).
+        texture: [N] int32, the texture's index in the model, -1 for none. Objects with a texture in the model can have any that
+            is loaded (see `from_mjmodel`), of the same type and number of channels.
         fovy: [] float32, vertical field of view: degrees, or metres for an orthographic camera.
         focal: [2] float32, focal lengths, metres, for a camera with a sensor size.
         principal: [2] float32, principal point relative to the sensor's centre, metres, for a camera with a sensor size.
@@ -72,18 +78,20 @@ class Scene:
         sky_top: [3] float32 in [0, 1], colour of a plain sky at the zenith (world +z).
         sky_bottom: [3] float32 in [0, 1], colour of a plain sky at the nadir.
         haze_colour: [3] float32 in [0, 1].
+        cords: [ntendon, 15] float32, lengths, limits and gravity of tendons, see `model.tendons`.
         texels: [T, 4] uint32, all textures at all mipmap levels, see `textures.Atlas`.
         triangles: [R, 36] float32, triangles of all meshes and height fields, see `meshes.build_triangles`.
         clusters: [K, 4] float32, bounding spheres of the rendered triangle clusters, metres.
         cluster_places: [K, 2] int32: index of the cluster's object among the G, and first row of its triangles.
-        object_ids: G indices of the rendered objects, in the reverse of MuJoCo's drawing order: of two objects at the same
-            depth, MuJoCo shows the one drawn later, this renderer the one listed first. That is descending order, with the
-            reflecting object, if any, at the end.
+        object_ids: G indices of the rendered objects (a tendon's once for each of its capsules), in the reverse of MuJoCo's
+            drawing order: of two objects at the same depth, MuJoCo shows the one drawn later, this renderer the one listed
+            first. That is descending order, with the reflecting object, if any, at the end.
         object_types: G values of `mujoco.mjtGeom`.
         transparent: G flags: 0 opaque, 1 transparent, 2 a plane that is transparent from behind.
         reordered: Whether a reflecting object is drawn before objects declared before it. MuJoCo's segmentation keeps the
             order of declaration.
         geom_count: ngeom of the model.
+        tendon_paths: Paths of the tendons.
         camera_id: Index of the camera in the model; `cameras.FREE_CAMERA` for a free one.
         camera_mount: Attachment of the camera.
         body_parents: nbody indices of parent bodies if ``body_mass`` is used, else empty.
@@ -108,6 +116,7 @@ class Scene:
     specular: jax.Array = _leaf()
     shininess: jax.Array = _leaf()
     texture_repeat: jax.Array = _leaf()
+    texture: jax.Array = _leaf()
     fovy: jax.Array = _leaf()
     focal: jax.Array = _leaf()
     principal: jax.Array = _leaf()
@@ -133,6 +142,7 @@ class Scene:
     sky_top: jax.Array = _leaf()
     sky_bottom: jax.Array = _leaf()
     haze_colour: jax.Array = _leaf()
+    cords: jax.Array = _leaf()
     texels: jax.Array = _leaf()
     triangles: jax.Array = _leaf()
     clusters: jax.Array = _leaf()
@@ -142,6 +152,7 @@ class Scene:
     transparent: tuple[int, ...] = _static()
     reordered: bool = _static()
     geom_count: int = _static()
+    tendon_paths: tuple[tendons.Path, ...] = _static()
     camera_id: int = _static()
     camera_mount: mounts.Mount = _static()
     body_parents: tuple[int, ...] = _static()
@@ -155,7 +166,12 @@ class Scene:
     headlight: bool = _static()
     sky: str = _static()
     haze: tuple[int, float] = _static()
-    atlas: textures.Atlas = _static()
+    atlas: atlases.Atlas = _static()
+
+    @property
+    def site_count(self) -> int:
+        """Number of sites of the model."""
+        return len(self.size) - self.geom_count - len(self.tendon_paths)
 
     @classmethod
     def from_mjmodel(
@@ -166,7 +182,9 @@ class Scene:
         width: int = 64,
         groups: tuple[int, ...] = (0, 1, 2),
         site_groups: tuple[int, ...] = (),
+        tendon_groups: tuple[int, ...] = (0, 1, 2),
         textured: bool = True,
+        textures: tuple[str | int, ...] = (),
         shadows: bool = False,
         haze: bool = False,
         plane_backs: bool | None = None,
@@ -184,8 +202,11 @@ class Scene:
             width: Image width in pixels.
             groups: Visible geom groups (default as in `mujoco.Renderer`).
             site_groups: Visible site groups. None by default, unlike in `mujoco.Renderer`: sites are markers for users.
+            tendon_groups: Visible groups of spatial tendons (default as in `mujoco.Renderer`).
             textured: Render textures. If False, which is cheaper, an object has its texture's mean colour, and the sky is a
                 gradient between its colours at the zenith and the nadir.
+            textures: Names or indices of further textures to load, for scenes in which objects have another one than in the
+                model.
             shadows: Render hard shadows of the lights that cast shadows in the model: one more ray per light.
             haze: Render haze at the horizon of the first infinite plane, as in the model's visual settings.
             plane_backs: True: planes are partly transparent from behind, as in MuJoCo. False: they look the same from both
@@ -196,32 +217,36 @@ class Scene:
                 MuJoCo's renderer does not support, to reproduce its images.
 
         Returns:
-            The scene. Objects with alpha 0 and objects of other groups are omitted; tendons are not rendered.
+            The scene. Objects with alpha 0 and objects of other groups are omitted.
 
         Raises:
-            ValueError: ``mj_model`` is not a `mujoco.MjModel`, the camera or a geom in ``leave_out`` does not exist, a size is
-                not a positive integer, groups are not integers, ``lights`` is invalid, or something visible is not supported
-                (skins, flexes, shadows of meshes).
+            ValueError: ``mj_model`` is not a `mujoco.MjModel`, the camera, a texture or a geom in ``leave_out`` does not exist,
+                a size is not a positive integer, groups are not integers, ``lights`` is invalid, or something visible is not
+                supported (skins, flexes, shadows of meshes).
         """
         reading.check_model(mj_model)
         reading.check_size(height=height, width=width)
         groups = reading.group_numbers("groups", groups)
         site_groups = reading.group_numbers("site_groups", site_groups)
+        tendon_groups = reading.group_numbers("tendon_groups", tendon_groups)
         reading.check_names(mj_model, leave_out)
         reading.check_lights(lights)
         camera_id = cameras.find_camera(mj_model, camera)
         appearance = reading.object_appearance(mj_model)
         types = reading.object_types(mj_model)
-        drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, leave_out)
+        drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, tendon_groups, leave_out)
         reading.check_supported(mj_model, types, drawn, groups, leave_out, shadows)
         clear_planes = reading.planes_clear_from_behind(mj_model, camera_id, camera, plane_backs)
         transparency = reading.transparency(appearance["rgba"][:, 3], clear_planes)
         ids, reordered = reading.drawing_order(mj_model, types, np.flatnonzero(drawn), transparency[drawn] == reading.SOLID)
-        atlas, texels, sky = textures.build_atlas(mj_model, ids, types[ids], textured)
+        paths = tendons.read_paths(mj_model)
+        ids = np.repeat(ids, tendons.capsule_counts(mj_model, paths)[ids])
+        further = reading.texture_numbers(mj_model, textures)
+        atlas, texels, sky = atlases.build_atlas(mj_model, ids, types[ids], textured, further)
         if not textured:
             appearance["rgba"] *= reading.mean_texture_colours(mj_model)
         light_leaves, light_facts = reading.lights(mj_model, appearance["specular"][ids], shadows, points=lights == "all")
-        leaves = {"bound": reading.bounds(mj_model), **appearance, **light_leaves}
+        leaves = {"bound": reading.bounds(mj_model), "cords": tendons.cord_columns(mj_model), **appearance, **light_leaves}
         leaves |= cameras.camera_parameters(mj_model, camera_id, camera)
         leaves["sky_top"], leaves["sky_bottom"] = reading.sky_colours(mj_model)
         leaves["haze_colour"] = mj_model.vis.rgba.haze[:3]
@@ -229,7 +254,11 @@ class Scene:
         leaves["body_mass"], parents = reading.body_masses(mj_model, (camera_mount, *light_facts["light_mounts"]))
         arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
         clear = transparency[ids] == reading.CLEAR
-        arrays |= {"texels": texels, **meshes.build_triangles(mj_model, ids, types[ids], clear)}
+        arrays |= {
+            "texels": texels,
+            "texture": reading.object_textures(mj_model).astype(np.int32),
+            **meshes.build_triangles(mj_model, ids, types[ids], clear),
+        }
         return cls(
             # All in one call: `jnp.asarray` would compile a program per shape.
             **jax.device_put(arrays),
@@ -238,6 +267,7 @@ class Scene:
             transparent=tuple(transparency[ids].tolist()),
             reordered=reordered,
             geom_count=mj_model.ngeom,
+            tendon_paths=paths,
             camera_id=camera_id,
             camera_mount=camera_mount,
             body_parents=parents,

@@ -152,10 +152,13 @@ def _rotate_randomly(quaternions: np.ndarray, max_angle: float, rng: np.random.G
 
 
 def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-    """Compute the poses that an image needs: bodies, geoms, sites, cameras and lights."""
+    """Compute what an image needs: poses of bodies, geoms, sites, cameras, lights and tendons, and the tendons' limits."""
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)
+    if mj_model.ntendon:
+        mujoco.mj_tendon(mj_model, mj_data)
+        mujoco.mj_makeConstraint(mj_model, mj_data)
 
 
 def random_poses(mj_model: mujoco.MjModel, count: int, seed: int, spread: float = 1.0) -> dict[str, np.ndarray]:

@@ -10,7 +10,9 @@ import numpy as np
 from jaxrl_vis_envs.render.model.cameras import FREE_CAMERA, Camera, free_camera, free_camera_pose
 from jaxrl_vis_envs.render.mounts import Mount
 
-_SDF, _MESH, _BOX, _PLANE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SDF", "MESH", "BOX", "PLANE"))
+_SDF, _MESH, _BOX, _PLANE, _CAPSULE = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SDF", "MESH", "BOX", "PLANE", "CAPSULE")
+)
 
 # A plane's half-size of 0 means infinite along that axis; this is far beyond any clipping distance.
 INFINITE_SIZE = 1e10
@@ -37,14 +39,16 @@ def drawn_objects(
     rgba: np.ndarray,
     groups: tuple[int, ...],
     site_groups: tuple[int, ...],
+    tendon_groups: tuple[int, ...],
     leave_out: tuple[str, ...],
 ) -> np.ndarray:
-    """Return the mask [ngeom + nsite] of rendered objects: in a visible group, not invisible, not left out."""
+    """Return the mask [ngeom + nsite + ntendon] of rendered objects: in a visible group, not invisible, not left out."""
     geoms = np.isin(_clamped(mj_model.geom_group), groups)
     sites = np.isin(_clamped(mj_model.site_group), site_groups)
     left_out = [mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in leave_out]
     geoms[[index for index in left_out if index >= 0]] = False
-    return np.concatenate([geoms, sites]) & (rgba[:, 3] > 0)
+    tendons = np.isin(_clamped(mj_model.tendon_group), tendon_groups)
+    return np.concatenate([geoms, sites, tendons]) & (rgba[:, 3] > 0)
 
 
 def _clamped(group: np.ndarray) -> np.ndarray:
@@ -86,6 +90,17 @@ def check_lights(lights: Any) -> None:
         raise ValueError(f"lights must be one of {', '.join(map(repr, LIGHTS))}, got {lights!r}")
 
 
+def texture_numbers(mj_model: mujoco.MjModel, textures: Any) -> tuple[int, ...]:
+    """Return the indices of textures by name or index, or raise a ValueError that lists those that objects can have."""
+    known = {mj_model.texture(index).name: index for index in range(mj_model.ntex) if mj_model.tex_nchannel[index] in (3, 4)}
+    listed = [textures] if isinstance(textures, str) else list(textures)
+    numbers = [known.get(texture) if isinstance(texture, str) else texture for texture in listed]
+    if not all(number in known.values() for number in numbers):
+        names = ", ".join(repr(name) for name in known if name) or "none has a name"
+        raise ValueError(f"textures must be among the model's: {names}; got {textures!r}")
+    return tuple(int(number) for number in numbers)  # pyright: ignore[reportArgumentType]
+
+
 def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
     """Raise a ValueError listing the names in ``leave_out`` that are neither a geom's name nor "skin" nor "flex"."""
     if isinstance(leave_out, str) or not isinstance(leave_out, Iterable):
@@ -98,8 +113,11 @@ def check_names(mj_model: mujoco.MjModel, leave_out: tuple[str, ...]) -> None:
 
 
 def object_types(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return the `mujoco.mjtGeom` [ngeom + nsite] of objects as rendered: a signed distance field as MuJoCo's mesh of it."""
-    types = np.concatenate([mj_model.geom_type, mj_model.site_type])
+    """Return the `mujoco.mjtGeom` [ngeom + nsite + ntendon] of objects as rendered.
+
+    A signed distance field is MuJoCo's mesh of it, a tendon consists of capsules.
+    """
+    types = np.concatenate([mj_model.geom_type, mj_model.site_type, np.full(mj_model.ntendon, _CAPSULE)])
     return np.where(types == _SDF, _MESH, types)
 
 
@@ -128,7 +146,7 @@ def drawing_order(mj_model: mujoco.MjModel, types: np.ndarray, ids: np.ndarray, 
 
 
 def bounds(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return the radii [ngeom + nsite] (m) of the bounding spheres by which MuJoCo sorts transparent objects."""
+    """Return the radii [ngeom + nsite + ntendon] (m) of the bounding spheres by which MuJoCo sorts transparent objects."""
     x, y, z = mj_model.site_size.reshape(-1, 3).T
     kinds = mj_model.site_type
     sites = np.sqrt(x * x + y * y + z * z)
@@ -136,7 +154,7 @@ def bounds(mj_model: mujoco.MjModel) -> np.ndarray:
     sites = np.where(kinds == mujoco.mjtGeom.mjGEOM_CAPSULE, x + y, sites)
     sites = np.where(kinds == mujoco.mjtGeom.mjGEOM_CYLINDER, np.sqrt(x * x + y * y), sites)
     sites = np.where(kinds == mujoco.mjtGeom.mjGEOM_ELLIPSOID, np.maximum(np.maximum(x, y), z), sites)
-    return np.concatenate([mj_model.geom_rbound, sites])
+    return np.concatenate([mj_model.geom_rbound, sites, mj_model.tendon_width])
 
 
 def check_supported(
@@ -165,7 +183,7 @@ def check_supported(
 
 
 def object_name(mj_model: mujoco.MjModel, index: int) -> str:
-    """Return the name of object ``index`` (a geom, or ngeom + a site) for messages."""
+    """Return the name of object ``index`` (a geom, or ngeom + a site; tendons need no messages)."""
     is_geom = index < mj_model.ngeom
     number = int(index if is_geom else index - mj_model.ngeom)
     name = (mj_model.geom(number) if is_geom else mj_model.site(number)).name or f"number {number}"
@@ -173,12 +191,12 @@ def object_name(mj_model: mujoco.MjModel, index: int) -> str:
 
 
 def object_materials(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return the material [N] of every geom, then of every site; -1 for none."""
-    return np.concatenate([mj_model.geom_matid, mj_model.site_matid])
+    """Return the material [N] of every geom, then of every site and every tendon; -1 for none."""
+    return np.concatenate([mj_model.geom_matid, mj_model.site_matid, mj_model.tendon_matid])
 
 
 def object_textures(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return the colour texture [N] of every geom, then of every site; -1 for none."""
+    """Return the colour texture [N] of every geom, site and tendon; -1 for none."""
     material = object_materials(mj_model)
     if not mj_model.nmat:
         return np.full(len(material), -1)
@@ -186,9 +204,10 @@ def object_textures(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return size, colour and material of every geom, then of every site. Keys as in `Scene`."""
-    size = np.concatenate([mj_model.geom_size, mj_model.site_size]).reshape(-1, 3)
-    rgba = np.concatenate([mj_model.geom_rgba, mj_model.site_rgba]).reshape(-1, 4).astype(np.float64)
+    """Return size, colour and material of every geom, site and tendon. Keys as in `Scene`."""
+    widths = np.repeat(mj_model.tendon_width[:, None], 3, axis=1)
+    size = np.concatenate([mj_model.geom_size, mj_model.site_size, widths]).reshape(-1, 3)
+    rgba = np.concatenate([mj_model.geom_rgba, mj_model.site_rgba, mj_model.tendon_rgba]).reshape(-1, 4).astype(np.float64)
     material = object_materials(mj_model)
     count = len(size)
     # Defaults of MuJoCo's visualiser for an object without a material.
@@ -203,7 +222,7 @@ def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
         # The default grey means "not set": use the material's colour.
         if np.array_equal(rgba[index], [0.5, 0.5, 0.5, 1.0]):
             rgba[index] = mj_model.mat_rgba[number]
-    planes = np.concatenate([mj_model.geom_type, mj_model.site_type]) == mujoco.mjtGeom.mjGEOM_PLANE
+    planes = object_types(mj_model) == _PLANE
     size = np.where(planes[:, None] & (size <= 0), INFINITE_SIZE, size)
     return dict(size=size, rgba=rgba, emission=emission, specular=specular, shininess=shininess, texture_repeat=repeat)
 
@@ -226,7 +245,7 @@ def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
 
 
 def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return mean texture colours [N, 4] in [0, 1], alpha last, of every geom and site; ones if there is no texture."""
+    """Return mean texture colours [N, 4] in [0, 1], alpha last, of every geom, site and tendon; ones if there is no texture."""
     means = np.ones((mj_model.ntex + 1, 4))  # the last row is for objects without a texture
     for texture in range(mj_model.ntex):
         pixels = texture_pixels(mj_model, texture)
@@ -256,7 +275,7 @@ def sky_colours(mj_model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def planes_clear_from_behind(mj_model: mujoco.MjModel, camera_id: int, camera: Camera, plane_backs: bool | None) -> np.ndarray:
-    """Return the mask [ngeom + nsite] of planes transparent from behind, for ``plane_backs`` of `Scene.from_mjmodel`."""
+    """Return the mask [ngeom + nsite + ntendon] of planes transparent from behind, see `Scene.from_mjmodel`."""
     planes = mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     if plane_backs is None:
         mj_data = mujoco.MjData(mj_model)
@@ -268,7 +287,7 @@ def planes_clear_from_behind(mj_model: mujoco.MjModel, camera_id: int, camera: C
         planes = planes & (np.sum((position - mj_data.geom_xpos) * normals, axis=1) < 0)
     elif not plane_backs:
         planes = np.zeros(mj_model.ngeom, bool)
-    return np.concatenate([planes, np.zeros(mj_model.nsite, bool)])
+    return np.concatenate([planes, np.zeros(mj_model.nsite + mj_model.ntendon, bool)])
 
 
 def transparency(alpha: np.ndarray, clear_planes: np.ndarray) -> np.ndarray:

@@ -32,7 +32,8 @@ class Atlas(NamedTuple):
     Attributes:
         levels: First row in the texels, width and height (of one face) of every image at every level.
         mappings: Texture mapping of each of the G rendered objects.
-        images: Texture of each of the G rendered objects; None for none.
+        images: Texture of each of the G rendered objects in the model; None for none.
+        loaded: Image of each texture of the model; None for those that are not in the atlas.
         uniform: Flags of the G rendered objects whose texture repeats per metre, not per object.
         alpha: Flags of the G rendered objects whose texture has alpha, which matters if they are transparent.
         sky: Texture of the sky, None for a plain one.
@@ -41,6 +42,7 @@ class Atlas(NamedTuple):
     levels: tuple[tuple[int, int, int], ...]
     mappings: tuple[int, ...]
     images: tuple[Image | None, ...]
+    loaded: tuple[Image | None, ...]
     uniform: tuple[bool, ...]
     alpha: tuple[bool, ...]
     sky: Image | None
@@ -51,8 +53,10 @@ class Atlas(NamedTuple):
         return any(mapping != NONE for mapping in self.mappings)
 
 
-def build_atlas(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, textured: bool) -> tuple[Atlas, np.ndarray, str]:
-    """Collect the textures of the objects ``ids``, rendered with these types, and of the sky.
+def build_atlas(
+    mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, textured: bool, further: tuple[int, ...] = ()
+) -> tuple[Atlas, np.ndarray, str]:
+    """Collect the textures of the objects ``ids``, rendered with these types, the ``further`` ones, and that of the sky.
 
     Returns:
         The atlas, the texels [T, 4] uint32 (T at least 1), and "plain" or "texture" for the sky.
@@ -81,8 +85,11 @@ def build_atlas(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, te
     sky = None
     if textured and skybox >= 0 and not _is_plain_sky(mj_model, skybox):
         sky = add(skybox)
+    for number in further if any(mappings) else ():
+        add(number)
     texels = np.concatenate(parts) if parts else np.zeros((1, 4), np.uint32)
-    atlas = Atlas(tuple(levels), tuple(mappings), images_by_object, uniform, alpha, sky)
+    loaded = tuple(images.get(number) for number in range(mj_model.ntex))
+    atlas = Atlas(tuple(levels), tuple(mappings), images_by_object, loaded, uniform, alpha, sky)
     return atlas, texels, "texture" if sky is not None else "plain"
 
 

@@ -86,15 +86,25 @@ def appearance_columns(scene: Scene) -> list[jax.Array]:
     columns = [jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, channel] for channel in range(3))]
     columns += [scene.emission[ids], scene.specular[ids], 128.0 * scene.shininess[ids]]
     if scene.atlas.used:
-        images = [image or textures.Image(0, 1, 1) for image in scene.atlas.images]
-        columns.append(jnp.asarray(scene.atlas.mappings, jnp.float32))
+        facts, mapping = _atlas_places(scene, ids)
+        columns.append(mapping)
         columns.extend(_texture_scales(scene, ids))
-        columns.append(jnp.asarray([image.first_level for image in images], jnp.float32))
-        columns.append(jnp.asarray([image.levels for image in images], jnp.float32))
-        columns.append(jnp.asarray([image.faces == 6 for image in images], jnp.float32))
-        sizes = np.array([scene.atlas.levels[image.first_level][1:] for image in images], np.float32)
-        columns.extend(jnp.asarray(sizes[:, axis]) for axis in range(2))
+        columns.extend(facts[:, column] for column in range(facts.shape[1]))
     return columns
+
+
+def _atlas_places(scene: Scene, ids: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """Return first level, number of levels, 1 for six faces, width and height of the objects' textures, [G, 5] float32; and the
+    mapping [G] float32, which is that of no texture where one is not loaded.
+    """
+    images = [*scene.atlas.loaded, None]  # the last is selected by index -1
+    chosen = jnp.clip(scene.texture[ids], -1, len(images) - 2)
+    facts = np.zeros((len(images), 5), np.float32)
+    for number, image in enumerate(images):
+        first, levels, faces = image or textures.Image(0, 1, 1)
+        facts[number] = (first, levels, faces == 6, *scene.atlas.levels[first][1:])
+    is_loaded = jnp.asarray([image is not None for image in images])[chosen]
+    return jnp.asarray(facts)[chosen], jnp.where(is_loaded, np.array(scene.atlas.mappings, np.float32), float(textures.NONE))
 
 
 def _texture_scales(scene: Scene, ids: np.ndarray) -> list[jax.Array]:

@@ -58,7 +58,7 @@ def check_poses(scene: Any, data: Any, rgb: bool) -> None:
     if scene.object_ids:
         _check_kind(data, "geom_", scene.geom_count, is_exact=True)
     if any(index >= scene.geom_count for index in scene.object_ids):
-        _check_kind(data, "site_", len(scene.size) - scene.geom_count, is_exact=True)
+        _check_kind(data, "site_", scene.site_count, is_exact=True)
     mounts = (scene.camera_mount, *(scene.light_mounts if rgb else ()))
     posed = max(mount.posed for mount in mounts)
     if posed > 0:

@@ -95,7 +95,7 @@ def _shadow_mask(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.L
     margin = 1e-4 * (1.0 - start[2])
     shadowed = jnp.zeros(start[2].shape, bool)
     for index in range(len(scene.object_ids)):
-        if scene.object_ids[index] >= scene.geom_count:
+        if 0 <= scene.object_ids[index] - scene.geom_count < scene.site_count:
             continue
         axes = [[unit.axes[index, i, j] for j in range(3)] for i in range(3)]
         values = ([unit.origin[index, i] for i in range(3)], axes, unit.extra[index], unit.extra_square[index])

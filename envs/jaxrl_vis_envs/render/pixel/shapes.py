@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from jaxrl_vis_envs.render import cords
 from jaxrl_vis_envs.render.scene import Scene
 
 PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -64,8 +65,7 @@ def unit_shapes(
         camera_rotation: [3, 3] float32, columns are the camera's axes in the world.
         camera_finite: [] bool; if False, nothing is visible.
     """
-    position, rotation = _object_poses(scene, data)
-    size = scene.size[np.array(scene.object_ids)]
+    position, rotation, size = _objects(scene, data)
     kinds = np.array(scene.object_types)[:, None]
     finite = camera_finite & jnp.all(jnp.isfinite(position), -1) & jnp.all(jnp.isfinite(rotation), (-2, -1))
     finite &= ~_without_area(kinds[:, 0], size)
@@ -138,12 +138,25 @@ def _radii(kinds: np.ndarray, size: jax.Array) -> jax.Array:
     return jnp.where((kinds == CYLINDER) | (kinds == PLANE), jnp.sqrt(a * a + b * b), radius)
 
 
-def _object_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
-    """Return positions [G, 3] and rotations [G, 3, 3] of the rendered objects in the world, float32."""
+def _objects(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return positions [G, 3] and rotations [G, 3, 3] of the rendered objects in the world, and sizes [G, 3] (m), float32."""
     position = jnp.asarray(data.geom_xpos, jnp.float32)
     rotation = jnp.asarray(data.geom_xmat, jnp.float32).reshape(-1, 3, 3)
-    if any(index >= scene.geom_count for index in scene.object_ids):
+    if scene.site_count and any(index >= scene.geom_count for index in scene.object_ids):
         position = jnp.concatenate([position, jnp.asarray(data.site_xpos, jnp.float32)])
         rotation = jnp.concatenate([rotation, jnp.asarray(data.site_xmat, jnp.float32).reshape(-1, 3, 3)])
     ids = np.array(scene.object_ids)
-    return position[ids], rotation[ids]
+    first = scene.geom_count + scene.site_count
+    rows = np.flatnonzero(ids >= first)
+    if not len(rows):
+        return position[ids], rotation[ids], scene.size[ids]
+    # Objects are in descending order but for a reflecting one: the capsules of each tendon follow one another.
+    cord = cords.capsules(scene, data, tuple(dict.fromkeys((ids[rows] - first).tolist())))
+    others = np.where(ids < first, ids, 0)
+    width = scene.size[ids[rows], 0]
+    size = jnp.stack([width, cord.half, width], axis=1)
+    return (
+        position[others].at[rows].set(cord.position),
+        rotation[others].at[rows].set(cord.rotation),
+        scene.size[ids].at[rows].set(size),
+    )

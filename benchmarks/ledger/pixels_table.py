@@ -1,0 +1,51 @@
+"""Table of docs/pixels.md: MuJoCo Playground's tasks, written from the records of `benchmarks.pixels`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from benchmarks.ledger.readme_tables import short
+from jaxrl_vis.bench.record import load
+
+_PARITY = "pixels_parity.json"
+_SPEED = {"two cores": "pixels-amd-epyc-2-cores.json", "H100": "pixels-nvidia-h100-80gb-hbm3-x1.json"}
+_MEASURES = (
+    ("segmentation", "segmentation, %", 100.0, 2),
+    ("matched", "worst match", 1.0, 3),
+    ("depth", "depth, %", 100.0, 2),
+    ("bare_mean", "colours", 1.0, 2),
+)
+
+
+def tasks_table(results: Path) -> str | None:
+    """Write camera, parity and, for each device with records, steps per second of all tasks, as Markdown; None without rows."""
+    if not (results / _PARITY).exists():
+        return None
+    rows = json.loads((results / _PARITY).read_text())["rows"]
+    speeds = {title: _speeds(results / name) for title, name in _SPEED.items() if (results / name).exists()}
+    head = ["task", "camera", *(title for _, title, _, _ in _MEASURES), *(f"steps/s, {title}" for title in speeds)]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for row in rows:
+        cells = [row["task"], f"`{row['camera']}`", *(_cell(row, *measure) for measure in _MEASURES)]
+        cells += [speed.get(row["task"], "") for speed in speeds.values()]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(row: dict[str, Any], name: str, title: str, scale: float, digits: int) -> str:
+    """Format a measure; one that violates its bound is bold."""
+    value = row["measures"][name]
+    text = "" if value is None else f"{scale * value:.{digits}f}"
+    return f"**{text}**" if name in row["failures"] else text
+
+
+def _speeds(path: Path) -> dict[str, str]:
+    """Return the speed by task, without and with images."""
+    values: dict[str, dict[str, float]] = {}
+    for record in load(path):
+        if record["name"] in ("pixels/steps", "pixels/steps_with_images"):
+            values.setdefault(record["config"]["task"], {})[record["name"]] = record["value"]
+    complete = {task: pair for task, pair in values.items() if len(pair) == 2}
+    return {
+        task: f"{short(pair['pixels/steps'])} / {short(pair['pixels/steps_with_images'])}" for task, pair in complete.items()
+    }
