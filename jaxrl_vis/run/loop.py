@@ -393,7 +393,8 @@ class RunLoop:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
         if self._writes:
             self._check_ours()
-            rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded, self._checkpoints.run_id)
+            rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
+            rows = [{**row, metrics.RUN_ID: self._checkpoints.run_id} for row in rows]
             if self._done == self._pace.begun:  # an evaluation that was due: a kill or a disk may have left a part of its rows
                 rows = [row for row in rows if row["seed"] not in self._evaluated_there]
             with self._saver.writing():

@@ -28,7 +28,7 @@ from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.files import read_json
 from jaxrl_vis.run.storage import hush, sums
 from jaxrl_vis.run.storage.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
-from jaxrl_vis.run.storage.manifest import FILE, READABLE, SCHEMA, is_manifest, progress_in
+from jaxrl_vis.run.storage.manifest import FILE, SCHEMA, is_manifest
 from jaxrl_vis.run.storage.metrics import RUN_ID
 from jaxrl_vis.run.storage.recent import ANY_RUN, Recent, Unusable
 from jaxrl_vis.types import LoopState, TrainState
@@ -86,7 +86,7 @@ class Checkpoints:
         read_only: Never save: nothing is created or cleaned up.
 
     Attributes:
-        run_id: Id of the run, None for one of an earlier version: other runs' checkpoints are ignored, except by
+        run_id: Id of the run: other runs' checkpoints are ignored, except by
             `set_foreign_aside`. `ANY_RUN`: all checkpoints.
     """
 
@@ -95,7 +95,7 @@ class Checkpoints:
         folder: Path,
         say: Callable[[str], None] = streams.say,
         read_only: bool = False,
-        run_id: str | None = ANY_RUN,
+        run_id: str = ANY_RUN,
     ):
         self._folder = folder.absolute()  # orbax refuses relative names
         self._say = say
@@ -108,12 +108,12 @@ class Checkpoints:
         self._unsilence: Callable[[], None] | None = None
 
     @property
-    def run_id(self) -> str | None:
+    def run_id(self) -> str:
         """Id of the run, see the class."""
         return self.recent.run_id
 
     @run_id.setter
-    def run_id(self, run_id: str | None) -> None:
+    def run_id(self, run_id: str) -> None:
         self.recent.run_id = run_id
 
     def _manager(self, tier: str) -> "ocp.CheckpointManager":
@@ -183,8 +183,7 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         described = {name: describe(arrays) for name, arrays in items.items()}
-        run = {} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}
-        manifest = {"schema": SCHEMA, **run, "iteration": iteration, "items": described, "progress": progress}
+        manifest = {"schema": SCHEMA, RUN_ID: self.run_id, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         if distributed.are_several():
@@ -403,7 +402,7 @@ class Checkpoints:
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
         if not is_manifest(manifest):
             raise _Damaged("its manifest is incomplete")
-        if manifest["schema"] not in READABLE:
+        if manifest["schema"] != SCHEMA:
             where = self._folder / tier / str(iteration)
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         return manifest
@@ -428,7 +427,7 @@ class Checkpoints:
                     raise _Damaged(f"wrong checksum of {leaf_name}")
             trees[name] = rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
-        return Restored(tier, iteration, trees["train"], loop, progress_in(manifest))
+        return Restored(tier, iteration, trees["train"], loop, manifest["progress"])
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
         import orbax.checkpoint as ocp

@@ -26,7 +26,7 @@ Row = Mapping[str, Any]
 """A line of the file."""
 
 RUN_ID = "run_id"
-"""Key of the run's id in a row, a checkpoint's manifest or a config.json; missing in those of earlier versions."""
+"""Key of the run's id in a row, a checkpoint's manifest or a config.json."""
 
 
 class Place(NamedTuple):
@@ -82,13 +82,10 @@ def _nine_digits(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-def make_rows(
-    seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]], run_id: str | None = None
-) -> list[dict[str, Any]]:
-    """Make one row per seed: seed, ``counts``, its entry of ``values``, and the run's id. Non-finite numbers become None."""
-    run = {} if run_id is None else {RUN_ID: run_id}
+def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
+    """Make one row per seed: seed, ``counts`` and its entry of ``values``. Non-finite numbers become None."""
     return [
-        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}, **run}
+        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}}
         for i, seed in enumerate(seeds)
     ]
 
@@ -188,14 +185,14 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def cut_back(
-    path: Path, iteration: int, run_id: str | None, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
+    path: Path, iteration: int, run_id: str, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
 ) -> str | None:
     """Remove the rows after ``iteration``, which a resumed run writes again, and the rows of other runs.
 
     Args:
         path: The file.
         iteration: Last iteration to keep.
-        run_id: Id of the run; None for one of an earlier version.
+        run_id: Id of the run.
         aside: File to which damaged lines are moved; nothing is discarded.
         others: File to which other runs' rows are moved.
         keeps_later: Also move rows after ``iteration`` to ``aside``.

@@ -45,14 +45,14 @@ class Expected:
         seeds: Seeds of the run, in order.
         updates, env_steps: Gradient steps and environment steps in an iteration, per seed.
         eval_interval: Iterations between evaluations.
-        run_id: Id of the run; None if its config.json has none.
+        run_id: Id of the run.
     """
 
     seeds: Sequence[int]
     updates: int
     env_steps: int
     eval_interval: int
-    run_id: str | None
+    run_id: str
 
 
 def listed(values: Iterable[Any]) -> str:
