@@ -43,10 +43,6 @@ _TIMEOUT_S = 10**9
 DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
 
 
-class _Damaged(Exception):
-    """Damaged checkpoint. The message gives the reason in a few words."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Restored:
     """Contents of a checkpoint.
@@ -248,7 +244,7 @@ class Checkpoints:
             # After a failed background write, a manager reports the error again and again: use a new one. Its threads keep
             # failing for a while, so the process stays silent about them from here on.
             self._managers.pop(tier, None)
-            self._unsilence = hush.stay_silent
+            self._unsilence = lambda: None
             text = " ".join(str(error).split())
             shown = "no space left on the device" if "No space left" in text else f"{type(error).__name__}: {text[:160]}"
             raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
@@ -371,7 +367,7 @@ class Checkpoints:
     def _damage_as_request_error(self, tier: str, iteration: int) -> Iterator[None]:
         try:
             yield
-        except _Damaged as damage:
+        except Unusable as damage:
             raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
 
     def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
@@ -381,34 +377,26 @@ class Checkpoints:
         for iteration, tier in sorted(candidates, key=lambda item: (-item[0], tiers.index(item[1]))):
             try:
                 if tier == RECENT:
-                    return self._restore_recent(iteration, template)
-                return self._restore(tier, iteration, template, with_rest and tier == FULL)
-            except _Damaged as damage:
+                    loop, progress = self.recent.restore(iteration, template)
+                    return Restored(RECENT, iteration, loop.train, loop, progress)
+                manifest = self._manifest(tier, iteration)
+                return self._restored(tier, iteration, template, with_rest and tier == FULL, manifest)
+            except Unusable as damage:
                 if (tier, iteration) not in self._reported:
                     self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
                 self._reported.add((tier, iteration))
         return None
-
-    def _restore_recent(self, iteration: int, template: LoopState) -> Restored:
-        try:
-            loop, progress = self.recent.restore(iteration, template)
-        except Unusable as error:
-            raise _Damaged(str(error)) from None
-        return Restored(RECENT, iteration, loop.train, loop, progress)
 
     def _manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
         if not is_manifest(manifest):
-            raise _Damaged("its manifest is incomplete")
+            raise Unusable("its manifest is incomplete")
         if manifest["schema"] != SCHEMA:
             where = self._folder / tier / str(iteration)
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         return manifest
-
-    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
-        return self._restored(tier, iteration, template, with_rest, self._manifest(tier, iteration))
 
     def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
         import orbax.checkpoint as ocp
@@ -424,7 +412,7 @@ class Checkpoints:
         for name, tree in templates.items():
             for leaf_name, array in to_host(read[name], copy=False).items():
                 if not is_intact(array, manifest["items"][name][leaf_name]):
-                    raise _Damaged(f"wrong checksum of {leaf_name}")
+                    raise Unusable(f"wrong checksum of {leaf_name}")
             trees[name] = rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
         return Restored(tier, iteration, trees["train"], loop, manifest["progress"])
@@ -438,6 +426,6 @@ class Checkpoints:
                 return manager.restore(iteration, args=ocp.args.Composite(**arguments))
         # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
         except Exception as error:
-            self._unsilence = hush.stay_silent  # as after a failed write: threads of this read may report errors later
+            self._unsilence = lambda: None  # as after a failed write: threads of this read may report errors later
             text = " ".join(str(error).split())[:80]
-            raise _Damaged(f"{type(error).__name__}: {text}") from None
+            raise Unusable(f"{type(error).__name__}: {text}") from None

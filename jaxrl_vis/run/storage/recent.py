@@ -43,7 +43,7 @@ def is_cheap(replay: ReplayState) -> bool:
 
 
 class Unusable(Exception):
-    """Damaged state, or one with a damaged rollout. The message gives the reason in a few words."""
+    """Damaged checkpoint of any tier, or state with a damaged rollout. The message gives the reason in a few words."""
 
 
 class Recent:

@@ -199,9 +199,7 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     groups = saved.values() if isinstance(saved, Mapping) else ()
     unset = sorted(set(OPTIONS).difference(*(group for group in groups if isinstance(group, Mapping))))
     if unset:
-        findings.notes.append(
-            f"config.json does not have {listed(unset)}: taken to be the default, or saved under an older name"
-        )
+        findings.notes.append(f"config.json does not have {listed(unset)}: taken to be the default")
 
 
 def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findings: Findings) -> None:

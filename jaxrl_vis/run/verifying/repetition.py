@@ -224,9 +224,7 @@ def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
         counts = [len(row) for values in progress.since_evaluation for row in values.values()]
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
-    is_mark = progress.replay_lost_at is None or isinstance(progress.replay_lost_at, int)
-    is_history = all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}
-    return is_mark and is_history and isinstance(progress.evaluation_due, bool)
+    return all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}
 
 
 def _compared(row: Mapping[str, Any]) -> Row:
