@@ -54,7 +54,7 @@ def _soak(options: argparse.Namespace, folder: Path) -> int:
 def _goodput(options: argparse.Namespace, folder: Path) -> int:
     what = [options.env, "--preset", options.preset, "--seed", str(options.seed)]
     killed = killed_every(folder / "killed", options.sigkill_every, options.minutes, what)
-    reference = None if options.no_reference else undisturbed(folder / "undisturbed", killed.env_steps, what)
+    reference = None if options.no_reference else undisturbed(folder / "undisturbed", killed["env_steps"], what)
     figures = report(killed, options.sigkill_every, reference)
     if options.json is not None:
         options.json.write_text(json.dumps(Record(seed=options.seed).machine | figures, indent=1) + "\n")
