@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.files import sync_folder, write_atomically
+from jaxrl_vis.host.files import is_count, sync_folder, write_atomically
 from jaxrl_vis_envs.documents import parse_json
 
 PerSeed = dict[str, list[float]]
@@ -158,15 +158,11 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
         row = parse_json(line.decode("utf-8"))
     except ValueError:
         return None
-    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in Place._fields):
+    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in Place._fields):
         return None
     if not isinstance(row.get(RUN_ID), str | None):
         return None
     return row if all(name == RUN_ID or _is_figure(value) for name, value in row.items()) else None
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _LARGEST
 
 
 def _is_figure(value: Any) -> bool:
