@@ -17,8 +17,6 @@ import json
 import secrets
 import shlex
 import shutil
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import check_path, is_temporary, read_json, write_atomically
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
+from jaxrl_vis.run.storage.lock import FolderGoneError, Held
 from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 
 SCHEMA = 2
@@ -114,10 +112,6 @@ class RunFolder:
     def video(self) -> Path:
         """Episodes of the trained policy."""
         return self.path / "video.gif"
-
-    def lock(self, say: Callable[[str], None] = print) -> AbstractContextManager[Held]:
-        """Return the context that locks the folder, see `run_lock`."""
-        return run_lock(self.path, say)
 
     def rows(self) -> list[dict[str, Any]]:
         """Read this run's rows of metrics.jsonl, in order of iteration, without damaged ones.
