@@ -189,11 +189,8 @@ def tiny(line: str) -> str:
     """A command of docs/start.md at tiny settings, and without the preset that would make it large."""
     words = shlex.split(line)
     if words[1] == "train" and "--resume" not in words:
-        if "--preset" in words:
-            at = words.index("--preset")
-            del words[at : at + 2]
-        if "--env-steps" in words:
-            at = words.index("--env-steps")
+        for option in {"--preset", "--env-steps"}.intersection(words):
+            at = words.index(option)
             del words[at : at + 2]
         words += shlex.split(TINY)
     if words[1] == "bench":

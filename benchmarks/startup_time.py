@@ -1,10 +1,9 @@
-"""Startup time of a run: imports, environment, then tracing, lowering and compiling of every program.
+"""Startup time of a run: imports, environment, then all programs, and the first iteration.
 
     python benchmarks/startup_time.py [ENV] [--preset P] [--seeds S] [--json FILE]
 
-Three processes are started, one after the other, with a compilation cache of their own:
+Two processes are started, one after the other, with a compilation cache of their own:
 
-    parts    every program traced, lowered and compiled by itself, with nothing beside it; an iteration's parts, too
     cold     as a run starts: `Programs.compile`, then the first iteration
     warm     the same once more, with everything in the cache
 
@@ -73,32 +72,6 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
     return Programs(config, make_train_step(env, config), keep=True)
 
 
-def parts(clock: Clock, options: argparse.Namespace) -> None:
-    """Every program by itself."""
-    from jaxrl_vis.learner.acting.rollout_parts import played_spec
-
-    programs = imported(clock, options)
-    program, shapes, keys = programs.program, programs.shapes, programs.run_keys
-    clock.lap("shapes")
-    for name in programs.names:
-        lowered = programs.lower(name)
-        clock.lap(f"{name}: trace and lower")
-        lowered.compile()
-        clock.lap(f"{name}: compile")
-    episodes, _ = played_spec(program.env, programs.config.run.num_envs, len(programs.seeds))
-    arguments = {  # JAX keeps what it traced, so what is part of something above takes less than it would alone
-        "insert": (shapes.train, shapes.replay, episodes, keys, shapes.iteration),
-        "update_many": (shapes.train, shapes.replay, keys, shapes.iteration),
-    }
-    for name, inputs in arguments.items():
-        traced = getattr(program, name).trace(*inputs)
-        clock.lap(f"{name}: trace")
-        lowered = traced.lower()
-        clock.lap(f"{name}: lower")
-        lowered.compile()
-        clock.lap(f"{name}: compile")
-
-
 def start(clock: Clock, options: argparse.Namespace) -> None:
     """Start as a run does."""
     import jax
@@ -111,7 +84,7 @@ def start(clock: Clock, options: argparse.Namespace) -> None:
     clock.lap("first iteration")
 
 
-MODES = {"parts": parts, "cold": start, "warm": start}
+MODES = ("cold", "warm")
 
 
 def measured(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
@@ -147,13 +120,13 @@ def main() -> None:
     options = parser.parse_args()
     if options.mode:
         clock = Clock()
-        MODES[options.mode](clock, options)
+        start(clock, options)
         print(json.dumps(clock.laps))
         return
     laps = {}
-    with tempfile.TemporaryDirectory() as own, tempfile.TemporaryDirectory() as shared:
+    with tempfile.TemporaryDirectory() as cache:
         for mode in MODES:
-            laps[mode] = measured(mode, own if mode == "parts" else shared, options)
+            laps[mode] = measured(mode, cache, options)
             show(mode, laps[mode])
     if options.json:
         options.json.write_text(json.dumps(laps, indent=1) + "\n", encoding="utf-8")

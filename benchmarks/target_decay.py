@@ -1,23 +1,17 @@
-"""Tables of docs/lab/target_decay.md, written from the stored runs.
+"""Tables of docs/lab/target_decay.md, written from the stored runs by `make tables`."""
 
-python benchmarks/target_decay.py            write them (`make tables` does, too)
-python benchmarks/target_decay.py --check    exit 1 if the page differs from the records
-"""
-
-import argparse
 import collections
 import dataclasses
 import itertools
 import re
-import sys
 import textwrap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.ledger.markers import WIDTH, fill
-from benchmarks.ledger.records import CHECKOUT, RESULTS
+from benchmarks.ledger.markers import WIDTH
+from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.report.plots import show_steps
@@ -26,7 +20,6 @@ from jaxrl_vis.run.storage.metrics import read_rows
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
 
-PAGE = CHECKOUT / "docs/lab/target_decay.md"
 SUCCESS = "eval/success"
 RELEASED_DECAY = 0.98
 VARIANTS = {"none": "without", "ol_aux_5": "OL-AUX-5"}
@@ -145,20 +138,3 @@ def tables(results: Path = RESULTS) -> str:
     revisions = sorted({text for group in groups.values() for text in group.revisions})
     runs = textwrap.fill(f"Runs: {', '.join(revisions)}.", WIDTH)
     return "\n".join([*parts, *comparison_table(groups), "", runs]) + "\n"
-
-
-def main() -> int:
-    """Run the command line; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="compare, and write nothing")
-    options = parser.parse_args()
-    text = PAGE.read_text(encoding="utf-8")
-    page = fill(text, "tables", tables())
-    if options.check:
-        return int(page != text)
-    PAGE.write_text(page, encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,10 @@
 """Kernels of a training iteration on a GPU: of a gradient step, a control step and an insertion.
 
     python -m benchmarks.profiling.kernels [TASK] [--preset P] [--parts update rollout insert] [--set FIELD VALUE ...]
-        [--rows 20] [--in-order] [--options xla_gpu_autotune_level=0 ...]
+        [--rows 20] [--in-order]
 
 Every part is a separate program with a replay full of noise, as in `jaxrl-vis bench update`. Printed are its time, the time of
-its kernels together, which is longer if they overlap, and the kernels that take most of it. ``--hlo FOLDER`` writes the
-compiled program, which explains their names. With ``--options``, of which there may be several sets, the same is
-measured with these compiler options, too.
+its kernels together, which is longer if they overlap, and the kernels that take most of it.
 """
 
 import argparse
@@ -80,10 +78,9 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
     sys.stdout.flush()
 
 
-def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, Any]) -> None:
-    """Compile the parts with compiler options and report each."""
+def measure(program: TrainStep, asked: argparse.Namespace) -> None:
+    """Compile the parts and report each."""
     parts: list[str] = asked.parts
-    hlo: Path | None = asked.hlo
     loop, keys = start(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)
     playing = train, keys, jnp.int32(0), program.exploration
@@ -98,10 +95,7 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
     for part in dict.fromkeys([*(["rollout"] if "insert" in parts else []), *parts]):
         function, inputs, _, _ = arguments[part]
         with rarely_collecting_garbage():
-            compiled[part] = function.lower(*inputs).compile(options)
-        if hlo is not None:
-            hlo.mkdir(parents=True, exist_ok=True)
-            (hlo / f"{part}.txt").write_text(compiled[part].as_text(), encoding="utf-8")
+            compiled[part] = function.lower(*inputs).compile()
 
     def call(part: str) -> None:
         # What is donated comes back, so that the next call has it.
@@ -120,18 +114,6 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
         report(
             f"{what} of {program.config.run.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order
         )
-
-
-def parse_compiler_options(words: list[str]) -> dict[str, Any]:
-    """Compiler options, NAME=VALUE each.
-
-    Raises:
-        RequestError: A word is none.
-    """
-    pairs = [word.partition("=") for word in words]
-    if wrong := [name for name, equals, _ in pairs if not equals]:
-        raise RequestError(f"--options takes NAME=VALUE, not {wrong[0]!r}")
-    return {name: {"true": True, "false": False}.get(value.lower(), value) for name, _, value in pairs}
 
 
 def parse_config(options: argparse.Namespace) -> Config:
@@ -161,10 +143,6 @@ def main() -> int:
     )
     parser.add_argument("--rows", type=int, default=20, help="kernels to list of each part")
     parser.add_argument("--in-order", action="store_true", help="list the kernels of one turn, too, in their order")
-    parser.add_argument("--hlo", type=Path, help="a folder for the compiled programs")
-    parser.add_argument(
-        "--options", nargs="+", action="append", default=[], metavar="NAME=VALUE", help="compiler options to try"
-    )
     options = parser.parse_args()
     try:
         check_devices()
@@ -172,11 +150,7 @@ def main() -> int:
             raise RequestError("kernels are seen on an NVIDIA GPU only, and JAX computes on something else here")
         config = parse_config(options)
         enable_compilation_cache()
-        sets = {" ".join(words) or "as it is": parse_compiler_options(words) for words in ([], *options.options)}
-        program = make_train_step(make_env(config), config)
-        for name, compiler_options in sets.items():
-            print(f"-- {name}")
-            measure(program, options, compiler_options)
+        measure(make_train_step(make_env(config), config), options)
     except RequestError as error:
         print(error, file=sys.stderr)
         return 2

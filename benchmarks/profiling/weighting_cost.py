@@ -1,7 +1,6 @@
 """Cost of learning the weights of auxiliary losses, for several numbers of losses.
 
     python -m benchmarks.profiling.weighting_cost [--losses 5 10] [--ways latents] [--image-size 64] [--batch-size 512]
-        [--json FILE]
 
 An encoder of the preset `paper` reads RGB-D images before and after an action. The main loss is a value of three hidden layers;
 every auxiliary loss is a linear head on both latents with its own targets. For every number of auxiliary losses and every
@@ -12,9 +11,7 @@ weighting itself.
 import argparse
 import dataclasses
 import functools
-import json
 import sys
-from pathlib import Path
 from typing import Any, get_args
 
 import jax
@@ -114,20 +111,20 @@ class Problem:
         return jaxrl_vis_envs.jit(steps)
 
 
-def time_step(problem: Problem, weighting: Weighting, way: str) -> tuple[float, float]:
-    """Seconds of a gradient step, and of the compilation.
+def time_step(problem: Problem, weighting: Weighting, way: str) -> float:
+    """Seconds of a gradient step.
 
     Raises:
         AssertionError: Nothing was learned, or learned weights did not move.
     """
     params, batches = problem.params(jax.random.key(0)), problem.batches(jax.random.key(1), 4)
     state = weighting.init((MAIN, *problem.names), params["critic"]["encoder"])
-    steps, compile_s = compile_timed(problem.make_steps(weighting, way), params, state, batches)
+    steps, _ = compile_timed(problem.make_steps(weighting, way), params, state, batches)
     after, _, weights = steps(params, state, batches)
     moved = [float(jnp.max(jnp.abs(one - other))) for one, other in zip(*map(jax.tree.leaves, (params, after)), strict=True)]
     assert all(0 < change < float("inf") for change in moved), "no gradient step was taken"
     assert weighting.needs == "losses" or float(weights[problem.names[0]].std()) > 0, "weights stay as they are"
-    return measure_time(lambda: steps(params, state, batches), repeats=5).median_s / STEPS, compile_s
+    return measure_time(lambda: steps(params, state, batches), repeats=5).median_s / STEPS
 
 
 def main() -> int:
@@ -139,29 +136,21 @@ def main() -> int:
     )
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--batch-size", type=int, default=512)
-    parser.add_argument("--json", type=Path, help="a file for the figures")
     options = parser.parse_args()
     check_devices()
     spec = jax.ShapeDtypeStruct((4, options.image_size, options.image_size), jnp.uint8)
     networks = Networks(preset("paper", image_size=options.image_size), spec, 4, 0.0)
-    rows = []
     print(f"{'way':12}{'losses':>8}{'fixed, us':>12}{'OL-AUX-5, us':>14}{'added, us':>12}   on {jax.devices()[0].device_kind}")
     for method in options.ways:
         for count in options.losses:
             problem = Problem(networks, options.batch_size, tuple(f"loss_{number}" for number in range(count)))
             weightings = {"fixed": make_weighting("balance"), "learned": make_weighting("ol_aux", interval=5)}
-            timed = {name: time_step(problem, weighting, method) for name, weighting in weightings.items()}
-            seconds = {name: step for name, (step, _) in timed.items()}
+            seconds = {name: time_step(problem, weighting, method) for name, weighting in weightings.items()}
             added = seconds["learned"] - seconds["fixed"]
-            compiling = {f"compile_{name}": round(compile_s, 1) for name, (_, compile_s) in timed.items()}
-            rows.append({"way": method, "losses": count, **seconds, "added": added, **compiling})
             print(
                 f"{method:12}{count:8}{1e6 * seconds['fixed']:12.0f}{1e6 * seconds['learned']:14.0f}{1e6 * added:12.0f}",
                 flush=True,
             )
-    if options.json is not None:
-        record = {"device": jax.devices()[0].device_kind, "batch_size": options.batch_size, "image_size": options.image_size}
-        options.json.write_text(json.dumps({**record, "seconds": rows}, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -1,7 +1,6 @@
 """Random faults over small real runs, each then resumed; and one long run that is killed once a minute.
 
     python -m benchmarks.soak [--minutes 9] [--workers 2] [--seed 0] [--faults 10000] [--json FILE]
-    python -m benchmarks.soak --sum FILE ... [--table docs/reliability.md]
     python -m benchmarks.soak --sigkill-every 60 [--preset cpu] [--minutes 60] [--env VisualFetchReach] [--json FILE]
 
 **Faults.** Each run is `jaxrl-vis train Reacher` with small settings, a process of its own that is struck by a fault and
@@ -16,7 +15,7 @@ in between. Full and frozen disks need root, to mount small ones; without, the l
 What does not hold is printed, kept in the record, and makes the exit status 1; its folder stays.
 
 No fault begins in the last 45 s of --minutes, so that runs come to their end. Pieces with different seeds on one commit, each
-with its --json, are added by --sum.
+with its --json in benchmarks/results/soak, are added by `make tables`.
 
 **Goodput.** Task and preset are trained with their default intervals, killed every so many seconds, and in the end evaluated;
 then as many steps are trained undisturbed. With --folder, a second call goes on with the same run, so that an hour can be had
@@ -30,9 +29,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.ledger.markers import fill
 from benchmarks.soak.goodput import killed_every, report, undisturbed
-from benchmarks.soak.record import Record, added
+from benchmarks.soak.record import Record
 from benchmarks.soak.soak import Soak
 
 _TO_THE_END = 45.0  # seconds
@@ -56,7 +54,7 @@ def _soak(options: argparse.Namespace, folder: Path) -> int:
 def _goodput(options: argparse.Namespace, folder: Path) -> int:
     what = [options.env, "--preset", options.preset, "--seed", str(options.seed)]
     killed = killed_every(folder / "killed", options.sigkill_every, options.minutes, what)
-    reference = None if options.no_reference else undisturbed(folder / "undisturbed", killed.env_steps, what)
+    reference = None if options.no_reference else undisturbed(folder / "undisturbed", killed["env_steps"], what)
     figures = report(killed, options.sigkill_every, reference)
     if options.json is not None:
         options.json.write_text(json.dumps(Record(seed=options.seed).machine | figures, indent=1) + "\n")
@@ -72,19 +70,11 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--folder", type=Path, help="where runs lie; a temporary folder if not given")
     parser.add_argument("--json", type=Path, help="write a record here")
-    parser.add_argument("--sum", type=Path, nargs="+", help="add these records, and print their table")
-    parser.add_argument("--table", type=Path, help="with --sum: write the table here, between the markers")
     parser.add_argument("--sigkill-every", type=float, metavar="SECONDS", help="measure the goodput of a long run instead")
     parser.add_argument("--env", default="VisualFetchReach", help="with --sigkill-every")
     parser.add_argument("--preset", default="cpu", help="with --sigkill-every")
     parser.add_argument("--no-reference", action="store_true", help="with --sigkill-every: without an undisturbed run")
     options = parser.parse_args()
-    if options.sum:
-        record = added([Record.read(path) for path in options.sum])
-        print(record.table())
-        if options.table is not None:
-            options.table.write_text(fill(options.table.read_text(), "soak", record.table()))
-        return 1 if record.broken else 0
     folder = (options.folder or Path(tempfile.mkdtemp(prefix="soak-"))).resolve()
     folder.mkdir(parents=True, exist_ok=True)
     return _soak(options, folder) if options.sigkill_every is None else _goodput(options, folder)

@@ -255,39 +255,31 @@ def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
     return status or None
 
 
-def _moved(folder: Path, dice: random.Random) -> int | None:
-    there = folder.with_name(f"{folder.name}-moved")
-    with killed_afterwards(_started(folder, dice)) as part:
-        rows = read_rows(folder)
-        if not part.runs():
-            return part.end() or None
-        folder.rename(there)
-        status = part.end()
-        part.check_words()
-    if (folder / "checkpoints").exists():
-        raise Broken(f"half a run was left at the old place: {sorted(folder.rglob('*'))[:5]}; {part.lines[-2:]}")
-    if folder.exists():
-        shutil.rmtree(folder)
-    there.rename(folder)
-    if read_rows(folder)[: len(rows)] != rows:
-        raise Broken("rows were lost in a folder that was moved")
-    return status or None
+def _taken_away(is_kept: bool) -> Strike:
+    """Move the folder, and back when the process has ended; or delete it."""
 
+    def strike(folder: Path, dice: random.Random) -> int | None:
+        there = folder.with_name(f"{folder.name}-{'moved' if is_kept else 'trash'}")
+        with killed_afterwards(_started(folder, dice)) as part:
+            rows = read_rows(folder)
+            if not part.runs():
+                return part.end() or None
+            folder.rename(there)
+            if not is_kept:
+                shutil.rmtree(there)
+            status = part.end()
+            part.check_words()
+        if (folder / "checkpoints").exists():
+            raise Broken(f"half a run was left in its place: {sorted(folder.rglob('*'))[:5]}; {part.lines[-2:]}")
+        if folder.exists():
+            shutil.rmtree(folder)
+        if is_kept:
+            there.rename(folder)
+            if read_rows(folder)[: len(rows)] != rows:
+                raise Broken("rows were lost in a folder that was moved")
+        return status or None
 
-def _vanished(folder: Path, dice: random.Random) -> int | None:
-    trash = folder.with_name(f"{folder.name}-trash")
-    with killed_afterwards(_started(folder, dice)) as part:
-        if not part.runs():
-            return part.end() or None
-        folder.rename(trash)
-        shutil.rmtree(trash)
-        status = part.end()
-        part.check_words()
-    if (folder / "checkpoints").exists():
-        raise Broken(f"half a run was left in its place: {sorted(folder.rglob('*'))[:5]}; {part.lines[-2:]}")
-    if folder.exists():
-        shutil.rmtree(folder)
-    return status or None
+    return strike
 
 
 def _lock_of_the_dead(folder: Path, dice: random.Random) -> int | None:
@@ -335,9 +327,11 @@ FAULTS: dict[str, Fault] = {
         _bit_in_metrics, "all other rows stay; a row that is none any more is put aside, and said", (143,), spoils=True
     ),
     "folder moved": Fault(
-        _moved, "status 1 and one line; nothing is left behind, and the folder goes on at its new place", (1,)
+        _taken_away(is_kept=True),
+        "status 1 and one line; nothing is left behind, and the folder goes on at its new place",
+        (1,),
     ),
-    "folder gone": Fault(_vanished, "status 1 and one line; no half of a run takes its place", (1,)),
+    "folder gone": Fault(_taken_away(is_kept=False), "status 1 and one line; no half of a run takes its place", (1,)),
     "lock of a dead process elsewhere": Fault(_lock_of_the_dead, "is taken over", (143,)),
     "clock jumps by up to a month": Fault(_jumping_clock, f"no duration follows it; {EXACT}", (143,)),
 }

@@ -1,6 +1,5 @@
 """A long run that is killed once a minute, and one that is left alone for the same number of steps."""
 
-import dataclasses
 import json
 import shutil
 import signal
@@ -15,33 +14,12 @@ from jaxrl_vis.run.goodput import account, read_processes
 _FOREVER = 10**9  # environment steps
 
 
-@dataclasses.dataclass(frozen=True)
-class Killed:
-    """Outcome of a run that was killed again and again.
-
-    Attributes:
-        env_steps: Those of its networks, per seed.
-        kills: How often it was killed.
-        minutes: How long it went on.
-        goodput: Gradient steps in its networks over gradient steps computed.
-        replays_lost: How often it was resumed without its replay.
-        success: At the end, one number per seed.
-    """
-
-    env_steps: int
-    kills: int
-    minutes: float
-    goodput: float
-    replays_lost: int
-    success: list[float]
-
-
 def _success(folder: Path) -> list[float]:
     rows = read_rows(folder)
     return [row["eval/success"] for row in rows if row["iteration"] == rows[-1]["iteration"]]
 
 
-def killed_every(folder: Path, every: float, minutes: float, options: Sequence[str]) -> Killed:
+def killed_every(folder: Path, every: float, minutes: float, options: Sequence[str]) -> dict[str, Any]:
     """Train for so many minutes, killed every so many seconds; then what is there is evaluated.
 
     Where the folder holds such a run already, it goes on: so an hour can be had in pieces, whose kills and minutes are added.
@@ -51,6 +29,10 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
         every: Seconds of a process.
         minutes: In all.
         options: Of ``train``: task and preset.
+
+    Returns:
+        ``env_steps`` of its networks, per seed; ``kills``; ``minutes``; ``goodput``, gradient steps in its networks over
+        gradient steps computed; ``replays_lost``, resumptions without the replay; and ``success`` at the end, one per seed.
     """
     notes = folder.with_name(f"{folder.name}.kills.json")
     earlier: dict[str, float] = json.loads(notes.read_text()) if notes.exists() else {"kills": 0, "minutes": 0.0}
@@ -84,7 +66,10 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
     total = account(read_processes(folder / "processes.jsonl"), last["iteration"])
     if total.goodput is None:
         raise Broken("processes.jsonl is damaged")
-    return Killed(last["env_steps"], kills, round(wall, 2), total.goodput, total.replays_lost, _success(copy))
+    return {
+        **{"env_steps": last["env_steps"], "kills": kills, "minutes": round(wall, 2), "goodput": total.goodput},
+        **{"replays_lost": total.replays_lost, "success": _success(copy)},
+    }
 
 
 def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[float]:
@@ -95,12 +80,13 @@ def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[fl
     return _success(folder)
 
 
-def report(killed: Killed, every: float, reference: Sequence[float] | None) -> dict[str, Any]:
+def report(killed: dict[str, Any], every: float, reference: Sequence[float] | None) -> dict[str, Any]:
     """Print what was found, and return it for a file."""
+    beside = "" if reference is None else f", undisturbed {' '.join(f'{value:.3f}' for value in reference)}"
     print(
-        f"goodput {killed.goodput:.4f} over {killed.env_steps:,} environment steps and {killed.minutes:g} minutes, killed "
-        f"{killed.kills} times, every {every:g} s; replay lost {killed.replays_lost} times; success at the end "
-        f"{' '.join(f'{value:.3f}' for value in killed.success)}"
-        + ("" if reference is None else f", undisturbed {' '.join(f'{value:.3f}' for value in reference)}")
+        "goodput {goodput:.4f} over {env_steps:,} environment steps and {minutes:g} minutes, killed {kills} times, every "
+        "{every:g} s; replay lost {replays_lost} times; success at the end ".format(**killed, every=every)
+        + " ".join(f"{value:.3f}" for value in killed["success"])
+        + beside
     )
-    return dataclasses.asdict(killed) | {"every": every, "undisturbed": None if reference is None else list(reference)}
+    return killed | {"every": every, "undisturbed": None if reference is None else list(reference)}

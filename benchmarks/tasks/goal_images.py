@@ -1,6 +1,6 @@
 """Content of goal images: visibility of the relevant parts, and different goals with the same image.
 
-    python -m benchmarks.tasks.goal_images [ENV ...] [--goals 1000] [--image-size 100] [--save FOLDER]
+    python -m benchmarks.tasks.goal_images [ENV ...] [--goals 1000] [--image-size 100]
 
 For each visual task, over its goals, as the agent sees them (RGB-D bytes):
 
@@ -13,17 +13,13 @@ Exit status: 1 where two different goals look the same, or where a goal shows no
 
 import argparse
 import os
-import pathlib
 import sys
 from typing import Any, NamedTuple
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "envs")]
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
-from PIL import Image  # noqa: E402
 
 import jaxrl_vis_envs  # noqa: E402
 from jaxrl_vis_envs.render import Scene, render_planes  # noqa: E402
@@ -93,7 +89,7 @@ def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, i
     return identical, len(differences), int(differences[least]), (int(first[least]), int(second[least]))
 
 
-def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> bool:
+def report(name: str, count: int, size: int) -> bool:
     """Print a task's figures; whether all is well."""
     env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
     goals = draw_goals(env, count)
@@ -103,20 +99,13 @@ def report(name: str, count: int, size: int, folder: pathlib.Path | None) -> boo
     span = f"{env.threshold:g} to {_NEAR * env.threshold:g} {env.distance_unit}"
     nearest = f"{least} bytes differ (goals {pair[0]} and {pair[1]})" if near else "none"
     print(f"  nearest images of {near} pairs {span} apart: {nearest}")
-    good, worst = identical == 0, {}
+    good = identical == 0
     for part, geoms in PARTS.get(name, {}).items():
         pixels = visible_pixels(env, goals.labels, geoms)
         hidden = int(np.sum(pixels == 0))
         good &= hidden == 0
-        worst[part] = int(np.argmin(pixels))
         figures = f"at least {pixels.min():4d} pixels, median {int(np.median(pixels)):4d}"
         print(f"  {part:<12} {figures}, hidden in {hidden} goals")
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        for title, index in [*worst.items(), ("pair_1", pair[0]), ("pair_2", pair[1])]:
-            image = np.moveaxis(goals.images[index, :3], 0, -1)
-            scaled = Image.fromarray(image).resize((4 * size, 4 * size), Image.Resampling.NEAREST)
-            scaled.save(folder / f"{name}_{title.replace(' ', '_')}.png")
     sys.stdout.flush()
     return good
 
@@ -127,9 +116,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("env", nargs="*", default=sorted(PARTS), help=f"any of {', '.join(sorted(PARTS))}; default: all")
     parser.add_argument("--goals", type=int, default=1000)
     parser.add_argument("--image-size", type=int, default=100)
-    parser.add_argument("--save", type=pathlib.Path, help="write the worst goal of each part, and the nearest pair, here")
     options = parser.parse_args(arguments)
-    passed = [report(name, options.goals, options.image_size, options.save) for name in options.env]
+    passed = [report(name, options.goals, options.image_size) for name in options.env]
     return 0 if all(passed) else 1
 
 

@@ -8,12 +8,9 @@ Difficulty: mean distance of start and goal, in thresholds.
 
 import argparse
 import os
-import pathlib
 import sys
 from typing import Any
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "envs")]
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax  # noqa: E402

@@ -113,6 +113,11 @@ def read_json(path: Path, kind: type = dict, mend: str = "") -> Any:
     return value
 
 
+def is_count(value: Any) -> bool:
+    """Return True if a JSON value is an integer from 0 to 2^63 - 1."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+
+
 def check_path(path: Path) -> None:
     """Check that ``path`` can be looked up, whether it exists or not.
 

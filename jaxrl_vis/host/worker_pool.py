@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import Any, Protocol, TypeVar
 
 from jaxrl_vis.errors import RequestError, WorkerError
-from jaxrl_vis.host.files import read_json, write_atomically
+from jaxrl_vis.host.files import is_count, read_json, write_atomically
 from jaxrl_vis.run.signals import heed_parent_only, shielded_children
 from jaxrl_vis_envs.cores import num_cores
 
@@ -291,7 +291,7 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     contents = read_json(path, mend=f"it holds no records to resume; {mend}")
     records = contents.get("each")
     if not isinstance(records, list) or not all(
-        isinstance(record, dict) and _is_count(record.get("number")) for record in records
+        isinstance(record, dict) and is_count(record.get("number")) for record in records
     ):
         raise RequestError(f"{path} holds no records to resume: {mend}")
     other = [name for name, value in about.items() if contents.get(name) != value]
@@ -305,10 +305,6 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
         raise RequestError(f"{path} holds number {twice[0]} twice: {mend}")
     return records
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
 
 
 def _short(value: Any) -> str:

@@ -40,7 +40,7 @@ from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
 from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
-from jaxrl_vis.run.storage.lock import FolderGoneError, Held
+from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
 from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.trained.results import Results, describe
@@ -127,7 +127,7 @@ class RunLoop:
         distributed.meet("checked")  # before the first of them writes anything that the others would find
         if goes_on:
             self._checkpoints.run_id = read_run_id(self._folder.path)
-        with self._folder.lock(self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
+        with run_lock(self._folder.path, self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
             if goes_on and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._say):
                 if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
                     self._say(said)
@@ -393,7 +393,8 @@ class RunLoop:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
         if self._writes:
             self._check_ours()
-            rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded, self._checkpoints.run_id)
+            rows = metrics.make_rows(self._programs.seeds, counts, values | means | rounded)
+            rows = [{**row, metrics.RUN_ID: self._checkpoints.run_id} for row in rows]
             if self._done == self._pace.begun:  # an evaluation that was due: a kill or a disk may have left a part of its rows
                 rows = [row for row in rows if row["seed"] not in self._evaluated_there]
             with self._saver.writing():

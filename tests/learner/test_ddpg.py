@@ -171,7 +171,7 @@ def test_replay_is_written_in_place():
     """The compiled iteration holds no second copy of the replay: it is aliased, and temporaries stay far below it."""
     config = preset("debug", replay_transitions=200_000, seeds=2)
     programs = Programs(config, make_train_step(probes.PointImage(), config))
-    memory = programs.lower("learn").compile().memory_analysis()
+    memory = programs.compiled("learn").memory_analysis()
     replay = 2 * programs.program.replay_bytes
     assert replay > 10e6
     assert memory.alias_size_in_bytes >= replay

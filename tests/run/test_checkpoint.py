@@ -205,10 +205,11 @@ def test_nothing_saved_yet(states, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-def test_a_manifest_of_the_first_schema_is_read(states, saved):
+def test_a_manifest_of_another_schema_is_refused(states, saved):
     (file,) = [path for path in (saved / FULL / "3" / "manifest").iterdir() if "progress" in path.read_text(errors="replace")]
-    file.write_text(file.read_text().replace('"schema": 2', '"schema": 1').replace('"progress"', '"memo"'))
-    assert Checkpoints(saved).restore_for_resume(states[1]).progress == {"wall_s": 4.5}
+    file.write_text(file.read_text().replace('"schema": 2', '"schema": 1'))
+    with pytest.raises(RequestError, match="is of schema 1, not 2: use the version that wrote it"):
+        Checkpoints(saved).restore_for_resume(states[1])
 
 
 def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environment):

@@ -16,7 +16,7 @@ from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.saving import Saver
 from jaxrl_vis.run.storage import folder as folders
 from jaxrl_vis.run.storage import metrics
-from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, Checkpoints
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT
 from jaxrl_vis.run.storage.folder import RunFolder, read_run_id
 from jaxrl_vis.run.storage.lock import FolderGoneError
 from jaxrl_vis.run.storage.sums import write_sums
@@ -91,27 +91,13 @@ def test_what_uses_a_run_does_not_count_another_ones(straight, tmp_path, monkeyp
         restored_run.load(opened, path, 8)
 
 
-def without_ids(path: Path) -> Path:
-    """Makes a run what an earlier version has written."""
-    for file in (path / "config.json", *path.glob("checkpoints/*/*/manifest/metadata")):
-        record = json.loads(file.read_text())
-        del record["run_id"]
-        file.write_text(json.dumps(record))
-    rows = metrics.read_rows(path / "metrics.jsonl")
-    text = "".join(json.dumps({name: value for name, value in row.items() if name != "run_id"}) + "\n" for row in rows)
-    (path / "metrics.jsonl").write_text(text)
-    return path
-
-
-def test_a_run_of_an_earlier_version_goes_on_as_it_was(straight, tmp_path):
-    path = tmp_path / "run"
-    list(make_fake_trainer(small_config(env_steps=40), path).run())
-    without_ids(path)
-    list(make_fake_trainer(small_config(), path, resume=True).run())
-    assert rows_without_time(path) == rows_without_time(straight[0])
-    assert read_run_id(path) is None and not any("run_id" in row for row in metrics.read_rows(path / "metrics.jsonl"))
-    checkpoints = Checkpoints(path / "checkpoints", run_id="0" * 32)
-    assert checkpoints.newest() is None  # nor is it anybody else's
+def test_a_run_that_lost_its_id_is_refused_in_one_line(straight, tmp_path):
+    path = Path(shutil.copytree(straight[0], tmp_path / "run"))
+    record = json.loads((path / "config.json").read_text())
+    del record["run_id"]
+    (path / "config.json").write_text(json.dumps(record))
+    with pytest.raises(RequestError, match="^run_id in .*config.json must be a word, not None: put back what it held$"):
+        list(make_fake_trainer(small_config(env_steps=100), path, resume=True).run())
 
 
 def test_overwriting_empties_what_a_link_leads_to_and_keeps_the_link(tmp_path):

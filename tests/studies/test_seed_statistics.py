@@ -1,9 +1,5 @@
 """Statistics over seeds against values that can be counted by hand, and against their own promises."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -29,8 +25,3 @@ def test_intervals_cover_the_mean_about_as_often_as_they_say():
     trials = [bootstrap_interval([random.normal(size=10), random.normal(size=10)], seed=trial) for trial in range(80)]
     assert 0.85 <= np.mean([low <= 0.0 <= high for low, high in trials]) <= 1.0
     assert bootstrap_interval([np.ones(5)]) == (1.0, 1.0)
-
-
-def test_tables_of_the_target_decay_study_say_what_the_records_say():
-    check = [sys.executable, "benchmarks/target_decay.py", "--check"]
-    assert subprocess.run(check, cwd=Path(__file__).resolve().parents[2]).returncode == 0

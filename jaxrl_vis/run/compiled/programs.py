@@ -192,12 +192,6 @@ class Programs:
                 self._stacks[frozenset(shapes)] = stacked.lower(shapes).compile()
         self._compiled |= compiled
 
-    def lower(self, name: str) -> Any:
-        """Trace and lower a program, as `compile` does without a cache."""
-        function, arguments = self._call(name)
-        with tracing_for_default_device(), rarely_collecting_garbage():
-            return function.lower(*arguments)
-
     def _call(self, name: str) -> tuple[Any, tuple]:
         """Return a program's jitted function and the shapes of its arguments."""
         if name == "init":

@@ -73,7 +73,7 @@ class Loggers:
         for name in self._names:
 
             def begin(name: str = name) -> None:
-                self._open[name] = _OPEN[name](self._folder, record, seeds, self._say)
+                self._open[name] = _open(name, self._folder, record, seeds, self._say)
                 self._open[name].rows(rows)
 
             self._try(name, begin)
@@ -108,16 +108,11 @@ class Loggers:
             self._say(f"--log {name} failed and is not used any more ({description[:200]}); metrics.jsonl has everything")
 
 
-def _open_tensorboard(folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
+def _open(name: str, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
+    if name == "wandb":
+        from jaxrl_vis.run.loggers.weights_and_biases import WeightsAndBiases
+
+        return WeightsAndBiases(folder, record, seeds, say)
     from jaxrl_vis.run.loggers.tensorboard import TensorBoard
 
     return TensorBoard(folder, record, seeds)
-
-
-def _open_wandb(folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
-    from jaxrl_vis.run.loggers.weights_and_biases import WeightsAndBiases
-
-    return WeightsAndBiases(folder, record, seeds, say)
-
-
-_OPEN = {"tensorboard": _open_tensorboard, "wandb": _open_wandb}

@@ -43,7 +43,7 @@ class WeightsAndBiases:
 
     def __init__(self, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]):
         self._state_file = folder / WANDB_STATE
-        self._run_id = record.get(RUN_ID)
+        self._run_id = record[RUN_ID]
         self._state = self._read_state()
         self._runs: dict[int, Any] = {}
         mode = wandb.setup().settings.mode
@@ -51,9 +51,8 @@ class WeightsAndBiases:
             raise RequestError("nobody is logged in: `wandb login`, or WANDB_MODE=offline")
         group = folder.resolve().name
         for seed in seeds:
-            owner = {} if self._run_id is None else {RUN_ID: self._run_id}
             options = {name: value for group in record["config"].values() for name, value in group.items()}
-            known = self._state.setdefault(str(seed), {"id": uuid.uuid4().hex[:8], "iteration": 0, **owner})
+            known = self._state.setdefault(str(seed), {"id": uuid.uuid4().hex[:8], "iteration": 0, RUN_ID: self._run_id})
             with shielded_children():  # W&B's own process must outlive a Ctrl-C, to receive the end of the run
                 run = wandb.init(
                     project=os.environ.get("WANDB_PROJECT", PROJECT),

@@ -28,7 +28,7 @@ from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.files import read_json
 from jaxrl_vis.run.storage import hush, sums
 from jaxrl_vis.run.storage.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
-from jaxrl_vis.run.storage.manifest import FILE, READABLE, SCHEMA, is_manifest, progress_in
+from jaxrl_vis.run.storage.manifest import FILE, SCHEMA, is_manifest
 from jaxrl_vis.run.storage.metrics import RUN_ID
 from jaxrl_vis.run.storage.recent import ANY_RUN, Recent, Unusable
 from jaxrl_vis.types import LoopState, TrainState
@@ -41,10 +41,6 @@ _PRECEDENCE = (FULL, RECENT, LIGHT)  # for resuming, among equally new ones
 _KEPT = 2
 _TIMEOUT_S = 10**9
 DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
-
-
-class _Damaged(Exception):
-    """Damaged checkpoint. The message gives the reason in a few words."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +82,7 @@ class Checkpoints:
         read_only: Never save: nothing is created or cleaned up.
 
     Attributes:
-        run_id: Id of the run, None for one of an earlier version: other runs' checkpoints are ignored, except by
+        run_id: Id of the run: other runs' checkpoints are ignored, except by
             `set_foreign_aside`. `ANY_RUN`: all checkpoints.
     """
 
@@ -95,7 +91,7 @@ class Checkpoints:
         folder: Path,
         say: Callable[[str], None] = streams.say,
         read_only: bool = False,
-        run_id: str | None = ANY_RUN,
+        run_id: str = ANY_RUN,
     ):
         self._folder = folder.absolute()  # orbax refuses relative names
         self._say = say
@@ -108,12 +104,12 @@ class Checkpoints:
         self._unsilence: Callable[[], None] | None = None
 
     @property
-    def run_id(self) -> str | None:
+    def run_id(self) -> str:
         """Id of the run, see the class."""
         return self.recent.run_id
 
     @run_id.setter
-    def run_id(self, run_id: str | None) -> None:
+    def run_id(self, run_id: str) -> None:
         self.recent.run_id = run_id
 
     def _manager(self, tier: str) -> "ocp.CheckpointManager":
@@ -183,8 +179,7 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         described = {name: describe(arrays) for name, arrays in items.items()}
-        run = {} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}
-        manifest = {"schema": SCHEMA, **run, "iteration": iteration, "items": described, "progress": progress}
+        manifest = {"schema": SCHEMA, RUN_ID: self.run_id, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         if distributed.are_several():
@@ -249,7 +244,7 @@ class Checkpoints:
             # After a failed background write, a manager reports the error again and again: use a new one. Its threads keep
             # failing for a while, so the process stays silent about them from here on.
             self._managers.pop(tier, None)
-            self._unsilence = hush.stay_silent
+            self._unsilence = lambda: None
             text = " ".join(str(error).split())
             shown = "no space left on the device" if "No space left" in text else f"{type(error).__name__}: {text[:160]}"
             raise StorageError(f"cannot write a {tier} checkpoint into {self._folder} ({shown})") from error
@@ -372,7 +367,7 @@ class Checkpoints:
     def _damage_as_request_error(self, tier: str, iteration: int) -> Iterator[None]:
         try:
             yield
-        except _Damaged as damage:
+        except Unusable as damage:
             raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
 
     def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
@@ -382,34 +377,26 @@ class Checkpoints:
         for iteration, tier in sorted(candidates, key=lambda item: (-item[0], tiers.index(item[1]))):
             try:
                 if tier == RECENT:
-                    return self._restore_recent(iteration, template)
-                return self._restore(tier, iteration, template, with_rest and tier == FULL)
-            except _Damaged as damage:
+                    loop, progress = self.recent.restore(iteration, template)
+                    return Restored(RECENT, iteration, loop.train, loop, progress)
+                manifest = self._manifest(tier, iteration)
+                return self._restored(tier, iteration, template, with_rest and tier == FULL, manifest)
+            except Unusable as damage:
                 if (tier, iteration) not in self._reported:
                     self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
                 self._reported.add((tier, iteration))
         return None
-
-    def _restore_recent(self, iteration: int, template: LoopState) -> Restored:
-        try:
-            loop, progress = self.recent.restore(iteration, template)
-        except Unusable as error:
-            raise _Damaged(str(error)) from None
-        return Restored(RECENT, iteration, loop.train, loop, progress)
 
     def _manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
         if not is_manifest(manifest):
-            raise _Damaged("its manifest is incomplete")
-        if manifest["schema"] not in READABLE:
+            raise Unusable("its manifest is incomplete")
+        if manifest["schema"] != SCHEMA:
             where = self._folder / tier / str(iteration)
             raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         return manifest
-
-    def _restore(self, tier: str, iteration: int, template: LoopState, with_rest: bool) -> Restored:
-        return self._restored(tier, iteration, template, with_rest, self._manifest(tier, iteration))
 
     def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
         import orbax.checkpoint as ocp
@@ -425,10 +412,10 @@ class Checkpoints:
         for name, tree in templates.items():
             for leaf_name, array in to_host(read[name], copy=False).items():
                 if not is_intact(array, manifest["items"][name][leaf_name]):
-                    raise _Damaged(f"wrong checksum of {leaf_name}")
+                    raise Unusable(f"wrong checksum of {leaf_name}")
             trees[name] = rebuild(tree, read[name])
         loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
-        return Restored(tier, iteration, trees["train"], loop, progress_in(manifest))
+        return Restored(tier, iteration, trees["train"], loop, manifest["progress"])
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
         import orbax.checkpoint as ocp
@@ -439,6 +426,6 @@ class Checkpoints:
                 return manager.restore(iteration, args=ocp.args.Composite(**arguments))
         # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
         except Exception as error:
-            self._unsilence = hush.stay_silent  # as after a failed write: threads of this read may report errors later
+            self._unsilence = lambda: None  # as after a failed write: threads of this read may report errors later
             text = " ".join(str(error).split())[:80]
-            raise _Damaged(f"{type(error).__name__}: {text}") from None
+            raise Unusable(f"{type(error).__name__}: {text}") from None

@@ -8,7 +8,7 @@ The files:
     processes.jsonl     see `goodput`
 
 A run has a random id, which is kept when it is resumed. Every row of metrics and every checkpoint has it, and nothing with
-another id is resumed, counted or deleted. Runs of earlier versions have no id.
+another id is resumed, counted or deleted.
 """
 
 import contextlib
@@ -17,8 +17,6 @@ import json
 import secrets
 import shlex
 import shutil
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import check_path, is_temporary, read_json, write_atomically
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
+from jaxrl_vis.run.storage.lock import FolderGoneError, Held
 from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 
 SCHEMA = 2
@@ -115,10 +113,6 @@ class RunFolder:
         """Episodes of the trained policy."""
         return self.path / "video.gif"
 
-    def lock(self, say: Callable[[str], None] = print) -> AbstractContextManager[Held]:
-        """Return the context that locks the folder, see `run_lock`."""
-        return run_lock(self.path, say)
-
     def rows(self) -> list[dict[str, Any]]:
         """Read this run's rows of metrics.jsonl, in order of iteration, without damaged ones.
 
@@ -147,7 +141,7 @@ class RunFolder:
         if not held.is_in_place():
             raise FolderGoneError(_where_gone(self.path, held.current_path(), "before the run began"))
 
-    def check_ours(self, run_id: str | None, held: Held) -> None:
+    def check_ours(self, run_id: str, held: Held) -> None:
         """Check that the folder still belongs to a run, before something is written into it.
 
         Args:
@@ -166,7 +160,7 @@ class RunFolder:
             when = "while the run wrote there, and what was trained since its last checkpoint is lost"
             raise FolderGoneError(_where_gone(self.path, held.current_path(), when))
 
-    def remove_remains(self, run_id: str | None) -> None:
+    def remove_remains(self, run_id: str) -> None:
         """Delete files that checkpoint threads have recreated in a folder after it was moved or deleted.
 
         A folder with other contents is left alone.
@@ -263,7 +257,7 @@ class RunFolder:
                 self.checkpoints.rmdir()
 
 
-def _is_remainder(checkpoint: Path, run_id: str | None) -> bool:
+def _is_remainder(checkpoint: Path, run_id: str) -> bool:
     """Return True if a checkpoint left in a deleted run folder is unfinished, or belongs to the run ``run_id``."""
     manifest = checkpoint / "manifest"
     try:
@@ -284,10 +278,10 @@ def _where_gone(path: Path, place: Path | None, when: str) -> str:
     return f"{path} was moved to {place} {when}: {resume}"
 
 
-def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[str, Any]:
+def _record(config: Config, log: tuple[str, ...], run_id: str) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
-        **({} if run_id is None else {RUN_ID: run_id}),
+        RUN_ID: run_id,
         "preset": config.run.preset,
         "git_revision": provenance.revision(),
         "versions": provenance.versions(),
@@ -315,14 +309,14 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def read_run_id(path: Path) -> str | None:
-    """Read the id of the run in ``path``; None for a run of an earlier version.
+def read_run_id(path: Path) -> str:
+    """Read the id of the run in ``path``.
 
     Raises:
         RequestError: There is no run in ``path``, or its config.json cannot be read.
     """
     run_id = read_record(path).get(RUN_ID)
-    if not isinstance(run_id, str | None):
+    if not isinstance(run_id, str):
         raise RequestError(f"{RUN_ID} in {RunFolder(path).config} must be a word, not {run_id!r}: put back what it held")
     return run_id
 

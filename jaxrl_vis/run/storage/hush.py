@@ -42,7 +42,3 @@ def silence_orbax() -> Callable[[], None]:
     absl.addFilter(is_not_orbax)
     sys.unraisablehook = hook
     return undo
-
-
-def stay_silent() -> None:
-    """No-op replacement for the undo function of `silence_orbax`."""

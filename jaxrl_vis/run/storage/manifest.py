@@ -1,19 +1,12 @@
 """Manifest of a checkpoint: descriptions of its arrays, and the host's progress."""
 
-from collections.abc import Mapping
 from typing import Any
 
 from jaxrl_vis.run.storage.progress import Progress
 
 SCHEMA = 2
-READABLE = (1, 2)
 FILE = "manifest/metadata"
 """Path within a checkpoint's folder, as written by orbax."""
-
-
-def progress_in(manifest: Mapping[str, Any]) -> Any:
-    """Return the progress in a manifest, for `Progress.from_dict`; schema 1 called it "memo"."""
-    return manifest.get("progress", manifest.get("memo", {}))
 
 
 def is_manifest(value: Any) -> bool:
@@ -30,7 +23,7 @@ def is_manifest(value: Any) -> bool:
         for entry in arrays
     )
     try:
-        Progress.from_dict(progress_in(value))
-    except (ValueError, AttributeError, TypeError):
+        Progress.from_dict(value["progress"])
+    except (KeyError, ValueError, AttributeError, TypeError):
         return False
     return are_arrays

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.files import sync_folder, write_atomically
+from jaxrl_vis.host.files import is_count, sync_folder, write_atomically
 from jaxrl_vis_envs.documents import parse_json
 
 PerSeed = dict[str, list[float]]
@@ -26,7 +26,7 @@ Row = Mapping[str, Any]
 """A line of the file."""
 
 RUN_ID = "run_id"
-"""Key of the run's id in a row, a checkpoint's manifest or a config.json; missing in those of earlier versions."""
+"""Key of the run's id in a row, a checkpoint's manifest or a config.json."""
 
 
 class Place(NamedTuple):
@@ -82,13 +82,10 @@ def _nine_digits(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-def make_rows(
-    seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]], run_id: str | None = None
-) -> list[dict[str, Any]]:
-    """Make one row per seed: seed, ``counts``, its entry of ``values``, and the run's id. Non-finite numbers become None."""
-    run = {} if run_id is None else {RUN_ID: run_id}
+def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
+    """Make one row per seed: seed, ``counts`` and its entry of ``values``. Non-finite numbers become None."""
     return [
-        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}, **run}
+        {"seed": seed, **counts, **{name: row[i] if math.isfinite(row[i]) else None for name, row in values.items()}}
         for i, seed in enumerate(seeds)
     ]
 
@@ -161,15 +158,11 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
         row = parse_json(line.decode("utf-8"))
     except ValueError:
         return None
-    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in Place._fields):
+    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in Place._fields):
         return None
     if not isinstance(row.get(RUN_ID), str | None):
         return None
     return row if all(name == RUN_ID or _is_figure(value) for name, value in row.items()) else None
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _LARGEST
 
 
 def _is_figure(value: Any) -> bool:
@@ -188,14 +181,14 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def cut_back(
-    path: Path, iteration: int, run_id: str | None, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
+    path: Path, iteration: int, run_id: str, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
 ) -> str | None:
     """Remove the rows after ``iteration``, which a resumed run writes again, and the rows of other runs.
 
     Args:
         path: The file.
         iteration: Last iteration to keep.
-        run_id: Id of the run; None for one of an earlier version.
+        run_id: Id of the run.
         aside: File to which damaged lines are moved; nothing is discarded.
         others: File to which other runs' rows are moved.
         keeps_later: Also move rows after ``iteration`` to ``aside``.

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, Self
 
+from jaxrl_vis.host.files import is_count
 from jaxrl_vis.run.storage.metrics import PerSeed
 
 
@@ -38,7 +39,7 @@ class Progress:
         counts = (progress.filtered, 0 if progress.replay_lost_at is None else progress.replay_lost_at)
         is_good = (
             all(_is_number(value) for value in (progress.wall_s, progress.compile_s))
-            and all(_is_number(value) and isinstance(value, int) for value in counts)
+            and all(map(is_count, counts))
             and isinstance(progress.evaluation_due, bool)
             and isinstance(progress.since_evaluation, list)
             and all(map(_are_metrics, progress.since_evaluation))

@@ -43,7 +43,7 @@ def is_cheap(replay: ReplayState) -> bool:
 
 
 class Unusable(Exception):
-    """Damaged state, or one with a damaged rollout. The message gives the reason in a few words."""
+    """Damaged checkpoint of any tier, or state with a damaged rollout. The message gives the reason in a few words."""
 
 
 class Recent:
@@ -54,13 +54,13 @@ class Recent:
         say: Called with one line when there is no more space for them.
 
     Attributes:
-        run_id: Id of the run, None for one without: other runs' states are ignored, except by `set_foreign_aside`. `ANY_RUN`:
+        run_id: Id of the run: other runs' states are ignored, except by `set_foreign_aside`. `ANY_RUN`:
             all states.
     """
 
     def __init__(self, folder: Path, say: Callable[[str], None]):
         self._folder, self._say = folder, say
-        self.run_id: str | None = ANY_RUN
+        self.run_id = ANY_RUN
         self._rollouts: dict[int, int] = {}  # rollouts known to exist, and their checksums
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
 
@@ -133,8 +133,7 @@ class Recent:
                 )
             rollouts[number] = self._rollouts[number]
         header = {
-            **{"schema": SCHEMA, "iteration": iteration, "items": describe(arrays)},
-            **({} if self.run_id in (None, ANY_RUN) else {RUN_ID: self.run_id}),
+            **{"schema": SCHEMA, RUN_ID: self.run_id, "iteration": iteration, "items": describe(arrays)},
             "episodes": {name: [list(array.shape), str(array.dtype)] for name, array in episodes.items()},
             **{"rollouts": {str(number): checksum for number, checksum in rollouts.items()}, "progress": progress},
         }

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxrl_vis.config import OPTIONS, Config
+from jaxrl_vis.host.files import is_count
 from jaxrl_vis.run.goodput import read_processes
 from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.folder import LOGGER_FOLDERS, WANDB_STATE, RunFolder
@@ -45,24 +46,20 @@ class Expected:
         seeds: Seeds of the run, in order.
         updates, env_steps: Gradient steps and environment steps in an iteration, per seed.
         eval_interval: Iterations between evaluations.
-        run_id: Id of the run; None if its config.json has none.
+        run_id: Id of the run.
     """
 
     seeds: Sequence[int]
     updates: int
     env_steps: int
     eval_interval: int
-    run_id: str | None
+    run_id: str
 
 
 def listed(values: Iterable[Any]) -> str:
     """Format the first few values, and the number of the others."""
     words = [str(value) for value in values]
     return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
 def _is_figure(value: Any) -> bool:
@@ -75,7 +72,7 @@ def _read_line(line: bytes) -> dict[str, Any] | str:
         row = json.loads(line.decode("utf-8"))
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         return "is damaged"
-    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in Place._fields):
+    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in Place._fields):
         return f"is no row: {', '.join(Place._fields)} must be numbers"
     return row
 
@@ -114,7 +111,7 @@ def _fault(row: Mapping[str, Any], expected: Expected) -> str:
     for name, per_iteration in (("updates", expected.updates), ("env_steps", expected.env_steps)):
         if row[name] != iteration * per_iteration:
             return f"{name} is {row[name]}, not {iteration * per_iteration} as config.json implies for {iteration} iterations"
-    if LOST in row and not (_is_count(row[LOST]) and row[LOST] <= iteration):
+    if LOST in row and not (is_count(row[LOST]) and row[LOST] <= iteration):
         return f"{LOST} is {row[LOST]!r}, which does not fit iteration {iteration}"
     wrong = [name for name, value in row.items() if name != RUN_ID and not _is_figure(value)]
     if wrong or "eval/success" not in row:
@@ -191,7 +188,7 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     count = device.get("count") if isinstance(device, Mapping) else None
     if count is None:
         findings.problems.append("config.json: does not name the device of the run")
-    elif _is_count(count) and config.run.devices > count:
+    elif is_count(count) and config.run.devices > count:
         findings.problems.append(f"config.json: the run is on {config.run.devices} devices, but only {count} existed")
     if not isinstance(record.get("versions"), Mapping):
         findings.problems.append("config.json: does not name the versions of the libraries")
@@ -199,9 +196,7 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     groups = saved.values() if isinstance(saved, Mapping) else ()
     unset = sorted(set(OPTIONS).difference(*(group for group in groups if isinstance(group, Mapping))))
     if unset:
-        findings.notes.append(
-            f"config.json does not have {listed(unset)}: taken to be the default, or saved under an older name"
-        )
+        findings.notes.append(f"config.json does not have {listed(unset)}: taken to be the default")
 
 
 def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findings: Findings) -> None:

@@ -20,7 +20,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.run.compiled.memory import check_compiled, check_memory
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
-from jaxrl_vis.run.storage.folder import RunFolder, read_record
+from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.storage.metrics import RUN_ID
 from jaxrl_vis.run.storage.progress import Progress
@@ -107,7 +107,7 @@ class _Verifier:
             updates=program.updates_per_iteration,
             env_steps=program.steps_per_iteration,
             eval_interval=self._config.run.eval_interval,
-            run_id=record.get(RUN_ID),
+            run_id=read_run_id(folder.path),
         )
         self._total: int = program.num_iterations
         self._checkpoints = Checkpoints(folder.checkpoints, self._say, read_only=True)
@@ -151,8 +151,7 @@ class _Verifier:
             **_flat(provenance.device_record() | {"name": name}),
         }
         recorded = {"revision": record.get("git_revision"), **versions, **_flat(device)}
-        named = f", run {self._expected.run_id}" if self._expected.run_id else ""
-        self._say(f"{self._folder.path}: {self._config.environment.env}, {describe(self._config)}{named}")
+        self._say(f"{self._folder.path}: {self._config.environment.env}, {describe(self._config)}, run {self._expected.run_id}")
         libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
         self._say(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")

@@ -18,7 +18,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import streams
@@ -29,6 +28,7 @@ from jaxrl_vis.run.loggers.console import show_seconds
 from jaxrl_vis.run.signals import SIGNALS, Interruption
 from jaxrl_vis.run.storage.folder import RunFolder
 from jaxrl_vis.studies.engine.cells import Cell, contradiction, is_finished, latest_rows, show_budget
+from jaxrl_vis.studies.engine.cluster import Job
 
 _POLL_S = 0.2
 _STATUS_S = 60.0  # between status lines
@@ -38,33 +38,11 @@ Command = Callable[[Cell, Path, bool], Sequence[str]]
 """(cell, its folder, True to resume a run there) -> the words of a command that trains it."""
 
 
-class Process(Protocol):
-    """Interface of the processes of `start_process`: the part of `subprocess.Popen` that is used here."""
-
-    returncode: Any
-
-    def poll(self) -> int | None:
-        """Return the exit status; None while the process runs."""
-        ...
-
-    def send_signal(self, sig: int, /) -> None:
-        """Send a signal to the process."""
-        ...
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for the process to end."""
-        ...
-
-    def kill(self) -> None:
-        """Kill the process."""
-        ...
-
-
-Start = Callable[[Sequence[str], Path, Mapping[str, str]], Process]
+Start = Callable[[Sequence[str], Path, Mapping[str, str]], subprocess.Popen | Job]
 """(words of a command, log file, variables that restrict it to its device) -> the process that runs it."""
 
 
-def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> Process:
+def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> subprocess.Popen:
     """Run a command on this machine. See `cluster` for others."""
     # In its own session, so that a Ctrl-C of the terminal reaches it only once, from here: a second signal would end it at
     # once.
@@ -85,7 +63,7 @@ def train_command(cell: Cell, folder: Path, resume: bool) -> list[str]:
 class _Running:
     cell: Cell
     device: Device
-    process: Process
+    process: subprocess.Popen | Job
     log: Path
     started: float
 
@@ -197,7 +175,7 @@ class _Grid:
     def _end(self, done: _Running) -> None:
         self._running.remove(done)
         self._free.append(done.device)
-        status, took = done.process.returncode, show_seconds(time.monotonic() - done.started)
+        status, took = done.process.wait(), show_seconds(time.monotonic() - done.started)
         if status == 0 and is_finished(done.cell, self._runs):
             self._say(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
         elif self._is_stopping and (-status in SIGNALS or status - 128 in SIGNALS):

@@ -74,18 +74,14 @@ def _write(
     for picture in content.pictures:
         pictures.append(request.out.with_stem(request.out.stem + picture.suffix))
         subtitle = "; ".join(part for part in (about, picture.subtitle) if part)
-        draw_panels(pictures[-1], picture.rows, f"{title} ({_name(request.figure)})", subtitle)
-    head = [f"# {_name(request.figure).capitalize()}: {title}", "", f"{about}.", ""]
+        draw_panels(pictures[-1], picture.rows, f"{title} (figure {request.figure})", subtitle)
+    head = [f"# Figure {request.figure}: {title}", "", f"{about}.", ""]
     markdown, table = (request.out.with_suffix(suffix) for suffix in (".md", ".csv"))
     notes = [*content.notes, *_common_notes(study, lines, unfinished)]
     spaced = [line for note in notes for line in ((note,) if note.startswith("- ") else (note, ""))]
     write_atomically(markdown, "\n".join([*head, *content.text, *spaced]).rstrip() + "\n")
     write_atomically(table, to_csv(content.rows))
     return [*pictures, markdown, table]
-
-
-def _name(figure: str) -> str:
-    return f"figure {figure}"
 
 
 def _about(request: Request, lines: Sequence[Line]) -> str:
