@@ -30,7 +30,7 @@ from jaxrl_vis.errors import RequestError  # noqa: E402
 from jaxrl_vis.host.provenance import versions  # noqa: E402
 
 PARITY = "pixels_parity.json"
-GALLERY = ROOT / "docs" / "images/figure_pixels.png"
+GALLERY = ROOT / "docs" / "images" / "figure_pixels.png"
 PARITY_SIZE, IMAGE_SIZE = 128, 64  # pixels
 
 
