@@ -49,7 +49,7 @@ _TENDONS = {
     "ball_above": '<spatial><site site="left"/><geom geom="ball" sidesite="above"/><site site="right"/></spatial>',
     "ball_inside": '<spatial><site site="above"/><geom geom="ball" sidesite="inside"/><site site="right"/></spatial>',
     "rod": '<spatial><site site="rod_left"/><geom geom="rod"/><site site="rod_right"/></spatial>',
-    "hanging": '<spatial limited="true" range="0 .9" width=".01"><site site="hook"/><site site="end"/></spatial>',
+    "hanging": '<spatial limited="true" range="0 .45" width=".01"><site site="hook"/><site site="end"/></spatial>',
     "spring": '<spatial stiffness="5" springlength="0 .8"><site site="end"/><site site="fixed"/></spatial>',
     "limit": (
         '<spatial limited="true" range=".2 1.35" margin=".05"><site site="hook"/><site site="end"/><site site="low"/></spatial>'
