@@ -193,8 +193,8 @@ def test_snips_at_the_images_edge_are_black_beyond_it():
 
 
 def test_smaller_images_have_smaller_snips():
-    assert snip_shape(3376, (640, 128), 3376) == (640, 128)
-    assert snip_shape(1688, (640, 128), 3376) == (320, 64)
+    assert snip_shape((640, 128), 1.0) == (640, 128)
+    assert snip_shape((640, 128), 0.5) == (320, 64)
 
 
 # --- learning ---
@@ -225,7 +225,8 @@ def test_stalks_move_with_their_images():
     images = np.zeros((8, 64, 64, 3), np.uint8)
     images[:, :60] = [each.image for each in examples]
     stalks, kinds = (np.stack([getattr(each, name) for each in examples]) for name in ("stalks", "kinds"))
-    moved, places, kinds = move(jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), (60, 64), jax.random.key(0))
+    shapes = jnp.full((8, 2), jnp.array([60, 64]))
+    moved, places, kinds = move(jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), shapes, jax.random.key(0))
     assert moved.dtype == jnp.uint8
     compared = 0
     for image, stalk, kind in zip(np.asarray(moved), np.asarray(places)[:, 0], np.asarray(kinds)[:, 0]):

@@ -198,10 +198,9 @@ class CameraOptions:
         Raises:
             RequestError: The file cannot be read.
         """
-        from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+        from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 
         if self.calibration is not None:
             return read_calibration(self.calibration, self.calibration_unit)
-        own = [folder / name for name in ("calibration.yaml", "calibration.yml", "calibration.xml")]
-        path = next((path for path in own if path.exists()), None)
+        path = find_calibration(folder)
         return None if path is None else read_calibration(path, self.calibration_unit)

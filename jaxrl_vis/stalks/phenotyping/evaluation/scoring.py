@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.track.follow import follow
 from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, find_with_ground, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import Find, Sighting, find_with_ground, measure_pair
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
@@ -74,7 +74,7 @@ Finder = Callable[[np.ndarray], list[Detection]]
 def score_plot(
     family: Family,
     seed: int,
-    find: Finder | None,
+    find: Find | None,
     method: Method = "strip",
     least_score: float = 0.5,
     with_thesis: bool = False,
@@ -84,7 +84,7 @@ def score_plot(
     Args:
         family: Family that the plot is drawn from.
         seed: Seed of the plot.
-        find: Detector of the stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
+        find: Detector of the stalks, those of low scores too; None for true boxes and masks.
         method: Method of widths.
         least_score: Lowest score of a detection that counts.
         with_thesis: Score the thesis's methods on the same detections, too.
@@ -138,7 +138,7 @@ def score_plot(
     )
 
 
-def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray) -> list[Detection]:
+def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, density: float | None) -> list[Detection]:
     """True boxes and masks, as a finder that needs no image."""
     return perfect_detections(map(dataclasses.asdict, stalks), instance, MIN_VISIBLE)
 

@@ -64,6 +64,12 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
     return _checked(path, matrices[0], matrices[1], sizes[0], unit or said or "m")
 
 
+def find_calibration(folder: Path) -> Path | None:
+    """Return the file of the calibration in a folder of images; None where there is none."""
+    own = [folder / name for name in ("calibration.yaml", "calibration.yml", "calibration.xml")]
+    return next((path for path in own if path.exists()), None)
+
+
 def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:
     """Check that an image is of the size that was calibrated.
 

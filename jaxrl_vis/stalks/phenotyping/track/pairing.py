@@ -11,7 +11,7 @@ from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
 _SMALL_SHARE, _LARGE_SHARE = 0.25, 0.6
-_LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels of an image 3376 wide
+_LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels at a focal length of 2168
 
 
 def pair_fault(
@@ -42,7 +42,7 @@ def pair_fault(
     ]
     if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_SHARE:
         return "left and right are swapped: exchange their names"
-    for lines in sorted({max(round(line * calibration.width / 3376), 3) for line in _LINES}):
+    for lines in sorted({max(round(line * calibration.focal / 2168), 3) for line in _LINES}):
         for shift in (lines, -lines):
             if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_SHARE:
                 return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"

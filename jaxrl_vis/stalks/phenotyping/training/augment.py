@@ -50,7 +50,7 @@ def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
 
 
 def move(
-    images: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[int, int], key: jax.Array
+    images: jax.Array, stalks: jax.Array, kinds: jax.Array, shapes: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Images mirrored, sheared, stretched and shifted, with their stalks; a quarter of them is only mirrored.
 
@@ -58,16 +58,16 @@ def move(
         images: [N, H, W, 3] uint8, padded below and on the right.
         stalks: [N, T, 6].
         kinds: [N, T] int32.
-        shape: Lines and columns of the images without what was added.
+        shapes: [N, 2] int32, lines and columns of the images without what was added.
         key: For the random numbers.
     """
     keys = jax.random.split(key, images.shape[0])
-    return jax.vmap(lambda image, stalk, kind, key: _moved(image, stalk, kind, shape, key))(images, stalks, kinds, keys)
+    return jax.vmap(_moved)(images, stalks, kinds, shapes, keys)
 
 
-def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[int, int], key: jax.Array):
+def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Array, key: jax.Array):
     drawn = jax.random.uniform(key, (7,), minval=-1.0, maxval=1.0)
-    height, width = shape
+    height, width = shape[0], shape[1]
     still = drawn[0] > 0.5
     wide, tall = (jnp.where(still, 1.0, jnp.exp(0.12 * factor)) for factor in drawn[1:3])
     # Stalks of other fields lean by up to 20 degrees.
@@ -101,7 +101,7 @@ def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: tuple[i
     return moved, jnp.stack([begin, low, end, high, above, below], axis=-1), kinds
 
 
-def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: tuple[int, int]) -> jax.Array:
+def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Array) -> jax.Array:
     """An image at other places, by bilinear interpolation; black beyond ``shape``."""
     inside = (line >= -0.5) & (line <= shape[0] - 0.5) & (column >= -0.5) & (column <= shape[1] - 0.5)
     line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)

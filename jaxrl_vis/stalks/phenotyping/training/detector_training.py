@@ -56,20 +56,25 @@ class _Pool(Pool[Example]):
     def __init__(self, sources: list[Iterator[Example]], plan: Plan) -> None:
         self._plan = plan
         self.snips: list[tuple[int, int]] = []
+        self._largest = (0, 0)
         super().__init__(sources, plan.images)
 
     def add(self, example: Example) -> None:
         """Keep an example and its snips."""
         self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
+        lines, columns = padded_shape(example.image.shape[:2])
+        self._largest = max(lines, self._largest[0]), max(columns, self._largest[1])
         super().add(example)
 
-    def images(self, rng: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A batch of images, padded to ``shape``, with their stalks and kinds."""
+    def images(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """A batch of images, padded to the largest so far, with their stalks, kinds, and lines and columns."""
         chosen = [self.examples[place] for place in rng.integers(len(self.examples), size=self._plan.batch)]
-        images = np.zeros((len(chosen), *shape, 3), np.uint8)
+        images = np.zeros((len(chosen), *self._largest, 3), np.uint8)
         for image, example in zip(images, chosen):
             image[: example.image.shape[0], : example.image.shape[1]] = example.image
-        return images, np.stack([example.stalks for example in chosen]), np.stack([example.kinds for example in chosen])
+        shapes = np.array([example.image.shape[:2] for example in chosen], np.int32)
+        stalks, kinds = (np.stack([getattr(example, name) for example in chosen]) for name in ("stalks", "kinds"))
+        return images, stalks, kinds, shapes
 
     def strips(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
         """A batch of snips with their masks; None where there are no snips yet."""
@@ -85,16 +90,14 @@ class _Pool(Pool[Example]):
         )
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "shape", "dtype"), donate_argnums=0)
-def _update(
-    state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.Array], settings: Settings, shape: Any, dtype: Any
-):
+@functools.partial(jax.jit, static_argnames=("settings", "dtype"), donate_argnums=0)
+def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.Array], settings: Settings, dtype: Any):
     """One update of both networks: parameters, their average, and the optimiser's state."""
     params, average, moments = state
     rate, share = rates
-    (images, stalks, kinds), (snips, masks) = batch
+    (images, stalks, kinds, shapes), (snips, masks) = batch
     places, light, near, strips = jax.random.split(key, 4)
-    images, stalks, kinds = move(images, stalks, kinds, shape, places)
+    images, stalks, kinds = move(images, stalks, kinds, shapes, places)
     images = relight(images, light)
     snips, masks = vary_snips(snips, masks, strips)
 
@@ -162,14 +165,12 @@ def train(
         strips = pool.strips(rng)
         if strips is None:
             return None
-        batch, key = (pool.images(rng, whole), strips), jax.random.fold_in(steps_key, step)
-        state, parts = _update(state, batch, key, rates, settings, shape, dtype)
+        batch, key = (pool.images(rng), strips), jax.random.fold_in(steps_key, step)
+        state, parts = _update(state, batch, key, rates, settings, dtype)
         return parts, state[1]
 
     try:
         pool.fill(plan.first)
-        shape = pool.examples[0].image.shape[:2]
-        whole = padded_shape(tuple(np.max([example.image.shape[:2] for example in pool.examples], axis=0)))
         step = repeat(update, pool, plan, started, report, every)
     finally:
         pool.close()
