@@ -225,8 +225,8 @@ def test_stalks_move_with_their_images():
     images = np.zeros((8, 64, 64, 3), np.uint8)
     images[:, :60] = [each.image for each in examples]
     stalks, kinds = (np.stack([getattr(each, name) for each in examples]) for name in ("stalks", "kinds"))
-    shapes = jnp.full((8, 2), jnp.array([60, 64]))
-    moved, places, kinds = move(jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), shapes, jax.random.key(0))
+    sizes = jnp.tile(jnp.array([60, 64]), (len(images), 1))
+    moved, places, kinds = move(jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), sizes, jax.random.key(0))
     assert moved.dtype == jnp.uint8
     compared = 0
     for image, stalk, kind in zip(np.asarray(moved), np.asarray(places)[:, 0], np.asarray(kinds)[:, 0]):

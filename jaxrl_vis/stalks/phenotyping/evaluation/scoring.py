@@ -68,7 +68,7 @@ class ThesisScore:
     widths: np.ndarray
 
 
-Finder = Callable[[np.ndarray], list[Detection]]
+
 
 
 def score_plot(

@@ -35,7 +35,8 @@ class Frame:
 
 def find_frame(image: np.ndarray) -> Frame:
     """Find the part of an image [H, W, 3] or [H, W] uint8 that is not a border."""
-    dark = cv2.inRange(image, (0,) * (image.shape[2] if image.ndim == 3 else 1), (_DARK,) * 3) > 0
+    channels = image.shape[2] if image.ndim == 3 else 1
+    dark = cv2.inRange(image, (0,) * channels, (_DARK,) * channels) > 0
     lit = ~dark
     lines, columns = (_extent(image, lit.any(axis=1 - axis), axis) for axis in (0, 1))
     part = image[slice(*lines), slice(*columns)]

@@ -50,7 +50,7 @@ def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
 
 
 def move(
-    images: jax.Array, stalks: jax.Array, kinds: jax.Array, shapes: jax.Array, key: jax.Array
+    images: jax.Array, stalks: jax.Array, kinds: jax.Array, sizes: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Images mirrored, sheared, stretched and shifted, with their stalks; a quarter of them is only mirrored.
 
@@ -58,11 +58,11 @@ def move(
         images: [N, H, W, 3] uint8, padded below and on the right.
         stalks: [N, T, 6].
         kinds: [N, T] int32.
-        shapes: [N, 2] int32, lines and columns of the images without what was added.
+        sizes: [N, 2] int32, lines and columns of the images without what was added.
         key: For the random numbers.
     """
     keys = jax.random.split(key, images.shape[0])
-    return jax.vmap(_moved)(images, stalks, kinds, shapes, keys)
+    return jax.vmap(_moved)(images, stalks, kinds, sizes, keys)
 
 
 def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Array, key: jax.Array):

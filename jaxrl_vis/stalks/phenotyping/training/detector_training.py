@@ -61,29 +61,29 @@ class _Pool(Pool[Example]):
 
     def add(self, example: Example) -> None:
         """Keep an example and its snips."""
+        height, width = example.image.shape[:2]
+        self._largest = max(self._largest[0], height), max(self._largest[1], width)
         self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
-        lines, columns = padded_shape(example.image.shape[:2])
-        self._largest = max(lines, self._largest[0]), max(columns, self._largest[1])
         super().add(example)
 
     def images(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """A batch of images, padded to the largest so far, with their stalks, kinds, and lines and columns."""
+        """A batch of images, padded to the largest that there were so far, with their stalks, kinds and sizes."""
         chosen = [self.examples[place] for place in rng.integers(len(self.examples), size=self._plan.batch)]
-        images = np.zeros((len(chosen), *self._largest, 3), np.uint8)
+        sizes = np.array([example.image.shape[:2] for example in chosen], np.int32)
+        images = np.zeros((len(chosen), *padded_shape(self._largest), 3), np.uint8)
         for image, example in zip(images, chosen):
             image[: example.image.shape[0], : example.image.shape[1]] = example.image
-        shapes = np.array([example.image.shape[:2] for example in chosen], np.int32)
         stalks, kinds = (np.stack([getattr(example, name) for example in chosen]) for name in ("stalks", "kinds"))
-        return images, stalks, kinds, shapes
+        return images, stalks, kinds, sizes
 
     def strips(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
         """A batch of snips with their masks; None where there are no snips yet."""
         if not self.snips:
             return None
-        chosen = [self.snips[place] for place in rng.integers(len(self.snips), size=self._plan.snips)]
-        # All of one size: in a folder of images of several, those that are as large as the first one.
-        shape = self.examples[chosen[0][0]].snips.shape[1:3]
-        chosen = [place if self.examples[place[0]].snips.shape[1:3] == shape else chosen[0] for place in chosen]
+        # All of one size: in a folder of images of several, those that are as large as one of them.
+        shape = self.examples[self.snips[rng.integers(len(self.snips))][0]].snips.shape[1:3]
+        alike = [place for place in self.snips if self.examples[place[0]].snips.shape[1:3] == shape]
+        chosen = [alike[place] for place in rng.integers(len(alike), size=self._plan.snips)]
         return (
             np.stack([self.examples[image].snips[place] for image, place in chosen]),
             np.stack([self.examples[image].masks[place] for image, place in chosen]),
@@ -95,9 +95,9 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     """One update of both networks: parameters, their average, and the optimiser's state."""
     params, average, moments = state
     rate, share = rates
-    (images, stalks, kinds, shapes), (snips, masks) = batch
+    (images, stalks, kinds, sizes), (snips, masks) = batch
     places, light, near, strips = jax.random.split(key, 4)
-    images, stalks, kinds = move(images, stalks, kinds, shapes, places)
+    images, stalks, kinds = move(images, stalks, kinds, sizes, places)
     images = relight(images, light)
     snips, masks = vary_snips(snips, masks, strips)
 
