@@ -187,8 +187,9 @@ class CameraOptions:
     calibration: Path | None = None
     """Calibration of all folders (OpenCV, or ROS left.yaml and right.yaml); calibration.yaml of each folder if not given.
     Without one there are no metric lengths."""
-    calibration_unit: Literal["m", "mm"] | None = None
-    """Unit of the calibration's baseline, where the file does not say it."""
+    calibration_unit: str | None = None
+    """Unit of the calibration's baseline, where the file does not say it: m, cm or mm, or the side of a square of the
+    chessboard, as 24mm, where it was counted in squares."""
     speed: float | None = None
     """Speed of the robot in m/s, for an odometry.csv that holds times only."""
 

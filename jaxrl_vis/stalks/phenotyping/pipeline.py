@@ -33,6 +33,7 @@ from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
 from jaxrl_vis.stalks.phenotyping.report.qc import Page, PlotResult
 from jaxrl_vis.stalks.phenotyping.report.tables import (
+    NO_ROW,
     PLOT_COLUMNS,
     STALK_COLUMNS,
     Origin,
@@ -158,7 +159,7 @@ def _run(
         ]
         result = _finish(plot, records, driven[plot.name], request, run_all)
         if result.row["stalks"] == "":
-            why = why_no_odometry(plot, driven[plot.name], plot.pairs) if result.row["flag"] == NO_ODOMETRY else None
+            why = _why_no_count(result, plot, driven[plot.name])
             say(plot.name, result.row["flag"] + ("" if why is None else f" ({why})"))
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
@@ -167,6 +168,22 @@ def _run(
         write_rows(request.out / "skipped.csv", SKIPPED_COLUMNS, skipped)
     page.write(request.out / "qc.html", skipped)
     return rows, skipped
+
+
+def _why_no_count(result: PlotResult, plot: PlotFolder, driven: dict[str, float] | None) -> str | None:
+    """Return more words than the flag has on why a plot has no count; None where there is no more to say."""
+    flag = result.row["flag"]
+    if flag == NO_ODOMETRY:
+        return why_no_odometry(plot, driven, plot.pairs)
+    if flag == NO_FIT:
+        return "its distances, or the baseline of the calibration, may be in another unit"
+    if flag != NO_ROW:
+        return None
+    finds = sum(map(len, result.frames))
+    return (
+        f"{finds} finds in {len(result.frames)} pairs, none of which counts: unless the plot is empty, its images are not "
+        "such as the networks know, see its overlays"
+    )
 
 
 def _is_whole(record: dict[str, Any]) -> bool:
@@ -203,7 +220,7 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
     )
     wrong = None
     if calibration is not None and disparity is None:
-        wrong = pair_fault(view.detections, view.sightings, left, right, calibration)
+        wrong = pair_fault(view.detections, view.sightings, left, right, calibration, view.ground)
     if wrong is not None:
         return {"skipped": wrong}
     return {

@@ -11,7 +11,7 @@ import dataclasses
 import math
 import reprlib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,24 +19,22 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
+from jaxrl_vis.stalks.phenotyping.io.units import METRES, baseline_in_metres
 from jaxrl_vis_envs.documents import read_text
 from jaxrl_vis_envs.plants import Calibration
 
-Unit = Literal["m", "mm"]
-_METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3}
-_BASELINES = (0.008, 2.0)  # m: of stereo pairs that look at plants from a robot
 _SIDES = ("left", "right")
 _NO_STORAGE = "it is neither YAML nor XML as OpenCV and ROS write it"
 _MAX_BYTES = 2_000_000  # of a file
 _MAX_PIXELS = 100_000  # along a side of an image
 
 
-def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
+def read_calibration(path: Path, unit: str | None = None) -> Calibration:
     """Read a calibration.
 
     Args:
         path: A file of OpenCV or of ROS, or a folder that holds left.yaml and right.yaml.
-        unit: Unit of the baseline; None for what the file says (its key ``unit``), and else metres.
+        unit: Unit of the baseline, see `in_metres`; None for what the file says (its key ``unit``), and else metres.
 
     Raises:
         RequestError: There is no such file, it does not describe a pair of rectified cameras, or its baseline cannot be in that
@@ -58,9 +56,9 @@ def read_calibration(path: Path, unit: Unit | None = None) -> Calibration:
     if sizes[0] != sizes[1]:
         raise RequestError(f"{path}: the left image has {_times(sizes[0])} pixels and the right one {_times(sizes[1])}")
     said = stores[0].get("unit")
-    if said is not None and (not isinstance(said, str) or said not in _METRES):
+    if said is not None and (not isinstance(said, str) or said not in METRES):
         unit_read = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
-        raise RequestError(f"{path}: unit must be m or mm, not {unit_read}")
+        raise RequestError(f"{path}: unit must be m, cm or mm, not {unit_read}")
     return _checked(path, matrices[0], matrices[1], sizes[0], unit or said or "m")
 
 
@@ -177,19 +175,17 @@ def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, i
         raise RequestError(
             f"{path}: the cameras differ in focal length or in lines, so they are not rectified: rectify the pair"
         )
-    length = -float(right[0, 3]) / focal
-    if length == 0.0:
+    if not math.isclose(left[1, 3], right[1, 3], abs_tol=1e-3 * focal):
+        raise RequestError(f"{path} has its cameras above each other: turn the pair, so that they stand side by side")
+    # Each camera's last column is its place along the baseline; OpenCV puts the left one at 0.
+    length = float(left[0, 3] - right[0, 3]) / focal
+    if abs(length) < 1e-9:
         raise RequestError(
             f"{path} has a baseline of 0, as of two cameras that were calibrated apart: calibrate them as a pair"
         )
     if length < 0.0:
         raise RequestError(f"{path} has its cameras swapped (baseline {length:g}): the first one must be the left one")
-    baseline = length * _METRES[unit]
-    if not _BASELINES[0] <= baseline <= _BASELINES[1]:
-        other = "mm" if unit == "m" else "m"
-        fits = _BASELINES[0] <= length * _METRES[other] <= _BASELINES[1]
-        mend = f": it seems to be in {other}, so say --calibration-unit {other}" if fits else ""
-        raise RequestError(f"{path} has a baseline of {length:g} {unit}, which is no stereo pair's{mend}")
+    baseline = baseline_in_metres(path, length, unit)
     centre = (float(left[0, 2]), float(left[1, 2]))
     calibration = Calibration(width, height, focal, centre, baseline, float(left[0, 2] - right[0, 2]))
     return dataclasses.replace(calibration, offset=0.0) if abs(calibration.offset) < 1e-9 else calibration

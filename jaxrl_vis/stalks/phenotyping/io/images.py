@@ -44,7 +44,7 @@ def image_size(path: Path) -> tuple[int, int]:
         OSError: It cannot be read, is no image, or one that no camera takes. One line that names it.
     """
     size, orientation = _header(path)
-    return size[::-1] if orientation > 4 else size
+    return (size[1], size[0]) if orientation > 4 else size
 
 
 def _header(path: Path) -> tuple[tuple[int, int], int]:
@@ -134,7 +134,7 @@ def _decoded(path: Path) -> np.ndarray | None:
     if image is None:
         return None
     if data[:2] in (b"II", b"MM"):  # OpenCV turns TIFF by itself, in whatever way it is read
-        size, orientation = size[::-1] if orientation > 4 else size, 1
+        size, orientation = image_size(path), 1
     return upright(image, orientation) if image.shape[:2] == size else None
 
 

@@ -115,6 +115,7 @@ def fill_borders(image: np.ndarray, frame: Frame) -> np.ndarray:
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
     # Every pixel of a border gets the value of the nearest one that shows something.
     _, labels = cv2.distanceTransformWithLabels((~shown).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    labels = labels.astype(np.int64)
     line, column = np.nonzero(shown)
     sources = np.zeros((int(labels.max()) + 1, 2), np.int64)
     sources[labels[line, column]] = np.stack([line, column], axis=1)

@@ -26,6 +26,7 @@ USUAL_DISTANCE = 0.8
 _OTHER_DISTANCES = (0.55, 1.15)  # m: at which a row is looked for that is not seen at the usual one
 _SAME_DISTANCE = 0.12  # of 1: networks find stalks that are by so much larger or smaller than those of the usual distance
 _AT_DISTANCE = 3  # stalks that say how far away the row is
+_FAR_FROM_ROW = 0.2  # m: what stands there is not of the row
 _HIDDEN = 0.1  # of its confidence that a sighting keeps if one of its edges may be hidden
 _BEHIND = 0.003  # m: what stands so much further away hides nothing
 _TOUCHING = 0.1  # of half a stalk's width: edges so near are one
@@ -236,6 +237,7 @@ def measure_pair(
         if ground is not None and detection.upper is not None:
             upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((got, upper))
+    measured = _without_strangers(measured, calibration, find_frame(grey_right).columns[0])
     hidden = _hidden_edges([got for got, _ in measured])
     above = _hidden_edges([upper or Measurement() for _, upper in measured])
     hidden = [behind or not got.here for behind, (got, _) in zip(hidden, measured)]
@@ -245,6 +247,31 @@ def measure_pair(
         sighting = _sighting(detection, less, upper, calibration)
         sightings.append(dataclasses.replace(sighting, hidden=behind[0], upper_hidden=behind[1]))
     return sightings
+
+
+def _without_strangers(
+    measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, begin: int
+) -> list[tuple[Measurement, Measurement | None]]:
+    """Return measurements without those that matched something else, as the right image does not reach as far as their stalk.
+
+    Args:
+        measured: Measurements of the stalks of a pair, lower and upper.
+        calibration: Calibration of the cameras.
+        begin: First column that the right image shows.
+    """
+    depths = [got.depth for got, _ in measured if got.diameter_mm is not None]
+    if len(depths) < _AT_DISTANCE:
+        return measured
+    row = float(np.median(depths))
+    disparity = float(calibration.disparity(np.array(row)))
+    kept = []
+    for got, upper in measured:
+        beyond = got.column - 0.5 * got.width - disparity < begin
+        if got.diameter_mm is not None and beyond and abs(got.depth - row) > _FAR_FROM_ROW:
+            got = Measurement(line=got.line, column=got.column, lean=got.lean, reason="the right image does not show it")
+            upper = None
+        kept.append((got, upper))
+    return kept
 
 
 def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
