@@ -16,6 +16,7 @@ _RINGING = 16  # pixels: how far from its side JPEG changes a border
 _MIN_LINES = 0.08  # of the image's lines: a shorter side is none
 _BEND = 2.5  # pixels: how far a border's side lies from an even curve
 _MIN_AGREEING = 0.9  # of a side's lines
+_THINNEST = 8.0  # pixels: width of a border where it begins within the image
 _INSIDE = 2  # pixels by which an image ends before its border begins
 
 
@@ -97,7 +98,9 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
         curve = np.polyval(np.polyfit(place[heavy], reach[heavy], 2), place)
         # A dark thing beside the border makes it look wider, and nothing makes it look narrower.
         heavy = np.abs(reach - curve) <= max(_BEND, float(np.quantile(np.abs(reach - curve), 0.5)))
-    if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING:
+    # A border goes on to the image's other sides, or grows from nothing.
+    ends = [curve[end] for end, whole in ((0, first == 0), (-1, last == dark.shape[0])) if not whole]
+    if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _THINNEST:
         return None
     columns = np.zeros(dark.shape[0])
     columns[first:last] = np.maximum(curve, 0.0) + _INSIDE

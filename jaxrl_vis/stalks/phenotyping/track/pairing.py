@@ -89,8 +89,8 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
         return None
     baseline = calibration.baseline * USUAL_DISTANCE / depth
     return (
-        f"its stalks stand {depth:.2g} m away by the calibration, not {DEPTHS[0]} to {DEPTHS[1]} m: say "
-        f"with --calibration-unit in which unit its baseline is (a baseline of about {baseline:.2g} m would put the row at {USUAL_DISTANCE} m)"
+        f"its stalks stand {depth:.2g} m away by the calibration, not {DEPTHS[0]} to {DEPTHS[1]} m: say in which unit its "
+        f"baseline is with --calibration-unit (a baseline of about {baseline:.2g} m would put the row at {USUAL_DISTANCE} m)"
     )
 
 
