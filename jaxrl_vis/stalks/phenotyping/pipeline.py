@@ -250,7 +250,7 @@ def _finish(
         drive = follow_either_way(frames, driven_at, calibration, (float(first), float(last)))
         why = NO_FIT
     if drive is None or not drive.fits:
-        stalks, row = rows_without_path(frames, skipped, origin, why)
+        stalks, row = rows_without_path(frames, skipped, origin, why, metric=why != NO_FIT)
     else:
         tracks, path = drive.tracks, drive.path
         labels = sighting_labels(frames, tracks)

@@ -144,9 +144,20 @@ def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin
     }
 
 
-def rows_without_path(frames: list[list[Sighting]], skipped: int, origin: Origin, why: str) -> tuple[list[Row], Row]:
-    """The plot's row where pairs cannot be put together: widths of detections, but no count. There are no rows of stalks."""
-    measured = [sighting.diameter_mm for sightings in frames for sighting in sightings if sighting.diameter_mm is not None]
+def rows_without_path(
+    frames: list[list[Sighting]], skipped: int, origin: Origin, why: str, metric: bool = True
+) -> tuple[list[Row], Row]:
+    """The plot's row where pairs cannot be put together: no count, no rows of stalks.
+
+    Args:
+        frames: Sightings of each pair.
+        skipped: Number of pairs that could not be used.
+        origin: Values of every row.
+        why: Flag of the plot.
+        metric: The mean width of detections is stated; not where the unit of the calibration is in doubt.
+    """
+    sightings = [sighting for frame in frames for sighting in frame] if metric else []
+    measured = [sighting.diameter_mm for sighting in sightings if sighting.diameter_mm is not None]
     row = {
         "plot": origin.plot,
         "pairs": len(frames),
