@@ -16,8 +16,10 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import initial
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, outlined_mask
 from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
+from jaxrl_vis_envs.plants import Calibration
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +209,21 @@ def test_a_box_that_is_not_there_is_the_one_around_the_mask(tmp_path, segmentati
         (found,) = read_annotations(coco_folder(tmp_path, {"segmentation": segmentation, **annotation}))["annotations"]
         assert found["bbox"] == BOX
     assert settings_for(tmp_path, TINY).band_lines == 40.0
+
+
+def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):
+    """Without one, images are reduced to one width, and so are those that the networks are used on."""
+    coco_folder(tmp_path, {"bbox": BOX})
+    assert settings_for(tmp_path, TINY).density == 0.0
+    usual = TINY.density * 0.8
+    write_calibration(tmp_path / "calibration.yaml", Calibration(IMAGE[1], IMAGE[0], 0.5 * usual, (31.5, 29.5), 0.1))
+    settings = settings_for(tmp_path, TINY)
+    assert settings.density == TINY.density and settings.band_lines == 80.0
+    (example,) = annotated_examples(tmp_path, settings)
+    assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 88.0
+    write_calibration(tmp_path / "calibration.yaml", Calibration(80, 60, usual, (39.5, 29.5), 0.1))
+    with pytest.raises(RequestError, match=r"row.png has 64 x 60 pixels, but the calibration is for 80 x 60"):
+        settings_for(tmp_path, TINY)
 
 
 # --- masks from outlines ---

@@ -63,7 +63,7 @@ def higher_up(stalk: np.ndarray) -> np.ndarray:
 
 def resize_factor(width: int, settings: Settings, density: float | None) -> float:
     """Factor by which `resize` resizes an image ``width`` pixels wide: only where its density is known it is enlarged."""
-    return min(settings.resizing(width, density), 1.0 if density is None else _MAX_ENLARGED)
+    return min(settings.resizing(width, density), _MAX_ENLARGED if density and settings.density else 1.0)
 
 
 def resize(image: np.ndarray, settings: Settings, density: float | None) -> tuple[np.ndarray, tuple[float, float]]:
