@@ -38,7 +38,7 @@ from jaxrl_vis_envs.plants import family
 band_overlap, overlap = jax.jit(band_overlap), jax.jit(overlap)
 encode, decode, vary_snips = jax.jit(encode), jax.jit(decode), jax.jit(vary_snips)
 roi_align, best_proposals = jax.jit(roi_align, static_argnums=(2, 3, 4, 5)), jax.jit(best_proposals, static_argnums=(3, 4))
-assign, suppress, move = jax.jit(assign), jax.jit(suppress), jax.jit(move, static_argnums=3)
+assign, suppress, move = jax.jit(assign), jax.jit(suppress), jax.jit(move)
 
 
 @jax.jit
