@@ -2,7 +2,7 @@
 
 python benchmarks/check_claims.py    # exit 1 if anything differs
 
-Covered are the README's table of results, docs/lab/target_decay.md and docs/lab/ablations.md, all tables of
+Covered are the tables of docs/lab/results.md, docs/lab/target_decay.md and docs/lab/ablations.md, all tables of
 `benchmarks.claims.pages`, and the numbers in sentences of README.md, docs/index.md and the pages of the studies
 (`benchmarks.claims.sentences`).
 """
@@ -14,7 +14,11 @@ from benchmarks.claims import pages, prose, sentences
 from benchmarks.ledger import pages as ledger
 from benchmarks.ledger.records import CHECKOUT
 
-OF_LEARNING = {"README.md": "results table", "docs/lab/target_decay.md": "tables", "docs/lab/ablations.md": "curves"}
+OF_LEARNING = {
+    "docs/lab/results.md": "results table",
+    "docs/lab/target_decay.md": "tables",
+    "docs/lab/ablations.md": "curves",
+}
 """Tables of the ledger that come from records of learning."""
 
 

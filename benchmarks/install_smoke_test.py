@@ -3,7 +3,7 @@
     python benchmarks/install_smoke_test.py [--python python3.12 python3.13] [--ways wheel clone notebooks] [--whole]
 
 wheel      builds a wheel, installs it with pip, runs every command, trains a task of one's own, and makes mistakes
-clone      clones the repository, `make train`, then the commands of the README; nothing may be left untracked
+clone      clones the repository, `make train`, then the commands of docs/start.md; nothing may be left untracked
 notebooks  a Jupyter without this project, and the notebooks in a folder of their own: without an address they stop, with one
            that cannot be cloned too, and with that of a clone they run
 
@@ -179,14 +179,14 @@ def wheel(shell: Shell, python: Path) -> None:
         shell.type(line, status=2, **variables)
 
 
-def readme_commands() -> list[str]:
-    """The commands of the program that the README shows, without their comments."""
-    lines = [line.partition(" # ")[0].strip() for line in (CHECKOUT / "README.md").read_text().splitlines()]
+def first_commands() -> list[str]:
+    """The commands of the program that docs/start.md shows, without their comments."""
+    lines = [line.partition(" # ")[0].strip() for line in (CHECKOUT / "docs" / "start.md").read_text().splitlines()]
     return [line for line in lines if line.startswith("jaxrl-vis ")]
 
 
 def tiny(line: str) -> str:
-    """A command of the README at tiny settings, and without the preset that would make it large."""
+    """A command of docs/start.md at tiny settings, and without the preset that would make it large."""
     words = shlex.split(line)
     if words[1] == "train" and "--resume" not in words:
         if "--preset" in words:
@@ -202,7 +202,7 @@ def tiny(line: str) -> str:
 
 
 def clone(shell: Shell, python: Path) -> None:
-    """From a clone, with make, and then what the README shows."""
+    """From a clone, with make, and then what docs/start.md shows."""
     shell.type(f"git clone --quiet {CHECKOUT} jaxrl-vis")
     shell.folder /= "jaxrl-vis"
     shell.type("make help", shows="make train")
@@ -210,9 +210,9 @@ def clone(shell: Shell, python: Path) -> None:
     shell.type(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/first", shows="video.gif")
     shell.type(".venv/bin/python --version", shows=f"Python {python.name.removeprefix('python')}")
     shell.activate(shell.folder / ".venv")
-    # What the README says next to the commands that need it.
+    # What the page says next to the commands that need it.
     shell.type(".uv/bin/uv pip install --quiet '.[tensorboard,wandb]'")
-    for line in readme_commands():
+    for line in first_commands():
         shell.type(tiny(line))
     untracked = shell.type("git status --porcelain")
     if untracked.strip():

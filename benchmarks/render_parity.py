@@ -6,7 +6,7 @@
 Every model of tests/render_models.py is drawn in N seeded random poses by both, with shadows, reflections and multisampling
 off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
 model that our renderer refuses is a row of the table like any other, with the reason. `--page` writes the table of the rows
-that --out holds into docs/renderer_parity.md. With a FOLDER of anyone's models (MJCF or URDF, at any depth) these are
+that --out holds into docs/lab/renderer_parity.md. With a FOLDER of anyone's models (MJCF or URDF, at any depth) these are
 compared, each at its start and in a scattered pose: see `rendering.model_folder`.
 """
 
@@ -36,7 +36,7 @@ from benchmarks.rendering import model_folder  # noqa: E402
 from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
-PAGE = ROOT / "docs" / "renderer_parity.md"
+PAGE = ROOT / "docs" / "lab" / "renderer_parity.md"
 BATCH = 10  # poses that we draw at a time
 COLUMNS = {
     "segmentation": ("segm %", 100.0, 3),

@@ -89,7 +89,7 @@ class Timed:
         A cycle is what lies between two evaluations. As in a run, the host reads the metrics of each iteration during the
         next one, and those of a cycle's last one during the evaluation, which it then waits for.
         """
-        programs, count = self.programs, self.config.eval_interval
+        programs, count = self.programs, self.config.run.eval_interval
         loop = programs.init(programs.run_keys) if self.loop is None else self.loop
         seconds = []
         for cycle in range(cycles + 1):
@@ -172,16 +172,16 @@ def check_resume(saved: Timed, others: list[Config], env: Any, single: Timed) ->
         start = time.perf_counter()
         checkpoints.save_full(1, saved.loop, {})
         took, expected = time.perf_counter() - start, words(saved.loop)
-        lines.append(f"saved on {saved.config.devices} devices in {took:.1f} s, {len(expected)} arrays")
+        lines.append(f"saved on {saved.config.run.devices} devices in {took:.1f} s, {len(expected)} arrays")
         for config in others:
-            programs = single.programs if config.devices == 1 else Programs(config, make_train_step(env, config))
+            programs = single.programs if config.run.devices == 1 else Programs(config, make_train_step(env, config))
             restored = checkpoints.restore_for_resume(programs.shapes)
             assert restored is not None and restored.loop is not None and restored.tier == FULL
             differing = [name for name, value in words(restored.loop).items() if value != expected[name]]
             if differing:
-                raise AssertionError(f"restored on {config.devices} devices, these differ: {', '.join(differing[:5])}")
-            lines.append(f"restored on {config.devices}: all bit-equal")
-            if config.devices == 1:
+                raise AssertionError(f"restored on {config.run.devices} devices, these differ: {', '.join(differing[:5])}")
+            lines.append(f"restored on {config.run.devices}: all bit-equal")
+            if config.run.devices == 1:
                 single.loop = restored.loop
                 single.run(1)
                 lines[-1] += ", and trained on"
@@ -211,7 +211,7 @@ def make_figures(base: Config, env: Any, numbers: list[int], batches: tuple[int,
     for count in numbers:
         figures.append(Figure("seeds", Timed(base.replace(seeds=seeds * count, devices=count), env, True), one_seeds))
         for batch, one in one_of.items():
-            sizes = {"batch_size": batch, "num_envs": base.num_envs, "replay_transitions": base.replay_transitions}
+            sizes = {"batch_size": batch, "num_envs": base.run.num_envs, "replay_transitions": base.run.replay_transitions}
             weak = base.replace(devices=count, **{name: size * count for name, size in sizes.items()})
             strong = base.replace(devices=count, batch_size=batch)
             figures += [Figure("weak", Timed(weak, env, False), one), Figure("strong", Timed(strong, env, False), one)]
@@ -232,23 +232,24 @@ def compare(kind: str, config: Config, one: list[float], seconds: list[float], i
     speedup = before / after * (1 if kind == "strong" else ideal)
     spread = max((max(cycles) - min(cycles)) / statistics.median(cycles) for cycles in (one, seconds))
     line = (
-        f"{kind:10}{config.devices:8}{config.seeds:7}{config.batch_size:8}{config.num_envs:6}{1e3 * before:11,.1f} ms"
+        f"{kind:10}{config.run.devices:8}{config.run.seeds:7}{config.run.batch_size:8}{config.run.num_envs:6}"
+        f"{1e3 * before:11,.1f} ms"
         f"{1e3 * after:11,.1f} ms{speedup:10.3f}{speedup / ideal:12.1%}{spread:9.1%}"
     )
     names = ("env", "preset", "image_size", "pixels", "num_envs", "batch_size", "seeds", "devices", "updates_per_iteration")
     compared = "one_process_ms" if kind == "processes" else "one_device_ms"
     details = {compared: 1e3 * before, "ms": 1e3 * after, "efficiency": speedup / ideal, "spread": spread}
     details = {name: round(value, 4) for name, value in details.items()} | {"repeats": len(seconds)}
-    described = {name: getattr(config, name) for name in names}
+    described = {name: config.value(name) for name in names}
     return line, Measurement(f"scaling/{kind}", round(speedup, 4), "x one device", described, details)
 
 
 def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
     """The time of an update's all-reduce: a line, and the record."""
-    train, count = figure.timed.programs.shapes.train, figure.timed.config.devices
+    train, count = figure.timed.programs.shapes.train, figure.timed.config.run.devices
     numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.agent.actor, train.agent.critic)))
     seconds = all_reduce_seconds(numbers, count)
-    updates = figure.timed.config.updates_per_iteration
+    updates = figure.timed.config.run.updates_per_iteration
     line = (
         f"all-reduce of {numbers:,} float32 over {count} devices: {1e6 * seconds:.1f} us, "
         f"{1e3 * seconds * updates:.1f} ms in the {updates} updates of an iteration"
@@ -268,7 +269,7 @@ def in_processes(figures: list[Figure], positions: list[int], times: list[list[f
     with socket.socket() as free:
         free.bind(("localhost", 0))
         place = ["--coordinator", f"localhost:{free.getsockname()[1]}", "--positions", *map(str, positions)]
-    half = figures[0].timed.config.devices // 2
+    half = figures[0].timed.config.run.devices // 2
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(map(str, range(2 * half)))).split(",")
     children = []
     for index in range(2):
@@ -364,12 +365,14 @@ def main() -> None:
     keep(HEAD)
     for figure in figures:
         times[id(figure)] = figure.timed.run(options.cycles)
-        ideal = figure.timed.config.devices
+        ideal = figure.timed.config.run.devices
         keep(*compare(figure.kind, figure.timed.config, times[id(figure.one)], times[id(figure)], ideal))
-        is_last = figure is [other for other in figures if other.timed.config.devices == figure.timed.config.devices][-1]
+        is_last = (
+            figure is [other for other in figures if other.timed.config.run.devices == figure.timed.config.run.devices][-1]
+        )
         if is_last:  # one learner, of the smallest batch
             keep(*measure_all_reduce(figure))
-            counts = (1, *(count for count in numbers if count < figure.timed.config.devices))
+            counts = (1, *(count for count in numbers if count < figure.timed.config.run.devices))
             for line in check_resume(
                 figure.timed, [figure.timed.config.replace(devices=count) for count in counts], env, figure.one
             ):
@@ -379,14 +382,15 @@ def main() -> None:
     write_records(options.json, watch, measurements)
     if numbers[-1] % 2 == 0:
         again = [
-            figure for figure in figures if figure.timed.config.devices == numbers[-1] and figure.kind in ("seeds", "weak")
+            figure for figure in figures if figure.timed.config.run.devices == numbers[-1] and figure.kind in ("seeds", "weak")
         ][:2]
         positions = [len(alone) + figures.index(figure) for figure in again]
         for line, measurement in in_processes(again, positions, [times[id(figure)] for figure in again]):
             keep(line, measurement)
     took = time.perf_counter() - began
     print(
-        f"\n{options.env}, preset fast, {base.image_size}x{base.image_size} {base.pixels}, on {there} x "
+        f"\n{options.env}, preset fast, {base.environment.image_size}x{base.environment.image_size} "
+        f"{base.environment.pixels}, on {there} x "
         f"{jax.devices()[0].device_kind}, JAX {jax.__version__}, {took:.0f} s\n"
     )
     print("\n".join(lines))

@@ -85,7 +85,7 @@ def parts(clock: Clock, options: argparse.Namespace) -> None:
         clock.lap(f"{name}: trace and lower")
         lowered.compile()
         clock.lap(f"{name}: compile")
-    episodes, _ = played_spec(program.env, programs.config.num_envs, len(programs.seeds))
+    episodes, _ = played_spec(program.env, programs.config.run.num_envs, len(programs.seeds))
     arguments = {  # JAX keeps what it traced, so what is part of something above takes less than it would alone
         "insert": (shapes.train, shapes.replay, episodes, keys, shapes.iteration),
         "update_many": (shapes.train, shapes.replay, keys, shapes.iteration),

@@ -10,13 +10,15 @@ import dataclasses
 import itertools
 import re
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.ledger.markers import fill
+from benchmarks.ledger.markers import WIDTH, fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
+from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.report.plots import show_steps
 from jaxrl_vis.run.storage.folder import read_record
@@ -83,7 +85,7 @@ def read_groups(studies: Path) -> dict[tuple[str, str, float], Group]:
 
 def _read_group(decay: float, folders: list[Path]) -> Group:
     records = [read_record(folder) for folder in folders]
-    assert all(record["config"]["target_decay"] == decay for record in records), folders
+    assert all(config_from_dict(record["config"]).ddpg.target_decay == decay for record in records), folders
     rows = [row for folder in folders for row in read_rows(folder / "metrics.jsonl") if SUCCESS in row]
     revisions = {f"{record['git_revision'][:7]} on {record['device']['kind']}" for record in records}
     return Group(rows, frozenset(revisions))
@@ -141,7 +143,8 @@ def tables(results: Path = RESULTS) -> str:
     groups = read_groups(results / "studies")
     parts = [line for task in TASKS for line in [*task_table(task, groups), ""]]
     revisions = sorted({text for group in groups.values() for text in group.revisions})
-    return "\n".join([*parts, *comparison_table(groups), "", f"Runs: {', '.join(revisions)}."]) + "\n"
+    runs = textwrap.fill(f"Runs: {', '.join(revisions)}.", WIDTH)
+    return "\n".join([*parts, *comparison_table(groups), "", runs]) + "\n"
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""Trains robots to reach goals given only as images.
+"""Training of robots that reach goals given only as images.
 
     config = jaxrl_vis.preset("fast", env="VisualFetchReach")
     trainer = jaxrl_vis.make_trainer(config)

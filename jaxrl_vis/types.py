@@ -147,7 +147,7 @@ class Statistics(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrainState(Replaceable):
-    """The learner: an agent, and observation statistics.
+    """State of the learner: an agent, and observation statistics.
 
     Attributes:
         agent: State of the algorithm, a pytree of its own (`learner.algorithm`).

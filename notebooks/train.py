@@ -18,7 +18,7 @@ def main(preset: str = "cpu", env: str = "VisualFetchReach", run_dir: str | None
     trainer = jaxrl_vis.make_trainer(config, run_dir=run_dir)
 
     # One iteration by hand: a rollout, then gradient steps. The first call compiles.
-    loop = trainer.init(jax.random.key(config.seed))
+    loop = trainer.init(jax.random.key(config.run.seed))
     loop, metrics = trainer.train_iteration(loop)
     print({name: float(value[0]) for name, value in metrics.items()})
     del loop, metrics  # the replay is large; run() makes its own

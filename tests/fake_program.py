@@ -33,7 +33,9 @@ _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)
 
 
 def small_config(**changes) -> Config:
-    config = Config(preset="debug", num_envs=2, env_steps=80, replay_transitions=30, image_size=SIZE, pixels="depth", seeds=2)
+    config = Config().replace(
+        preset="debug", num_envs=2, env_steps=80, replay_transitions=30, image_size=SIZE, pixels="depth", seeds=2
+    )
     looking = {"eval_interval": 2, "eval_episodes": 4, "checkpoint_interval": 2, "full_checkpoint_interval": 2}
     return config.replace(**(looking | changes))
 
@@ -49,18 +51,18 @@ class FakeProgram:
             control_period=0.04,
             horizon=HORIZON,
             frame_stack=1,
-            observation_spec=jax.ShapeDtypeStruct((1, config.image_size, config.image_size), jnp.uint8),
+            observation_spec=jax.ShapeDtypeStruct((1, config.environment.image_size, config.environment.image_size), jnp.uint8),
             goal_state_size=3,
             action_size=4,
         )
-        self.plays_any, self.part_size, self.exploration = False, config.num_envs, Exploration()
-        self.parts_spec = [played_spec(self.env, config.num_envs, config.seeds)]
-        self.steps_per_iteration = config.num_envs * HORIZON
+        self.plays_any, self.part_size, self.exploration = False, config.run.num_envs, Exploration()
+        self.parts_spec = [played_spec(self.env, config.run.num_envs, config.run.seeds)]
+        self.steps_per_iteration = config.run.num_envs * HORIZON
         self.updates_per_iteration = 3
-        self.num_iterations = math.ceil(config.env_steps / self.steps_per_iteration)
-        episodes = math.ceil(config.replay_transitions / self.steps_per_iteration) * config.num_envs
-        size = config.image_size
-        self.replay = make_replay(config.replay_transitions, config.num_envs, HORIZON)
+        self.num_iterations = math.ceil(config.run.env_steps / self.steps_per_iteration)
+        episodes = math.ceil(config.run.replay_transitions / self.steps_per_iteration) * config.run.num_envs
+        size = config.environment.image_size
+        self.replay = make_replay(config.run.replay_transitions, config.run.num_envs, HORIZON)
         self.replay_bytes = episodes * ((HORIZON + 2) * (size * size + 3 * 4) + HORIZON * 4 * 4) + 4
 
         def init_one(key):
@@ -85,9 +87,9 @@ class FakeProgram:
 
         def play_one(train, key):
             def spread(like):
-                count = jnp.arange(config.num_envs * math.prod(like.shape[1:]), dtype=jnp.uint32)
+                count = jnp.arange(config.run.num_envs * math.prod(like.shape[1:]), dtype=jnp.uint32)
                 words = (count * jnp.uint32(2654435761)) ^ (noise_of(key) * 2.0**24).astype(jnp.uint32)
-                values = ((words ^ (words >> 15)) >> 8).reshape((config.num_envs, *like.shape[1:]))
+                values = ((words ^ (words >> 15)) >> 8).reshape((config.run.num_envs, *like.shape[1:]))
                 return values.astype(like.dtype) if like.dtype == jnp.uint8 else values.astype(jnp.float32) / 2.0**24 - 0.5
 
             episodes, outcome = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), self.parts_spec[0])
@@ -98,7 +100,7 @@ class FakeProgram:
             noise = noise_of(jax.random.fold_in(loop.key, loop.iteration))
             ((new, _),) = parts
             old = loop.replay.episodes
-            start = (loop.iteration * config.num_envs) % episodes
+            start = (loop.iteration * config.run.num_envs) % episodes
             bad = loop.iteration == (-1 if nan_at is None else nan_at)
             if break_state:
                 new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
@@ -109,7 +111,7 @@ class FakeProgram:
             loss = jnp.where(bad, jnp.nan, step**2)
             critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, agent["critic"])
             train = loop.train.replace(agent=agent | {"actor": actor, "critic": critic, "updates": agent["updates"] + 3})
-            memory = ReplayState(replay, jnp.minimum(loop.replay.size + config.num_envs, episodes))
+            memory = ReplayState(replay, jnp.minimum(loop.replay.size + config.run.num_envs, episodes))
             metrics = {
                 "train/critic_loss": loss,
                 "train/success": jax.nn.sigmoid(loop.iteration / 3.0 - 1.0),

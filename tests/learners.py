@@ -24,7 +24,7 @@ _compiled = {}
 
 def _without(config, fields):
     plain = preset("debug")
-    return config.replace(**{field: getattr(plain, field) for field in fields})
+    return config.replace(**{field: plain.value(field) for field in fields})
 
 
 def begin(program, keys):
@@ -35,14 +35,14 @@ def begin(program, keys):
 
 
 def _parts(program, play, train, keys):
-    firsts = range(0, program.config.num_envs, program.part_size)
+    firsts = range(0, program.config.run.num_envs, program.part_size)
     return [play(train, keys, jnp.int32(first), program.exploration) for first in firsts]
 
 
 def rollout(program, train, keys):
     """Episodes [S, E, ...] and outcome of a rollout of training, with typed keys [S]."""
     parts = _parts(program, program.play, train, keys)
-    return jax.tree.map(lambda *leaves: join_parts(leaves, program.config.num_envs, axis=1), *parts)
+    return jax.tree.map(lambda *leaves: join_parts(leaves, program.config.run.num_envs, axis=1), *parts)
 
 
 def train_iteration(program, loop):
@@ -52,12 +52,12 @@ def train_iteration(program, loop):
 
 def experienced(program, key):
     """Arguments of ``program.update_many`` after one rollout, which programs share that differ in their updates only."""
-    assert program.config.normalizer_source == "rollouts"
+    assert program.config.study.normalizer_source == "rollouts"
     what = type(program.env), _without(program.config, _LATER)
     loop, keys = begin(program, key[None]), key[None]
     play = _compiled.setdefault(("play", *what), program.play)
     parts = _parts(program, play, loop.train, keys)
-    episodes, _ = jax.tree.map(lambda *leaves: join_parts(leaves, program.config.num_envs, axis=1), *parts)
+    episodes, _ = jax.tree.map(lambda *leaves: join_parts(leaves, program.config.run.num_envs, axis=1), *parts)
     insert = _compiled.setdefault(("insert", *what), program.insert)
     return *insert(loop.train, loop.replay, episodes, keys, loop.iteration), keys, loop.iteration
 

@@ -44,6 +44,56 @@ def read_calibration(folder: Path) -> None:
     assert type(found.width) is int and 1 <= found.width <= 100_000 and 1 <= found.height <= 100_000
 
 
+def read_cameras(folder: Path) -> None:
+    """What any program says of two cameras, rectified or not."""
+    from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair
+    from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import read_cameras
+
+    files = list(folder.iterdir())
+    found = read_cameras(files[0] if len(files) == 1 else folder)
+    arrays = (found.matrices, found.distortions, found.rotation) if isinstance(found, RawPair) else (found.left, found.right)
+    assert all(np.isfinite(array).all() for array in arrays)
+    assert found.size is None or all(type(side) is int and 1 <= side <= 100_000 for side in found.size)
+
+
+def _recognised(path: Path) -> None:
+    from jaxrl_vis.stalks.phenotyping.io.calibrations import kitti, middlebury, ros, zed
+
+    text = documents.read_text(path, 2_000_000)
+    known = (middlebury.is_middlebury, kitti.is_kitti, zed.is_settings, ros.from_print, ros.from_table, ros.from_sections)
+    if not any(recognise(text) for recognise in known):
+        _storage(path)
+
+
+def read_plan(folder: Path) -> None:
+    from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import read_field_plan
+
+    columns, plan = read_field_plan(_only(folder), [f"plot_{name}" for name in PAIRS])
+    assert plan and all(set(values) == set(columns) for values in plan.values())
+
+
+def _plan(path: Path) -> None:
+    from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
+
+    assert cells(path, read_table_text(path, 1_000_000))[1]
+
+
+def read_any_annotations(folder: Path) -> None:
+    """Annotations beside an image of their size."""
+    import cv2
+
+    (folder / "a.png").write_bytes(cv2.imencode(".png", np.full(ANNOTATED, 90, np.uint8))[1].tobytes())
+    read_annotations(folder)
+
+
+def _any_annotations(path: Path) -> None:
+    data = path.read_bytes()
+    if path.suffix == ".txt":
+        assert [float(word) for word in data.decode().split()]
+    else:
+        (documents.parse_xml if path.suffix == ".xml" else documents.parse_json)(data)
+
+
 def _storage(path: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 
@@ -69,7 +119,8 @@ def read_annotations(folder: Path) -> None:
 
 
 def read_odometry(folder: Path) -> None:
-    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
+    from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 
     pairs = tuple(PairFiles(name, folder / f"left_{name}.png", folder / f"right_{name}.png") for name in PAIRS)
     plot = PlotFolder("plot", folder, pairs)
@@ -84,7 +135,7 @@ def read_odometry(folder: Path) -> None:
 
 def _table(path: Path) -> None:
     head = next(csv.reader(io.StringIO(path.read_bytes().decode("utf-8-sig"), newline="")))
-    assert {"distance_m", "time_s", "left"} & set(head)
+    assert {"distance_m", "time_s", "left", "x", "latitude"} & set(head)
 
 
 def read_image(folder: Path) -> None:
@@ -106,7 +157,8 @@ def read_image(folder: Path) -> None:
 
 def read_names(folder: Path) -> None:
     """Plots of a folder of empty files: each image is at most one side of one pair, and what is not found is no pair's."""
-    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometries
+    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
+    from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 
     plots = find_plots(folder)
     pairs = [(plot, pair) for plot in plots for pair in plot.pairs]
@@ -232,6 +284,9 @@ def _pair_errors() -> tuple[type[Exception], ...]:
 _REQUEST = (RequestError,)
 READERS = {
     "calibration": Reader(read_calibration, _parses(_storage), _REQUEST),
+    "cameras": Reader(read_cameras, _parses(_recognised), _REQUEST),
+    "plan": Reader(read_plan, _parses(_plan), _REQUEST),
+    "annotations": Reader(read_any_annotations, _parses(_any_annotations), _REQUEST),
     "coco": Reader(read_annotations, _parses(documents.read_json), _REQUEST),
     "voc": Reader(read_annotations, _parses(lambda path: documents.parse_xml(path.read_bytes())), _REQUEST),
     "labelme": Reader(read_annotations, _parses(documents.read_json), _REQUEST),

@@ -82,7 +82,7 @@ class Emulated(Layout):
 def trained(config, layout=None, iterations=3):
     """The program, the last loop state, and the metrics of all iterations and of an evaluation."""
     program = make_train_step(ENV, config, layout)
-    keys = jnp.stack([jax.random.key(seed) for seed in range(config.seeds)])
+    keys = jnp.stack([jax.random.key(seed) for seed in range(config.run.seeds)])
     loop, found = program.init(program.layout.put(keys, program.layout.by_seed)), []
     for _ in range(iterations):
         loop, metrics = train_iteration(program, loop)
@@ -136,7 +136,7 @@ def resumed(loop, folder, program):
     """An iteration on one device, after what two devices have saved."""
     checkpoints = Checkpoints(Path(folder), say=lambda line: None)
     checkpoints.save_full(3, loop, {})
-    restored = checkpoints.restore_for_resume(jax.eval_shape(program.init, jnp.stack([jax.random.key(0)] * CONFIG.seeds)))
+    restored = checkpoints.restore_for_resume(jax.eval_shape(program.init, jnp.stack([jax.random.key(0)] * CONFIG.run.seeds)))
     checkpoints.close()
     after, metrics = train_iteration(program, restored.loop)
     return int(after.iteration), all(np.isfinite(values).all() for values in metrics.values())

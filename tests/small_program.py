@@ -5,11 +5,10 @@ import dataclasses
 import functools
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import HOST, Config, marked
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import JIT_OPTIONS
-from jaxrl_vis.run.compiled.trace_cache import HOST_FIELDS
 from jaxrl_vis_envs.base import GoalEnv
 
 _TRACES: collections.Counter[Config] = collections.Counter()
@@ -17,7 +16,7 @@ _TRACES: collections.Counter[Config] = collections.Counter()
 
 def _trained_alike(config: Config) -> Config:
     defaults = Config()
-    return config.replace(**{name: getattr(defaults, name) for name in HOST_FIELDS})
+    return config.replace(**{name: defaults.value(name) for name in marked(HOST)})
 
 
 @functools.cache

@@ -5,7 +5,7 @@
     ol_aux       tables of the study of auxiliary losses (figures 5.4 to 5.7)
     indicator    tables of the study of rewards without ground truth (figures 5.1, 5.2, estimators, cameras)
     ablations    tables of single runs with one option changed
-    thesis       claims of the thesis beside the records, for docs/claims.md and in short for README and index
+    thesis       claims of the thesis beside the records, for docs/claims.md and in short for the README
     prose        sentences that quote numbers, compared with their pages
     sentences    these sentences, computed
     pages        all tables, by page and marker

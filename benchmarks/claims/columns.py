@@ -42,6 +42,11 @@ def p_value(first: Record, second: Record, budget: int | None = None) -> float:
     return permutation_p_value(first.means(budget), second.means(budget))
 
 
+def show_p(value: float) -> str:
+    """Format a p-value with three decimals; ``< 0.001`` below that."""
+    return "< 0.001" if value < 0.0005 else f"{value:.3f}"
+
+
 def verdict(record: Record, reference: Record, budget: int | None = None) -> str:
     """``better``, ``worse`` or ``level``: the first two only where the permutation test says so."""
     if p_value(record, reference, budget) > SIGNIFICANT:
@@ -193,7 +198,7 @@ def p(reference: Record, label: str, budget: int | None = None) -> Column:
     """p-value of the permutation test of mean success against a reference."""
 
     def cell(record: Record) -> str:
-        return "" if record is reference else _of_seeds(record, lambda: f"{p_value(record, reference, budget):.3f}")
+        return "" if record is reference else _of_seeds(record, lambda: show_p(p_value(record, reference, budget)))
 
     return Column(f"p against {label}", cell)
 

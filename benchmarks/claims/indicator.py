@@ -94,7 +94,7 @@ def _cameras() -> str:
 
     def p_cell(record: Record) -> str:
         reference = ours if record.name.partition("-")[2].startswith(("ours", OURS)) else oracle
-        return "" if record is reference else f"{c.p_value(record, reference):.3f}"
+        return "" if record is reference else c.show_p(c.p_value(record, reference))
 
     columns = [c.final(), c.final_distance(), c.mean_success(), c.Column("p against plain images", p_cell)]
     return table([f"{FETCH}, {show_steps(oracle.end)} steps"], _rows(FETCH, own), columns)
@@ -112,7 +112,7 @@ def _main() -> str:
             rows.append(Row(f"{task}, {show_steps(record.end)} steps" if variant == "oracle" else "", record, [label]))
 
     def p_cell(record: Record) -> str:
-        return "" if record is oracles[record] else f"{c.p_value(record, oracles[record]):.3f}"
+        return "" if record is oracles[record] else c.show_p(c.p_value(record, oracles[record]))
 
     columns = [
         c.final(SUCCESS),

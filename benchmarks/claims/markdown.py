@@ -2,10 +2,12 @@
 
 import collections
 import dataclasses
+import textwrap
 from collections.abc import Sequence
 
 from benchmarks.claims.columns import Column
 from benchmarks.claims.records import Record
+from benchmarks.ledger.markers import WIDTH
 
 NO_RECORD = "no record kept"
 
@@ -49,7 +51,7 @@ def made_by(records: Sequence[Record]) -> str:
         devices[device].add(revision)
     parts = [f"{', '.join(sorted(revisions))} on {device}" for device, revisions in sorted(devices.items())]
     some = "" if all(record.made for record in records) else " (records that say so)"
-    return f"Made by {'; '.join(parts)}{some}." if parts else ""
+    return textwrap.fill(f"Made by {'; '.join(parts)}{some}.", WIDTH) if parts else ""
 
 
 def _line(cells: Sequence[str]) -> str:

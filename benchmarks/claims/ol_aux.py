@@ -165,7 +165,7 @@ def _main() -> str:
 
     def p_cell(record: Record) -> str:
         reference, budget = base[record]
-        return "" if record is reference else f"{c.p_value(record, reference, budget):.3f}"
+        return "" if record is reference else c.show_p(c.p_value(record, reference, budget))
 
     columns = [
         c.seeds(),

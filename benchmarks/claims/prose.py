@@ -26,7 +26,8 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "docs/learner.md": ("with 0.1 the finger", "0.6 of the time", "near 0.5 with balancing and about 0.08 without"),
     "docs/claims.md": (),
     "docs/index.md": (),
-    "README.md": ("JAX 0.11",),
+    "docs/lab/results.md": (),
+    "README.md": (),
 }
 """Page -> numbers in its sentences that are settings, laws, speeds or properties of tasks, not figures of learning records."""
 

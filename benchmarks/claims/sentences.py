@@ -15,7 +15,8 @@ from benchmarks.claims.records import DISTANCE, Record, ablation, learning, stud
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
 
-DECAY, GUIDE, REWARDS = "docs/lab/target_decay.md", ol_aux.GUIDE, indicator.GUIDE
+DECAY, RESULTS = "docs/lab/target_decay.md", "docs/lab/results.md"
+GUIDE, REWARDS = ol_aux.GUIDE, indicator.GUIDE
 
 
 def _all(verdict: str, records: Sequence[Record], reference: Record) -> bool:
@@ -23,11 +24,30 @@ def _all(verdict: str, records: Sequence[Record], reference: Record) -> bool:
 
 
 def _p(first: Record, second: Record, budget: int | None = None) -> str:
-    return f"p = {c.p_value(first, second, budget):.3f}"
+    shown = c.show_p(c.p_value(first, second, budget))
+    return f"p {shown}" if shown.startswith("<") else f"p = {shown}"
 
 
 def _distance(record: Record, task: str) -> str:
     return f"{mean_difference(record.points, released_curves()[task, 'none']):.3f}"
+
+
+def _logarithm() -> Iterator[Sentence]:
+    alone, ours, none = (
+        {task: ol_aux.claim(task, name) for task in (FETCH, HAND, FINGER)} for name in ("none_log", "ol_aux_5", "none")
+    )
+    name, budgets = alone[HAND].name, ol_aux.BUDGETS
+    against_ours = {task: f"({_p(alone[task], ours[task], budgets[task])})" for task in budgets}
+    verdicts = {task: c.verdict(alone[task], ours[task], budgets[task]) for task in budgets}
+    quote = f"seeds) is better than OL-AUX-5 on FetchReach {against_ours[FETCH]}, where"
+    yield Sentence(LAB, quote, alone[FETCH].name, verdicts[FETCH] == "better")
+    quote = f"better than none ({_p(alone[HAND], none[HAND], budgets[HAND])}) and worse than OL-AUX-5 {against_ours[HAND]},"
+    is_better = c.verdict(alone[HAND], none[HAND], budgets[HAND]) == "better"
+    yield Sentence(LAB, quote, name, is_better and verdicts[HAND] == "worse")
+    p = _p(alone[FINGER], none[FINGER], budgets[FINGER])
+    quote = f"on the finger level with none ({p}) and worse than OL-AUX-5 {against_ours[FINGER]}"
+    is_level = c.verdict(alone[FINGER], none[FINGER], budgets[FINGER]) == "level"
+    yield Sentence(LAB, quote, alone[FINGER].name, is_level and verdicts[FINGER] == "worse")
 
 
 def _weightings() -> Iterator[Sentence]:
@@ -81,7 +101,7 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(LAB, f"better than `paper` ({_p(several, ten, 240_000)})", several.name)
     first_five = float(np.median(ten.at(100_000)[:5]))
     three = (none[FETCH].median(100_000), learning("fetch_reach_paper").median(100_000), first_five)
-    for page in (LAB, "README.md"):
+    for page in (LAB, RESULTS):
         yield Sentence(page, "have {:.2f}, {:.2f} and {:.2f} at 100 k steps".format(*three), ten.name)
 
 
@@ -299,5 +319,16 @@ def _decays() -> Iterator[Sentence]:
 
 def sentences() -> list[Sentence]:
     """All registered sentences."""
-    parts = (_weightings, _single_tasks, _indicator, _parts_of_the_method, _choices, _options, _fast, _devices, _decays)
+    parts = (
+        _weightings,
+        _logarithm,
+        _single_tasks,
+        _indicator,
+        _parts_of_the_method,
+        _choices,
+        _options,
+        _fast,
+        _devices,
+        _decays,
+    )
     return [sentence for part in parts for sentence in part()]

@@ -1,10 +1,11 @@
 """Ledger: the stored records in benchmarks/results, the tables that are written from them, and their age.
 
     records          reading of records                      evidence     training runs behind learning figures
-    readme_rows      rows of the README's tables             staleness    records that are older than the measured code
-    readme_tables    tables of the README                    ablations    learning curves of the ablations, one table
-    scaling_table    tables of docs/scaling.md               render_table tables of docs/renderer_speed.md
-    pages            every page with tables from records     markers      position of a table in its page
+    result_rows      rows of docs/lab/results.md             staleness    records that are older than the measured code
+    result_tables    tables of docs/lab/results.md           ablations    learning curves of the ablations, one table
+    comparison_table figures of the README beside others'    render_table tables of docs/lab/renderer_speed.md
+    scaling_table    tables of docs/scaling.md               markers      position of a table in its page
+    pages            every page with tables from records
 
     python -m benchmarks.ledger tables     write the tables of README and docs (`make tables`)
     python -m benchmarks.ledger stale      list stale records, rows without a record, and outdated tables (`make stale`)

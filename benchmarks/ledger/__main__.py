@@ -2,21 +2,21 @@
 
 python -m benchmarks.ledger tables         write the tables of README and docs
 python -m benchmarks.ledger stale          list stale records, rows without a record, and outdated tables; exit 1 for any
-python -m benchmarks.ledger keep RUN NAME  store the evaluations of a run under a name of `readme_rows.LEARNING`
+python -m benchmarks.ledger keep RUN NAME  store the evaluations of a run under a name of `result_rows.LEARNING`
 """
 
 import argparse
 import sys
 from pathlib import Path
 
-from benchmarks.ledger import evidence, pages, readme_tables, staleness
+from benchmarks.ledger import evidence, pages, result_tables, staleness
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 
 
 def complaints(results: Path, checkout: Path) -> list[str]:
-    """List stale records, rows of the README without one, and pages with outdated tables, one line each.
+    """List stale records, rows of docs/lab/results.md without one, and pages with outdated tables, one line each.
 
     Args:
         results: Folder of records.
@@ -28,8 +28,8 @@ def complaints(results: Path, checkout: Path) -> list[str]:
     lines = []
     if provenance.is_checkout(checkout):
         lines += [str(stale) for stale in staleness.stale_records(results, checkout)]
-    if (checkout / "README.md").exists():
-        lines += [f"README.md: {complaint}" for complaint in readme_tables.missing_rows(results)]
+    if (checkout / result_tables.PAGE).exists():
+        lines += [f"{result_tables.PAGE}: {complaint}" for complaint in result_tables.missing_rows(results)]
     return lines + list(pages.outdated(results, checkout))
 
 

@@ -17,8 +17,8 @@ import statistics
 from pathlib import Path
 from typing import Any, Self
 
-from benchmarks.ledger.readme_tables import short
 from benchmarks.ledger.records import RESULTS
+from benchmarks.ledger.result_tables import short
 
 FILE = "ablations.jsonl.gz"
 UNKNOWN = "unknown"

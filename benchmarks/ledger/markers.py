@@ -4,6 +4,9 @@ import re
 
 from jaxrl_vis.errors import RequestError
 
+WIDTH = 127
+"""Columns of the prose of a page."""
+
 
 def fill(text: str, name: str, table: str) -> str:
     """Return ``text`` with ``table`` between the markers of ``name``.

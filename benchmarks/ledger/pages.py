@@ -5,7 +5,7 @@ from pathlib import Path
 
 from benchmarks import target_decay
 from benchmarks.claims import pages as claims
-from benchmarks.ledger import ablations, readme_tables, render_table, scaling_table
+from benchmarks.ledger import ablations, comparison_table, render_table, result_tables, scaling_table
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
@@ -16,7 +16,7 @@ Writer = Callable[[Path], str | None]
 
 
 def renderer_parity(results: Path) -> str:
-    """Write the table of docs/renderer_parity.md."""
+    """Write the table of docs/lab/renderer_parity.md."""
     from benchmarks import render_parity  # imports the models of the tests
 
     return render_parity.table(render_parity.read_rows(results / render_parity.TARGET.name))
@@ -31,11 +31,13 @@ def soak(results: Path) -> str | None:
 
 
 PAGES: dict[str, dict[str, Writer]] = {
-    "README.md": {"results table": readme_tables.results_table, "speed table": readme_tables.speed_table},
+    "README.md": {"comparison": comparison_table.comparison_table},
+    "docs/index.md": {"comparison": comparison_table.comparison_table},
+    "docs/lab/results.md": {"results table": result_tables.results_table, "speed table": result_tables.speed_table},
     "docs/scaling.md": {"devices": scaling_table.devices_table, "processes": scaling_table.processes_table},
-    "docs/renderer_speed.md": {"warp": render_table.warp_table, "mujoco": render_table.mujoco_table},
+    "docs/lab/renderer_speed.md": {"warp": render_table.warp_table, "mujoco": render_table.mujoco_table},
     "docs/reliability.md": {"soak": soak},
-    "docs/renderer_parity.md": {"table": renderer_parity},
+    "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }

@@ -1,9 +1,9 @@
-"""Tables of docs/renderer_speed.md, written from the records of other renderers beside ours on the same poses."""
+"""Tables of docs/lab/renderer_speed.md, written from the records of other renderers beside ours on the same poses."""
 
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ledger.readme_tables import short
+from benchmarks.ledger.result_tables import short
 from jaxrl_vis.bench.record import load
 
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"

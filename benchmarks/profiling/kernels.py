@@ -21,9 +21,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis import fields, preset
+from jaxrl_vis import preset
 from jaxrl_vis.bench.update import seed_keys, start
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, fields
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.learner.environment import make_env
@@ -117,7 +117,9 @@ def measure(program: TrainStep, asked: argparse.Namespace, options: dict[str, An
     episodes = compiled["rollout"](*playing)[0] if "insert" in parts else None
     for part in parts:
         _, _, turns, what = arguments[part]
-        report(f"{what} of {program.config.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order)
+        report(
+            f"{what} of {program.config.run.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order
+        )
 
 
 def parse_compiler_options(words: list[str]) -> dict[str, Any]:

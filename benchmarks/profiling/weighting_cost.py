@@ -55,7 +55,7 @@ class Problem:
     def params(self, key: jax.Array) -> dict[str, Any]:
         """The critic's, and a linear head for each auxiliary loss."""
         critic_key, *keys = jax.random.split(key, 1 + len(self.names))
-        width = 2 * self.networks.config.latent_size
+        width = 2 * self.networks.config.network.latent_size
         heads = {
             name: jax.random.normal(key, (width, TARGETS)) / width**0.5 for name, key in zip(self.names, keys, strict=True)
         }

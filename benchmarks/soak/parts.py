@@ -96,13 +96,15 @@ class Part:
     ) -> "Part":
         """Start any command, which works beside ``folder``."""
 
-        def limit() -> None:
+        def prepare() -> None:
+            for number in (signal.SIGINT, signal.SIGHUP):  # ignored if the soak was started in the background
+                signal.signal(number, signal.SIG_DFL)
             if file_bytes is not None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, resource.RLIM_INFINITY))
 
         process = subprocess.Popen(
             command, env=environment() | (variables or {}), cwd=folder.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True, errors="replace", start_new_session=True, preexec_fn=limit,
+            text=True, errors="replace", start_new_session=True, preexec_fn=prepare,
         )  # fmt: skip
         part = cls(folder, process)
         part.reader.start()

@@ -113,7 +113,7 @@ class Soak:
 
     def _one_run(self, folder: Path, dice: random.Random, faults: list[str]) -> bool:
         """One run to its end; False where no fault is left for it."""
-        spoilt = False
+        spoilt, fault = False, None
         while len(faults) < FAULTS_PER_RUN:
             fault = self._next(FAULTS)
             if fault is None:
@@ -130,8 +130,9 @@ class Soak:
             if folder.exists() and not (FAULTS[fault].spoils or FAULTS[fault].goes_back):
                 self._check_kept(folder, before, good[-1][0] if good else 0)
             self._struck(folder.name, fault, f"status {status}")
-        if not faults:
-            return False
+        if not faults:  # there was nothing to strike, or it is time to end
+            shutil.rmtree(folder, ignore_errors=True)
+            return fault is not None
         with killed_afterwards(Part.start(folder)) as part:
             if (status := part.end()) != 0:
                 raise Broken(f"it did not finish: status {status}, {part.lines[-5:]}")

@@ -4,7 +4,7 @@ Links that leave docs/ (to a notebook, a record, a test) work in the checkout. T
 the path takes the place of the link.
 
 Columns of tables get no narrower than their text can be read in: `site.css` looks for the class ``long``. Long names in code
-may be broken at their dots and underscores.
+may be broken at their dots and underscores. On a phone, rows of wide tables are shown as cards.
 
 Search runs in a worker, which browsers refuse to start from a file: a page without a server starts one from the worker's text.
 """
@@ -15,26 +15,31 @@ import re
 from pathlib import Path
 from typing import Any
 
-_LINK_OUT_OF_DOCS = re.compile(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+([^)#]+)\)")
 
+def name_files_outside(markdown: str, depth: int = 0) -> str:
+    """Replace ``[text](../path)``, a link out of docs/, by ``text``, and the path in code unless the text names it already.
 
-def name_files_outside(markdown: str) -> str:
-    """``[text](../path)`` becomes ``text``, and the path in code unless the text names it already."""
+    Args:
+        markdown: Text of a page.
+        depth: Number of folders between docs/ and the page.
+    """
+    link_out_of_docs = re.compile(rf"(?<!!)\[([^\]]+)\]\((?:\.\./){{{depth + 1}}}([^)#]+)\)")
 
     def named(link: re.Match[str]) -> str:
         text, path = link.group(1).strip("`"), link.group(2)
         return f"`{path}`" if text == path else f"{text} (`{path}`)"
 
-    return _LINK_OUT_OF_DOCS.sub(named, markdown)
+    return link_out_of_docs.sub(named, markdown)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Called by mkdocs for the text of every page."""
-    return markdown if page.file.src_uri.startswith("api/") else name_files_outside(markdown)
+    uri = page.file.src_uri
+    return markdown if uri.startswith("api/") else name_files_outside(markdown, uri.count("/"))
 
 
 _CELL = re.compile(r"<(t[dh])\b([^>]*)>(.*?)</\1>", re.DOTALL)
-_LONG_TEXT, _LONG_NAME = 40, 24  # letters
+_LONG_TEXT, _LONG_NAME = 40, 20  # letters
 
 
 def fit_cells(content: str) -> str:
@@ -57,9 +62,36 @@ def fit_cells(content: str) -> str:
     return _CELL.sub(fitted, content)
 
 
+_TABLE = re.compile(r"<table>.*?</table>", re.DOTALL)
+_HEAD = re.compile(r"<th\b[^>]*>(.*?)</th>", re.DOTALL)
+_ROW = re.compile(r"<tr>(.*?)</tr>", re.DOTALL)
+
+
+def label_cells(content: str) -> str:
+    """Give wide tables of HTML from `fit_cells` the attribute ``data-cards``, and each of their cells its column's title.
+
+    On a phone, `site.css` shows a row of such a table as a card: one line per cell, which begins with the title.
+    """
+
+    def labelled(table: re.Match[str]) -> str:
+        heads = [html.escape(html.unescape(re.sub(r"<[^>]*>", "", head)), quote=True) for head in _HEAD.findall(table[0])]
+        rows = [re.findall(r"<td\b[^>]*>", row) for row in _ROW.findall(table[0])]
+        has_long = any('class="long"' in cell for row in rows for cell in row)
+        if len(heads) < 3 or not has_long:
+            return table[0]
+
+        def row_with_labels(row: re.Match[str]) -> str:
+            titles = iter(heads)
+            return re.sub(r"<td\b", lambda _: f'<td data-label="{next(titles, "")}"', row[0])
+
+        return _ROW.sub(row_with_labels, table[0].replace("<table>", "<table data-cards>", 1))
+
+    return _TABLE.sub(labelled, content)
+
+
 def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Called by mkdocs for the HTML of every page."""
-    return html if page.file.src_uri.startswith("api/") else fit_cells(html)
+    return html if page.file.src_uri.startswith("api/") else label_cells(fit_cells(html))
 
 
 _WORKER = """if (location.protocol === "file:") {

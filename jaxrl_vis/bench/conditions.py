@@ -50,7 +50,7 @@ def busy_cores() -> float | None:
 
 
 def _busy_seconds() -> float | None:
-    """Seconds of work of this process's cores since boot, over all programs; None if unknown."""
+    """Return the busy time of this process's cores since boot, in seconds over all programs; None if unknown."""
     if not (hasattr(os, "sched_getaffinity") and os.path.exists("/proc/stat")):
         return None
     allowed, total = os.sched_getaffinity(0), 0
@@ -89,7 +89,7 @@ class Work:
 
 
 def calibrations() -> dict[str, Work]:
-    """Workloads of `calibrate` by the name of the figure."""
+    """Return the workloads of `calibrate` by the name of the figure."""
     on_cpu = jax.default_backend() == "cpu"
     size, length = (384, 2**22) if on_cpu else (4096, 2**27)
     matrix = jnp.ones((size, size), jnp.float32 if on_cpu else jnp.bfloat16)
@@ -105,7 +105,7 @@ def calibrations() -> dict[str, Work]:
 
 
 def _seconds(call: Callable[[], Any]) -> float:
-    """Median seconds of a call over a few repeats of many calls."""
+    """Time a call: median seconds over a few repeats of many calls."""
 
     def seconds_per_call(calls: int) -> float:
         start = time.perf_counter()
@@ -161,7 +161,7 @@ def why_not_comparable(new: dict[str, Any] | None, old: dict[str, Any] | None) -
 
 
 def speed_ratio(new: dict[str, float], old: dict[str, float]) -> float:
-    """Ratio of two calibrations that is farthest from 1."""
+    """Return the ratio of two calibrations that is farthest from 1."""
     return max((new[name] / old[name] for name in old), key=lambda ratio: abs(ratio - 1))
 
 

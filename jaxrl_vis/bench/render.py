@@ -50,7 +50,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                     name="render/images",
                     value=count / timing.median_s,
                     unit="images/s",
-                    config={"env": settings.env, "image_size": size, "pixels": output, "envs": count},
+                    config=dict(env=settings.env, image_size=size, pixels=output, envs=count),
                     details=timing.details(compile_s),
                 )
 

@@ -40,14 +40,14 @@ def encoder_products(networks: Networks) -> tuple[int, int]:
     if not networks.sees_images:
         return 0, 0
     channels, height, width = networks.observation_spec.shape
-    filters = networks.config.encoder_filters
+    filters = networks.config.network.encoder_filters
     blocks = (height >> len(filters)) * (width >> len(filters))
     layers = []
     for level, outputs in enumerate(filters, start=1):
         pixels = blocks * 4 ** (len(filters) - level)
         layers.append(pixels * 4 * channels * outputs)
         channels = outputs
-    layers.append(blocks * channels * networks.config.latent_size)
+    layers.append(blocks * channels * networks.config.network.latent_size)
     return sum(layers), layers[0]
 
 
@@ -74,13 +74,13 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     """
     config = networks.config
     encoder, first_layer = encoder_products(networks)
-    spec, hidden, actions = networks.observation_spec, config.hidden_sizes, networks.action_size
-    latent = config.latent_size if networks.sees_images else math.prod(spec.shape)
+    spec, hidden, actions = networks.observation_spec, config.network.hidden_sizes, networks.action_size
+    latent = config.network.latent_size if networks.sees_images else math.prod(spec.shape)
     actor_head = head_products((2 * latent, *hidden, actions))
     critic_head = head_products((2 * latent + actions, *hidden, 1))
-    separate, actor_share = config.encoders == "separate", 1.0 / config.actor_interval
+    separate, actor_share = config.network.encoders == "separate", 1.0 / config.ddpg.actor_interval
     learned = 2 * (3 * encoder - first_layer)
-    followed = (2 if config.target_encoder else 1) * encoder
+    followed = (2 if config.network.target_encoder else 1) * encoder
     critic_products = learned + followed + (1 + 3) * critic_head
     actor_products = (followed if separate else 0) + actor_head
     actor_step_products = (learned if separate else 0) + 3 * actor_head + 2 * critic_head
@@ -89,7 +89,7 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     images = 3 * batch_size * math.prod(spec.shape) * spec.dtype.itemsize
     actor, critic = params
     online = _bytes(critic) + actor_share * _bytes(actor)
-    targets = sum(_bytes(network if config.target_encoder else network["head"]) for network in (actor, critic))
+    targets = sum(_bytes(network if config.network.target_encoder else network["head"]) for network in (actor, critic))
     return Cost(flops=2.0 * batch_size * products, bytes=images + (2 + 4) * online + 2 * targets)
 
 

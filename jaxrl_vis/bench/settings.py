@@ -69,7 +69,7 @@ class Settings:
         Raises:
             RequestError: There is no such environment, or it refuses the settings.
         """
-        images = {"image_size": self.image_size, "pixels": self.pixels, **overrides}
+        images = dict(image_size=self.image_size, pixels=self.pixels) | overrides
         try:
             return registry.make(self.env, **(images if self.has_images else {}))
         except ValueError as error:
@@ -79,7 +79,7 @@ class Settings:
         """Entries of a record for the measured environment."""
         if not self.has_images:
             return {"env": self.env}
-        return {"env": self.env, "image_size": self.image_size, "pixels": self.pixels}
+        return dict(env=self.env, image_size=self.image_size, pixels=self.pixels)
 
     def preset_config(self) -> dict[str, str]:
         """Entry of a record for the preset; empty for the default of the device."""
@@ -99,4 +99,4 @@ class Settings:
         """Entries of a record for auxiliary losses; empty without them."""
         if self.weighting == "none":
             return {}
-        return {"weighting": self.weighting, "aux_tasks": " ".join(self.aux_tasks)}
+        return dict(weighting=self.weighting, aux_tasks=" ".join(self.aux_tasks))

@@ -23,7 +23,7 @@ from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.update import seed_keys, time_updates, training_config
-from jaxrl_vis.config import Config, data_devices_of
+from jaxrl_vis.config import Config, data_devices
 from jaxrl_vis.learner.acting.rollout_parts import join_parts
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.run.compiled.programs import Programs
@@ -73,7 +73,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
 
 
 def _settled(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
-    """Return the call, synchronised if several devices of a CPU share its threads: two calls could wait for each other."""
+    """Wrap a call to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
     if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
         return call
     return lambda: jax.block_until_ready(call())
@@ -93,7 +93,7 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     program, iteration = programs.program, loop.iteration
     keys, key = seed_keys(program, 3), jax.random.key(4)
     evaluation = measure_time(_settled(program, lambda: programs.evaluate(loop.train, key)), repeats)
-    num_envs = programs.config.num_envs
+    num_envs = programs.config.run.num_envs
 
     def play() -> tuple[Episodes, Metrics]:
         return jax.tree.map(lambda *leaves: join_parts(leaves, num_envs, axis=1), *programs.play(loop.train, keys))
@@ -114,7 +114,7 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
         "rollout": rollout.median_s,
         "insert": inserted.median_s,
         "updates": updates.median_s,
-        "evaluation": evaluation.median_s / program.config.eval_interval,
+        "evaluation": evaluation.median_s / program.config.run.eval_interval,
     }
 
 
@@ -127,15 +127,15 @@ def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
 
 
 def share_of_one(config: Config) -> Config:
-    """Configuration of one device's share of a run, as a run on one device."""
-    parts = data_devices_of(config)
+    """Return the configuration of one device's share of a run, as a run on one device."""
+    parts = data_devices(config)
     return config.replace(
         devices=1,
         data_devices=None,
-        seeds=config.seeds * parts // config.devices,
-        num_envs=config.num_envs // parts,
-        batch_size=config.batch_size // parts,
-        replay_transitions=config.replay_transitions // parts,
+        seeds=config.run.seeds * parts // config.run.devices,
+        num_envs=config.run.num_envs // parts,
+        batch_size=config.run.batch_size // parts,
+        replay_transitions=config.run.replay_transitions // parts,
     )
 
 
@@ -156,22 +156,23 @@ def measure(settings: Settings) -> Iterator[Measurement]:
         parts = {**time_parts(programs, loop, settings.repeats), "host": seconds["host"]}
         del loop
         efficiency = (
-            {} if config.devices == 1 else {"efficiency": round(_time_share(env, config, settings) / timing.median_s, 3)}
+            {} if config.run.devices == 1 else {"efficiency": round(_time_share(env, config, settings) / timing.median_s, 3)}
         )
-        episodes, _ = time_episodes(env, config.num_envs * config.seeds // config.devices, settings.repeats)
+        episodes, _ = time_episodes(env, config.run.num_envs * config.run.seeds // config.run.devices, settings.repeats)
         promised = episodes.median_s + parts["updates"]
         print(describe(timing.median_s, parts, promised), flush=True)
-        sizes = {"num_envs": config.num_envs, "batch_size": config.batch_size, "updates": program.updates_per_iteration}
         shared = {
-            "config": {
+            "config": dict(
                 **settings.image_config(),
-                "preset": config.preset,
-                "method": config.method,
-                **sizes,
+                preset=config.run.preset,
+                method=config.reward.method,
+                num_envs=config.run.num_envs,
+                batch_size=config.run.batch_size,
+                updates=program.updates_per_iteration,
                 **settings.seeds_config(),
                 **settings.devices_config(),
                 **settings.auxiliary_config(),
-            },
+            ),
             "details": timing.details(
                 seconds["compile"],
                 measured_s=round(time.perf_counter() - started, 1),
@@ -180,6 +181,6 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                 **efficiency,
             ),
         }
-        per_s = config.seeds / timing.median_s
+        per_s = config.run.seeds / timing.median_s
         yield Measurement("train/env_steps", program.steps_per_iteration * per_s, "env-steps/s", **shared)
         yield Measurement("train/updates", program.updates_per_iteration * per_s, "updates/s", **shared)

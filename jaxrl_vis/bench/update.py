@@ -13,7 +13,7 @@ from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.bench.timing import Timing, compile_timed
 from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import assert_varied
-from jaxrl_vis.config import Config, preset
+from jaxrl_vis.config import Config, changes, preset
 from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.types import LoopState, ReplayState
 
@@ -21,11 +21,11 @@ from jaxrl_vis.types import LoopState, ReplayState
 def training_config(settings: Settings, **overrides: Any) -> Config:
     """Configuration of the requested preset, or of this device's, with the environment, images and sizes of the benchmark."""
     if settings.has_images:
-        overrides |= {"image_size": settings.image_size, "pixels": settings.pixels}
+        overrides |= changes(image_size=settings.image_size, pixels=settings.pixels)
     if settings.batch_size is not None:
         overrides["batch_size"] = settings.batch_size
-    overrides |= {"devices": settings.devices, "data_devices": settings.data_devices}
-    overrides |= {"seeds": settings.seeds, "weighting": settings.weighting, "aux_tasks": settings.aux_tasks}
+    overrides |= changes(devices=settings.devices, data_devices=settings.data_devices, seeds=settings.seeds)
+    overrides |= changes(weighting=settings.weighting, aux_tasks=settings.aux_tasks)
     own = "fast" if settings.on_accelerator else "cpu"
     return preset(settings.preset or own, env=settings.env, **overrides)
 
@@ -52,7 +52,7 @@ def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
 
 def seed_keys(program: TrainStep, seed: int) -> jax.Array:
     """Make typed keys [S], one per learner, on its devices."""
-    keys = jax.random.split(jax.random.key(seed), program.config.seeds)
+    keys = jax.random.split(jax.random.key(seed), program.config.run.seeds)
     return program.layout.put(keys, program.layout.by_seed)
 
 
@@ -89,7 +89,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
 
 def updates_per_call(settings: Settings) -> int:
-    """Gradient steps of one timed call."""
+    """Number of gradient steps in one timed call."""
     return 200 if settings.on_accelerator else 20
 
 
@@ -105,21 +105,21 @@ def measure_program(program: TrainStep, settings: Settings) -> Measurement:
     assert_varied(loop.replay.episodes.observations[:1, :64, :1][0, :, 0], "observations of the replay")
     timing, compile_s = time_updates(program, loop, settings.repeats)
     del loop
-    seconds = timing.median_s / (program.updates_per_iteration * config.seeds)
+    seconds = timing.median_s / (program.updates_per_iteration * config.run.seeds)
     dtype = str(program.networks.dtype)
     return Measurement(
         name="update/gradient_steps",
         value=1.0 / seconds,
         unit="updates/s",
-        config={
+        config=dict(
             **settings.image_config(),
             **settings.preset_config(),
-            "method": config.method,
-            "batch_size": config.batch_size,
-            "dtype": dtype,
+            method=config.reward.method,
+            batch_size=config.run.batch_size,
+            dtype=dtype,
             **settings.seeds_config(),
             **settings.auxiliary_config(),
-        },
+        ),
         details=timing.details(compile_s, replay_mb=round(program.replay_bytes / 1e6, 1), **_costs(program, seconds)),
     )
 
@@ -128,18 +128,18 @@ def _costs(program: TrainStep, seconds: float) -> dict[str, Any]:
     """Cost of a gradient step of ``seconds``, by the lower bound (``roofline``) and by the compiler's count (``compiler``)."""
     config = program.config
     # The fewest possible gradient steps of one learner, compiled for their cost alone: the count covers one turn of the loop.
-    steps = math.lcm(config.actor_interval, program.auxiliary.weighting.interval)
+    steps = math.lcm(config.ddpg.actor_interval, program.auxiliary.weighting.interval)
     single = make_train_step(program.env, config.replace(updates_per_iteration=steps, seeds=1))
     shapes = jax.eval_shape(single.init, seed_keys(single, 0))
     arguments = shapes.train, shapes.replay, seed_keys(single, 2), shapes.iteration
-    counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile(), config.actor_interval)
+    counted = roofline.compiler_cost(single.update_many.lower(*arguments).compile(), config.ddpg.actor_interval)
     params = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), (shapes.train.agent.actor, shapes.train.agent.critic)
     )
     dtype, device = str(program.networks.dtype), jax.devices()[0].device_kind
     costs = {}
-    if not config.aux_tasks:
-        bound = roofline.least_cost(program.networks, params, config.batch_size)
+    if not config.auxiliary.aux_tasks:
+        bound = roofline.least_cost(program.networks, params, config.run.batch_size)
         costs["roofline"] = roofline.describe(bound, seconds, dtype, device)
     if counted is not None:
         costs["compiler"] = roofline.describe(counted, seconds, dtype, device)

@@ -180,7 +180,7 @@ def _next_words(group: str, table: Iterable[str]) -> list[str]:
 
 
 def _command(words: Sequence[str]) -> Callable[[], int]:
-    """Read a command line, and return the command with its options; what is left to do after help is nothing."""
+    """Read a command line, and return the command with its options; after help, nothing is left to do."""
     if not words:
         first = ", ".join(_next_words("", all_commands()))
         raise RequestError(f"no command given; choose one of {first} (or see {PROGRAM} --help)")

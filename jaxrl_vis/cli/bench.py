@@ -9,9 +9,9 @@ import tyro
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.config import Pixels
+from jaxrl_vis.config.methods import AuxTaskName, WeightingName
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices
-from jaxrl_vis.methods import AuxTaskName, WeightingName
 from jaxrl_vis.report.outputs import check_writable
 
 Benchmark = Literal["render", "physics", "env", "update", "train"]
@@ -67,9 +67,8 @@ def run(options: Bench) -> int:
         raise RequestError("--seeds goes with `bench update` and `bench train` only")
     if (options.weighting != "none" or options.aux_tasks) and options.benchmark not in ("update", "train"):
         raise RequestError("--weighting and --aux-tasks go with `bench update` and `bench train` only")
-    for option in ("preset", "batch_size"):
-        if getattr(options, option) is not None and options.benchmark not in ("update", "train"):
-            raise RequestError(f"--{option.replace('_', '-')} goes with `bench update` and `bench train` only")
+    if (options.preset is not None or options.batch_size is not None) and options.benchmark not in ("update", "train"):
+        raise RequestError("--preset and --batch-size go with `bench update` and `bench train` only")
     if (options.devices is not None or options.data_devices is not None) and options.benchmark != "train":
         raise RequestError("--devices and --data-devices go with `bench train` only")
     check_counts(

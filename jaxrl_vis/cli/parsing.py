@@ -20,7 +20,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from jaxrl_vis import fields
+from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError, nearest
 
 PROGRAM = "jaxrl-vis"
@@ -224,7 +224,7 @@ def _split(
 
 
 def _check_values(words: Sequence[str], options: Sequence[_Option]) -> None:
-    """Rejects true or false after a flag, and several numbers after an option that takes one: they would be taken for a task.
+    """Reject true or false after a flag, and several numbers after an option that takes one: they would pass for a task.
 
     Raises:
         RequestError: There are such values.
@@ -268,38 +268,41 @@ def _collect_options(command: type) -> list[_Option]:
     """
     own = {field.name for field in dataclasses.fields(command)}
     options = []
-    for field, hint, extras, text in _describe_fields(command):
-        changes = next((extra for extra in extras if isinstance(extra, FieldsOf)), None)
+    for field, text in describe_options(command):
+        changes = next((extra for extra in field.extras if isinstance(extra, FieldsOf)), None)
         if changes is None:
             required = field.default is dataclasses.MISSING
             default = "required" if required else f"default: {field.default}" if field.default else ""
-            for extra in extras:
+            for extra in field.extras:
                 default = extra.words() if isinstance(extra, DefaultText) else default
-            if AlsoPositional() in extras:
-                options.append(_Option(field.name, hint, False, text, "" if required else default, False))
-                options.append(_Option(field.name, hint, True, text, default, required, twin=True))
+            if AlsoPositional() in field.extras:
+                options.append(_Option(field.name, field.hint, False, text, "" if required else default, False))
+                options.append(_Option(field.name, field.hint, True, text, default, required, twin=True))
                 continue
-            options.append(_Option(field.name, hint, tyro.conf.Positional in extras, text, default, required))
+            positional = tyro.conf.Positional in field.extras
+            options.append(_Option(field.name, field.hint, positional, text, default, required))
             continue
         options += [
-            _Option(item.name, item_hint, False, item_text, changes.default(item.name), False, field.name)
-            for item, item_hint, _, item_text in _describe_fields(changes.record)
+            _Option(item.name, item.hint, False, item_text, changes.default(item.name), False, field.name)
+            for item, item_text in describe_options(changes.record)
             if item.name not in own
         ]
     return options
 
 
-def _describe_fields(record: type) -> list[tuple[dataclasses.Field, Any, tuple[Any, ...], str]]:
-    """List the fields of a dataclass with their annotations, the metadata of `typing.Annotated`, and their docstrings."""
+def describe_options(record: type) -> list[tuple[fields.Field, str]]:
+    """List the fields of a dataclass, those of its groups in their place, with their docstrings."""
+    described = fields.describe(record)
+    texts = {kind: _docstrings(kind) for kind in {field.record for field in described}}
+    return [(field, texts[field.record].get(field.name, "")) for field in described]
+
+
+def _docstrings(record: type) -> dict[str, str]:
+    """Return the docstrings below the fields of a dataclass, inherited ones included, as single lines."""
     texts: dict[str, str] = {}
     for kind in reversed([kind for kind in record.__mro__ if dataclasses.is_dataclass(kind)]):
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
         for line, following in itertools.pairwise(definition.body):
             if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name) and isinstance(following, ast.Expr):
                 texts[line.target.id] = " ".join(str(ast.literal_eval(following.value)).split())
-    hints = typing.get_type_hints(record, include_extras=True)
-    plain = fields.hints(record)
-    return [
-        (field, plain[field.name], getattr(hints[field.name], "__metadata__", ()), texts.get(field.name, ""))
-        for field in dataclasses.fields(record)
-    ]
+    return texts

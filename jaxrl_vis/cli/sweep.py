@@ -12,9 +12,9 @@ from jaxrl_vis.cli.figure import UNFINISHED
 from jaxrl_vis.cli.parsing import DefaultText, FieldsOf
 from jaxrl_vis.cli.train import default_preset, describe_default
 from jaxrl_vis.config import PRESETS, Config
+from jaxrl_vis.config.methods import MethodName
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host.devices import guess_accelerator
-from jaxrl_vis.methods import MethodName
 from jaxrl_vis.report.outputs import check_writable
 
 

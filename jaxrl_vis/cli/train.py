@@ -2,28 +2,27 @@
 
 import dataclasses
 import importlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 from jaxrl_vis.cli.checks import check_counts, check_env, may_run_code
 from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
-from jaxrl_vis.config import PRESETS, Config, preset
+from jaxrl_vis.config import OPTIONS, PRESETS, Config, preset, validate
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.host import distributed
+from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
 from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.loggers import group
 from jaxrl_vis.run.loggers.group import LoggerName
 from jaxrl_vis.run.storage.folder import check_there, default_folder, read_config
-from jaxrl_vis.validation import validate
 
 
 def describe_default(name: str) -> str:
     """Describe a field's default: its value in this machine's ``auto`` preset, and the presets with other values."""
     current = _auto(guess_accelerator())
-    values = {preset_name: getattr(config, name) for preset_name, config in PRESETS.items()}
+    values = {preset_name: config.value(name) for preset_name, config in PRESETS.items()}
     words = {
         preset_name: " ".join(map(str, value)) or "none" if isinstance(value, tuple) else str(value)
         for preset_name, value in values.items()
@@ -57,6 +56,8 @@ class Train:
     environments are. One if not given."""
     run_dir: Path | None = None
     """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
+    show_config: bool = False
+    """Print the complete configuration, with the source of each value, and train nothing."""
     resume: bool = False
     """Continue from the newest checkpoint in an existing run folder."""
     overwrite: bool = False
@@ -107,6 +108,32 @@ def training_config(options: Train) -> Config:
     return preset(name, **changes)
 
 
+def config_lines(config: Config, given: Collection[str]) -> list[str]:
+    """List a configuration, group by group: the value of each option, and the source of those that are not defaults.
+
+    Args:
+        config: Configuration.
+        given: Names of the options that were given.
+    """
+    name, environment = config.run.preset, config.environment
+    of_preset, of_task = PRESETS[name], preset(name, env=environment.env, method=config.reward.method)
+    lines, group = [], ""
+    for option, value in config.flat().items():
+        if OPTIONS[option].group != group:
+            group = OPTIONS[option].group
+            lines += ["", f"[{group}]"]
+        source = ""
+        if option in given or (value != of_task.value(option) and option != "preset"):
+            source = "given"
+        elif value != of_preset.value(option):
+            source = f"preset {name}, for {environment.env}"
+        elif value != OPTIONS[option].default and option != "preset":
+            source = f"preset {name}"
+        shown = " ".join(map(str, _words(value))) or "none"
+        lines.append(f"{option:27} {shown:24} {source}".rstrip())
+    return lines[1:]
+
+
 def _words(value: Any) -> tuple[Any, ...]:
     return value if isinstance(value, tuple) else (value,)
 
@@ -127,13 +154,16 @@ def run(options: Train) -> int:
     if options.env is not None:
         check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
+    if options.show_config:
+        streams.say("\n".join(config_lines(config, set(options.changes))))
+        return 0
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)
     if options.resume and "env_folder" not in options.changes and (run_dir / "config.json").exists():
         named = {options.env, *(word for value in options.changes.values() for word in _words(value))}
         if set(own_names(config).values()) - named:
             may_run_code(run_dir, options.trust)  # its user named neither such a part nor where it lies: the run does
-    check_env(config.env, config.env_folder)
+    check_env(config.environment.env, config.environment.env_folder)
     from jaxrl_vis.run import trainer
 
     check_writable(run_dir, "--run-dir", folder=True)

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaxrl_vis import fields
+from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import make_private, user_cache
 from jaxrl_vis.host.provenance import child_environment
@@ -79,7 +79,7 @@ def check_devices() -> None:
 
 
 def enable_compilation_cache() -> str:
-    """Enables JAX's persistent compilation cache, so that later starts take seconds.
+    """Enable JAX's persistent compilation cache, so that later starts take seconds.
 
     A folder that is already configured (JAX_COMPILATION_CACHE_DIR, or jax.config) is kept; otherwise it is ``jaxrl-vis/xla`` in
     the user's cache folder, if that can be created. `cache_fault` reports problems with it.

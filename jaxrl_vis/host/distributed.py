@@ -42,7 +42,7 @@ def find_rank(
     index: int | None = None,
     variables: Mapping[str, str] = os.environ,
 ) -> Rank | None:
-    """Determines the rank of this process from options or a launcher's variables; None for a single process. Imports no JAX.
+    """Determine the rank of this process from options or a launcher's variables; None for a single process. Imports no JAX.
 
     Args:
         coordinator, count, index: The options; all or none must be set.
@@ -80,7 +80,7 @@ def _by_launcher(variables: Mapping[str, str]) -> Rank | None:
 
 
 def start(rank: Rank, seconds: int = START_S) -> None:
-    """Connects to the other processes; call it before JAX initialises its devices.
+    """Connect to the other processes; call it before JAX initialises its devices.
 
     Args:
         rank: From `find_rank`.
@@ -164,7 +164,7 @@ def meet(name: str) -> None:
 
 
 def leave_together() -> None:
-    """Shuts down together with the other processes, within a timeout, so that each can print its error before JAX ends it.
+    """Shut down together with the other processes, within a timeout, so that each can print its error before JAX ends it.
 
     Call it after an error in the request, which all processes will raise.
     """

@@ -50,7 +50,7 @@ def compilation_cache() -> str:
 
 
 def physics_and_camera() -> str:
-    """Compile and run one control step, renders it, and check that the image is neither empty nor equal to the goal
+    """Compile and run one control step, render it, and check that the image is neither empty nor equal to the goal
     image.
     """
     import jax

@@ -75,7 +75,7 @@ def is_temporary(name: str) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Syncs the entries of a folder to the disk, where the system supports it."""
+    """Sync the entries of a folder to the disk, if the system supports it."""
     with contextlib.suppress(OSError):  # Windows cannot open folders, and some file systems do not support fsync
         descriptor = os.open(folder, os.O_RDONLY)
         try:

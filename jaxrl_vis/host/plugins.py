@@ -1,4 +1,4 @@
-"""Parts of a run that are named: built-in ones by a word, a person's own as ``module:Name``. Imports no JAX by itself.
+"""Named parts of a run: built-in ones by a word, custom ones as ``module:Name``. Imports no JAX by itself.
 
 Algorithms, reward methods, auxiliary losses and weightings are named so, as tasks are (`jaxrl_vis_envs.task_modules`). A module
 is imported from ``Config.env_folder``, or else the current folder, or else as Python finds it.
@@ -8,8 +8,7 @@ from collections.abc import Mapping
 from types import ModuleType
 from typing import Any, TypeVar
 
-from jaxrl_vis import fields
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, fields
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis_envs import task_modules
 
@@ -17,12 +16,12 @@ T = TypeVar("T")
 
 
 def own_names(config: Config) -> dict[str, str]:
-    """Return the names of a configuration that are ``module:Name``, by what they name: task, algorithm, aux_tasks 1, ..."""
-    names = {"task": config.env}
+    """Return the custom parts ``module:Name`` of a configuration, by their role: task, algorithm, aux_tasks 1, ..."""
+    names = {"task": config.environment.env}
     for field, hint in fields.hints(Config).items():
         if not fields.names_parts(hint):
             continue
-        value = getattr(config, field)
+        value = config.value(field)
         names |= (
             {f"{field} {number}": name for number, name in enumerate(value, 1)} if isinstance(value, tuple) else {field: value}
         )
@@ -30,7 +29,7 @@ def own_names(config: Config) -> dict[str, str]:
 
 
 def find(kind: str, name: str, known: Mapping[str, T], folder: str | None = None) -> T | Any:
-    """Return a part by its name; one of ``module:Name`` is imported.
+    """Return a part by name; a ``module:Name`` is imported.
 
     Args:
         kind: Kind of the part, for messages.
@@ -66,7 +65,7 @@ def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
 
 
 def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
-    """Return what somebody's function makes, and check what it is.
+    """Call a custom function, and check the type of its result.
 
     Args:
         kind, name: As of `find`, for messages.

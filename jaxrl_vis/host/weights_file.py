@@ -55,7 +55,7 @@ def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, 
 
 
 def _quantised(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the three arrays, by name, that stand for an array float32 [..., C] with 10 bits a number."""
+    """Quantize an array float32 [..., C] to 10 bits per number: three arrays by name."""
     scale = np.abs(array).max(axis=tuple(range(array.ndim - 1))) / np.float32(_LEVELS)
     levels = np.round(array / np.where(scale > 0, scale, 1)).astype(np.int16)
     low = np.pad((levels & 3).ravel(), (0, -levels.size % 4)).reshape(-1, 4) << _PLACES
@@ -63,7 +63,7 @@ def _quantised(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return the array float32 that the three stand for."""
+    """Restore a quantized array to float32."""
     lower = ((low[:, None] >> _PLACES) & 3).ravel()[: high.size].reshape(high.shape)
     return (4 * high.astype(np.float32) + lower.astype(np.float32)) * scale
 

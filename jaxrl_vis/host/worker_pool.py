@@ -167,7 +167,7 @@ def _environments(workers: int) -> list[dict[str, str]]:
 
 
 def _end_with_parent() -> None:
-    """Wait for the parent process to end, for example when killed, then exits: its results are no longer needed."""
+    """Wait for the parent process to end, for example when killed, then exit: its results are no longer needed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

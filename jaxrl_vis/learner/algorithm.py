@@ -1,4 +1,4 @@
-"""The interface of an algorithm. Rollouts, evaluations, checkpoints and policies know nothing else of a learner.
+"""Interface of an algorithm: all that rollouts, evaluations, checkpoints and policies know about a learner.
 
     init            a fresh agent: a pytree of the algorithm's own
     update          all gradient steps of an iteration, from batches that were chosen by the replay
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
-from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, Statistics
 
 Agent = Any
@@ -28,7 +28,7 @@ PolicyParams = Any
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """Configuration and sizes that an algorithm is made for.
+    """Configuration and sizes that an algorithm is built for.
 
     Attributes:
         config: The run.
@@ -49,7 +49,7 @@ class Setup:
 
 @dataclasses.dataclass(frozen=True)
 class Batches:
-    """Batches of an iteration, chosen at once and read one at a time.
+    """Batches of an iteration, drawn together and read one at a time.
 
     Attributes:
         choices: Tree of arrays [U, ...], one row for each gradient step.
@@ -64,7 +64,7 @@ Update = Callable[[Agent, Statistics, Batches, jax.Array], tuple[Agent, Metrics]
 
 
 class Algorithm(NamedTuple):
-    """An algorithm for one learner. Pure; mapped over seeds.
+    """Algorithm of one learner: pure functions, mapped over seeds.
 
     Attributes:
         init: key -> agent.
@@ -72,8 +72,8 @@ class Algorithm(NamedTuple):
         update: (agent, Statistics, Batches, key) -> (agent after a gradient step on every batch, means of metrics, [] float32
             by name).
         policy_params: (agent, Statistics) -> the parameters that ``act`` and ``aim`` read.
-        aim: (policy parameters, goals [E, ...]) -> tree of arrays [E, ...] that ``act`` reads of goals. Goals stay, so this is
-            computed once an episode. The goals themselves if not given.
+        aim: (policy parameters, goals [E, ...]) -> tree of arrays [E, ...] that ``act`` reads of goals. Goals are constant, so
+            this is computed once per episode. The goals themselves if not given.
         diagnose: (agent, Statistics, goals [E, ...] of a rollout) -> further metrics, [] float32 by name, averaged over the
             parts of a learner.
         networks: Networks of the algorithm, for tools that look inside (`networks.Networks`); None for none.
@@ -89,7 +89,7 @@ class Algorithm(NamedTuple):
 
 
 def scan_batches(step: Callable[[Agent, Statistics, Batch, jax.Array], tuple[Agent, Metrics]]) -> Update:
-    """Make `Algorithm.update` of a gradient step.
+    """Build `Algorithm.update` from a single gradient step.
 
     Args:
         step: (agent, Statistics, Batch, key) -> (agent, metrics, [] float32 by name).

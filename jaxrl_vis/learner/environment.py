@@ -1,42 +1,41 @@
-"""The environment that a configuration asks for."""
+"""Environment of a configuration."""
 
 import dataclasses
 from typing import Any
 
 import jaxrl_vis_envs
-from jaxrl_vis import fields
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import OPTIONS, Config, fields, validate
+from jaxrl_vis.config.groups import EnvironmentOptions
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host import plugins
-from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.randomization import typical
 from jaxrl_vis_envs.registry import config_class, load
 from jaxrl_vis_envs.task_modules import import_folder
 
-# Options of an environment that `Config` has fields of its own for.
-_OWN_FIELDS = {
-    "image_size": "--image-size",
-    "pixels": "--pixels",
-    "frame_stack": "--frame-stack",
-    "randomization": "--randomize",
-}
+
+def _own_option(name: str) -> str | None:
+    """Return the option of the command line that sets a field of an environment; None if only ``env_options`` sets it."""
+    if name == "randomization":
+        return "--randomize"
+    is_own = name in OPTIONS and OPTIONS[name].group == "environment"
+    return f"--{name.replace('_', '-')}" if is_own else None
 
 
 def locate_env(config: Config) -> Config:
-    """Return ``config`` with the folder that its environment, and whatever else is ``module:Name``, was imported from.
+    """Return ``config`` with the folder of its ``module:Name`` parts filled in.
 
     Raises:
-        RequestError: There is no such environment, what holds it cannot be imported, or modules lie in several folders.
+        RequestError: There is no such environment, its module cannot be imported, or the modules are in several folders.
     """
     validate(config)
     try:
-        folders = {config.env: load(config.env, config.env_folder)}
+        folders = {config.environment.env: load(config.environment.env, config.environment.env_folder)}
     except ValueError as error:
         raise RequestError(str(error)) from error
     for kind, name in plugins.own_names(config).items():
         if kind != "task":
-            folders[name] = import_folder(plugins.load(name, config.env_folder)[0])
+            folders[name] = import_folder(plugins.load(name, config.environment.env_folder)[0])
     places = {folder: name for name, folder in folders.items() if folder is not None}
     if len(places) > 1:
         where = " and ".join(f"{name} in {folder}" for folder, name in places.items())
@@ -52,36 +51,41 @@ def make_env(config: Config) -> GoalEnv:
     """
     locate_env(config)
     try:
-        names = {field.name for field in dataclasses.fields(config_class(config.env))}
-        settings: dict[str, Any] = {name: getattr(config, name) for name in ("image_size", "pixels") if name in names}
-        if config.frame_stack is not None:
-            settings["frame_stack"] = config.frame_stack
-        if config.randomize:
-            settings["randomization"] = typical(*config.randomize, strength=config.randomize_strength)
-        return jaxrl_vis_envs.make(config.env, **settings, **_read_options(config))
+        options = config.environment
+        names = {field.name for field in dataclasses.fields(config_class(options.env))}
+        settings: dict[str, Any] = {}
+        if "image_size" in names:
+            settings["image_size"] = options.image_size
+        if "pixels" in names:
+            settings["pixels"] = options.pixels
+        if options.frame_stack is not None:
+            settings["frame_stack"] = options.frame_stack
+        if options.randomize:
+            settings["randomization"] = typical(*options.randomize, strength=options.randomize_strength)
+        return jaxrl_vis_envs.make(options.env, **settings, **_read_options(options))
     except ValueError as error:
         raise RequestError(str(error)) from error
 
 
-def _read_options(config: Config) -> dict[str, Any]:
-    """``env_options`` as the fields of the environment's configuration hold them.
+def _read_options(environment: EnvironmentOptions) -> dict[str, Any]:
+    """Convert ``env_options`` to the fields of the environment's configuration.
 
     Raises:
         RequestError: One is not ``name=value``, names no field, or has a value that does not suit.
     """
-    if not config.env_options:
+    if not environment.env_options:
         return {}
-    hints = fields.hints(config_class(config.env))
+    hints = fields.hints(config_class(environment.env))
     found: dict[str, Any] = {}
-    for option in config.env_options:
+    for option in environment.env_options:
         name, equals, value = option.partition("=")
         if not equals:
             raise RequestError(f"an environment's option is written name=value, not {option!r}")
-        if name in _OWN_FIELDS:
-            raise RequestError(f"{name} has an option of its own: {_OWN_FIELDS[name]}")
+        if own := _own_option(name):
+            raise RequestError(f"{name} has an option of its own: {own}")
         if name not in hints:
-            choices = [each for each in hints if each not in _OWN_FIELDS]
-            raise RequestError(f"{config.env} has no option {name!r}{nearest(name, choices)}")
+            choices = [choice for choice in hints if _own_option(choice) is None]
+            raise RequestError(f"{environment.env} has no option {name!r}{nearest(name, choices)}")
         if not fields.is_known(hints[name]):
             raise RequestError(f"{name} cannot be set by name=value: it is a {hints[name]}, neither a number nor a word")
         _, _, several = fields.unwrap(hints[name])

@@ -1,4 +1,4 @@
-"""Second half of a training iteration, after its rollout, for one learner, as pure functions that are not compiled yet.
+"""Second half of a training iteration, after the rollout, for one learner: pure functions, not yet compiled.
 
     insert      one contiguous slice of the replay; observation statistics
     update      scan over U: sample, relabel, reward, gradient step, target networks
@@ -48,26 +48,26 @@ class Learned(NamedTuple):
 
 
 def split_key(key: jax.Array, iteration: jax.Array) -> jax.Array:
-    """Return two keys [2] of an iteration of a learner: for its rollout, and for what follows."""
+    """Derive a learner's two keys [2] for an iteration: one for its rollout, one for the rest."""
     return jax.random.split(jax.random.fold_in(key, iteration))
 
 
 def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> Batches:
-    """Choose the batches of all gradient steps at once: in a loop, drawing numbers would be a dozen tiny kernels a step."""
-    keys = jax.random.split(key, config.updates_per_iteration)
+    """Choose the batches of all gradient steps at once: inside the loop, sampling would take a dozen tiny kernels per step."""
+    keys = jax.random.split(key, config.run.updates_per_iteration)
     choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
     return Batches(choices, lambda choice: sampler.batch(replay, choice))
 
 
 def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
     """Update the normaliser with the observations of a rollout."""
-    if config.normalizer_source == "rollouts":
+    if config.study.normalizer_source == "rollouts":
         observations, goals = episodes.observations, episodes.observations[:, -1:]
         if train.goal_normalizer is not None:
             observations = observations[:, :-1]
         axes = (0, 1)
     else:  # as the authors' release: as many transitions as the rollout has, relabelled
-        count = config.num_envs * sampler.replay.horizon
+        count = config.run.num_envs * sampler.replay.horizon
         latest = sampler.replay._replace(num_rollouts=1, mean_age=None)
         sampler = dataclasses.replace(sampler, config=config.replace(batch_size=count), replay=latest)
         rollout = latest.of_rollout(episodes)
@@ -83,7 +83,7 @@ def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, co
 
 
 def make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Insert:
-    """Make the insertion of a rollout into the replay and the statistics."""
+    """Build the function that adds a rollout to the replay and the statistics."""
 
     def insert(
         train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
@@ -96,7 +96,7 @@ def make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Inser
 
 
 def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Update:
-    """Make the gradient steps of an iteration by themselves, to be timed."""
+    """Build the gradient steps of an iteration alone, for timing."""
 
     def update(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
         batches = choose_batches(config, sampler, replay, key, iteration)
@@ -109,7 +109,7 @@ def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Updat
 def make_learn(
     config: Config, insert: Insert, algorithm: Algorithm, sampler: Sampler, layout: Layout
 ) -> Callable[[LoopState, Sequence[Played]], Learned]:
-    """Make the second half of an iteration.
+    """Build the second half of an iteration.
 
     Returns:
         (LoopState, the rollout's parts in their order) -> `Learned`, of one learner or one shard of it, whose replay lies as

@@ -1,12 +1,12 @@
-"""One training iteration, for one or several seeds, as two compiled programs that are called one after the other.
+"""One training iteration, for one or several seeds, as two compiled programs that are called in turn.
 
     keys        random numbers that this iteration's rollout draws from: fold_in(seed's key, iteration)
     play        reset, then scan over T: act, advance, observe            -> episodes, of all environments or of a few
     learn       replay, statistics, gradient steps, metrics (`iteration`)
 
-XLA compiles the two side by side, and nothing is lost by the division: episodes lie in the device's memory in either case, and
+XLA compiles the two in parallel, and the division costs nothing: episodes are in the device's memory in either case, and
 neither program waits for the host. `vmap` over the seeds' axis trains several learners at once. `learn` is donated the loop
-state, so the replay is written where it lies. On several devices (`sharding`) each runs all of this on its part of the seeds,
+state, so the replay is updated in place. On several devices (`sharding`) each runs all of this on its part of the seeds,
 or of one learner.
 """
 
@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, validate
 from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import iteration as iterations
 from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate
@@ -35,9 +35,8 @@ from jaxrl_vis.learner.memory.sampling import Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks, compute_dtype
 from jaxrl_vis.learner.parallel.sharding import Layout, make_layout
-from jaxrl_vis.resolved import Resolved, resolve
+from jaxrl_vis.learner.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
-from jaxrl_vis.validation import validate
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_default_device
 
@@ -53,12 +52,12 @@ _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore
 
 @dataclasses.dataclass(frozen=True)
 class TrainStep:
-    """The programs of a run, jitted and not compiled yet, and what they were made of; see `make_train_step`.
+    """Programs of a run, jitted but not yet compiled, and their ingredients; see `make_train_step`.
 
     Attributes:
-        env, config, resolved, acting, auxiliary: Parts that the programs were made of.
+        env, config, resolved, acting, auxiliary: Parts that the programs were built from.
         replay: Sizes of one device's part of a learner's replay.
-        layout: Placement of seeds and shards; all programs take and return arrays that lie there.
+        layout: Placement of seeds and shards; all programs take and return arrays placed there.
         exploration: Noise of training; an evaluation has none.
         plays_any: True if ``play`` can begin with any environment, and so evaluate, too; else it plays a whole rollout.
         part_size: P, environments that one call of ``play`` plays, on all devices together.
@@ -101,17 +100,17 @@ class TrainStep:
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps of one seed in an iteration."""
-        return self.config.num_envs * self.env.horizon
+        return self.config.run.num_envs * self.env.horizon
 
     @property
     def updates_per_iteration(self) -> int:
         """Gradient steps of one seed in an iteration."""
-        return self.config.updates_per_iteration
+        return self.config.run.updates_per_iteration
 
     @property
     def num_iterations(self) -> int:
         """Iterations that `Config.env_steps` takes."""
-        return math.ceil(self.config.env_steps / self.steps_per_iteration)
+        return math.ceil(self.config.run.env_steps / self.steps_per_iteration)
 
     @property
     def replay_spec(self) -> ReplayState:
@@ -128,9 +127,9 @@ class TrainStep:
     @property
     def parts_spec(self) -> list[Played]:
         """Shapes and placement of what `learn` takes: the parts of a rollout."""
-        spec = played_spec(self.env, self.part_size, self.config.seeds)
+        spec = played_spec(self.env, self.part_size, self.config.run.seeds)
         spec = self.layout.with_shardings(spec, self.layout.by_environment)
-        return [spec] * math.ceil(self.config.num_envs / self.part_size)
+        return [spec] * math.ceil(self.config.run.num_envs / self.part_size)
 
     @functools.cached_property
     def insert(self) -> Any:
@@ -188,30 +187,30 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         layout: Placement on devices; None: as ``config`` says.
 
     Raises:
-        RequestError: The configuration asks for something that cannot be.
+        RequestError: The configuration is contradictory.
     """
     resolved = resolve(validate(config), env.horizon)
     layout = make_layout(config) if layout is None else layout
     shards = layout.shards
     auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, compute_dtype(config))
     setup = Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards)
-    maker = find("algorithm", config.algorithm, ALGORITHMS, config.env_folder)
-    algorithm = call("algorithm", config.algorithm, maker, setup, of=Algorithm)
-    acting = Acting(env, algorithm, config.observation_noise)
+    maker = find("algorithm", config.run.algorithm, ALGORITHMS, config.environment.env_folder)
+    algorithm = call("algorithm", config.run.algorithm, maker, setup, of=Algorithm)
+    acting = Acting(env, algorithm, config.environment.observation_noise)
     stacked = env.frame_stack if len(env.observation_spec.shape) == 3 else 1
-    replay = make_replay(config.replay_transitions, config.num_envs, env.horizon, stacked, config.replay_mean_age)
-    replay = replay._replace(num_envs=config.num_envs // shards.count)
+    replay = make_replay(config.run.replay_transitions, config.run.num_envs, env.horizon, stacked, config.study.replay_mean_age)
+    replay = replay._replace(num_envs=config.run.num_envs // shards.count)
     stored = auxiliary.stored_spec(env.observation_spec, env.horizon)
     replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, stored)
     sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if stacked > 1 else None, auxiliary, shards)
     insert = iterations.make_insert(config, sampler, auxiliary)
     with tracing_for_default_device():
         plays_any = targets_cpu() and layout.mesh is None and shards.count == 1
-    num_played = part_size(config.num_envs) if plays_any else config.num_envs // shards.count
+    num_played = part_size(config.run.num_envs) if plays_any else config.run.num_envs // shards.count
 
     def init_learner(key: jax.Array) -> TrainState:
         statistics = normalizer.init(env.observation_spec)
-        of_goals = normalizer.init(env.observation_spec) if config.normalizers == "separate" else None
+        of_goals = normalizer.init(env.observation_spec) if config.study.normalizers == "separate" else None
         return TrainState(algorithm.init(key), statistics, of_goals)
 
     def init(keys: jax.Array) -> LoopState:
@@ -228,7 +227,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         return jax.vmap(lambda key: iterations.split_key(key, iteration)[0])(keys)
 
     def play_part(train: TrainState, keys: jax.Array, first: jax.Array, exploration: Exploration) -> Played:
-        draws = RolloutPart(first, config.num_envs) if plays_any else shards
+        draws = RolloutPart(first, config.run.num_envs) if plays_any else shards
         episodes, outcome, _ = play(acting, train, keys, num_played, exploration, draws=draws)
         return episodes, outcome
 
@@ -247,7 +246,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         auxiliary=auxiliary,
         replay=replay,
         layout=layout,
-        exploration=Exploration(config.random_action_probability, config.action_noise),
+        exploration=Exploration(config.ddpg.random_action_probability, config.ddpg.action_noise),
         plays_any=plays_any,
         part_size=num_played * shards.count,
         init=spread("init", init, (seeds,), layout.loop),
@@ -262,7 +261,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
         ),
         evaluate=spread(
             "evaluate",
-            make_evaluate(acting, config.eval_episodes, shards),
+            make_evaluate(acting, config.run.eval_episodes, shards),
             (seeds, whole),
             Evaluation(seeds, environments),  # type: ignore[arg-type]
             kept_as=Evaluation(host, host) if jax.process_count() > 1 else None,  # type: ignore[arg-type]

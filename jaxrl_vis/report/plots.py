@@ -89,7 +89,7 @@ def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) 
 
 
 def style_curves(axes: Axes, title: str) -> None:
-    """Styles axes of a metric against environment steps."""
+    """Style the axes of a metric against environment steps."""
     axes.set_title(title, loc="left", fontsize=11, color=INK, pad=8)
     axes.grid(axis="y", color="#e6e8eb", linewidth=0.8)
     axes.set_axisbelow(True)

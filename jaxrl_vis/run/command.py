@@ -1,20 +1,20 @@
 """Command line equivalent of a configuration."""
 
-import dataclasses
 import shlex
 
 from jaxrl_vis.config import Config, preset
 
 
 def training_options(config: Config) -> list[str]:
-    """Return the arguments of ``jaxrl-vis train``: the task, the preset, and the fields that differ from it."""
-    words = [config.env, "--preset", config.preset]
-    base = preset(config.preset, env=config.env, method=config.method).replace(method=preset(config.preset).method)
-    for field in dataclasses.fields(Config):
-        value = getattr(config, field.name)
-        if field.name in ("env", "preset") or value == getattr(base, field.name):
+    """Return the arguments of ``jaxrl-vis train``: the task, the preset, and the options that differ from it."""
+    words = [config.environment.env, "--preset", config.run.preset]
+    base = preset(config.run.preset, env=config.environment.env, method=config.reward.method).replace(
+        method=preset(config.run.preset).reward.method
+    )
+    for name, value in config.replace(env=base.environment.env, preset=base.run.preset).flat().items():
+        if value == base.value(name):
             continue
-        option = "--" + field.name.replace("_", "-")
+        option = "--" + name.replace("_", "-")
         if isinstance(value, bool):
             words.append(option if value else option.replace("--", "--no-", 1))
         else:

@@ -74,7 +74,7 @@ def _times(count: int) -> str:
 
 
 def account(processes: Sequence[Process | None], done: int) -> Account:
-    """Sums up the processes of a run.
+    """Sum up the processes of a run.
 
     Args:
         processes: As `read_processes` returns them.
@@ -138,7 +138,7 @@ class Goodput:
         self._file = self._path.open("r+b", buffering=0)
 
     def count(self) -> None:
-        """Records the start of one more iteration."""
+        """Record the start of one more iteration."""
         self._own.begun += 1
         if self._file is None:
             return

@@ -1,4 +1,4 @@
-"""A training run from its first line to its last: iterations, evaluations, checkpoints, images.
+"""Training run: iterations, evaluations, checkpoints, images.
 
     dispatch iteration k+1                 the device never waits for the host ...
     read the metrics of iteration k        ... because the host reads one iteration late
@@ -69,12 +69,12 @@ class Report:
 
 
 class RunLoop:
-    """One call of `Trainer.run`.
+    """State of one call of `Trainer.run`.
 
     Args:
         programs: Programs of the run.
         folder: Folder of its files.
-        log: Names of the loggers that are told, see `loggers`.
+        log: Names of the loggers, see `loggers`.
         on_begun: Called when the folder is this run's.
     """
 
@@ -106,7 +106,7 @@ class RunLoop:
         self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
         self._started, self._compile_s = time.monotonic(), 0.0
-        self._pace = Pace(self._program.steps_per_iteration * self._config.seeds)
+        self._pace = Pace(self._program.steps_per_iteration * self._config.run.seeds)
         self._is_left_alone = False
         self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
         self._evaluates_ahead = False  # while the iteration before is still learned from
@@ -115,7 +115,7 @@ class RunLoop:
         self.has_begun = False  # the folder is this run's
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
-        """The whole run; see `Trainer.run`."""
+        """Run to the end, yielding reports; see `Trainer.run`."""
         reserve_standard_files()
         goes_on = self._folder.check(self._config, resume, overwrite)
         if resume and not goes_on:
@@ -175,12 +175,12 @@ class RunLoop:
                 self._goodput.close()
 
     def _check_ours(self) -> None:
-        """Raise a `FolderGoneError` where the run folder was moved, deleted or taken over; asked before each writing."""
+        """Raise a `FolderGoneError` if the run folder was moved, deleted or taken over; called before every write."""
         if self._held is not None and self.has_begun:
             self._folder.check_ours(self._checkpoints.run_id, self._held)
 
     def _gone(self) -> FolderGoneError | None:
-        """Why nothing can be saved any more, if the run folder is not this run's any more."""
+        """Reason why nothing can be saved any more; None while the run folder is this run's."""
         try:
             self._check_ours()
         except FolderGoneError as gone:
@@ -204,9 +204,9 @@ class RunLoop:
     # -- Before
 
     def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
-        """Restore and compile; the compiled programs by name. Nothing is written."""
+        """Restore and compile; return the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
-        self._say(f"{self._config.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
+        self._say(f"{self._config.environment.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
         restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
         if restored is not None:
@@ -223,7 +223,7 @@ class RunLoop:
         return compiled
 
     def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
-        """Ask for memory once more, the last thing that can refuse the run; then make the folder and the state ready."""
+        """Check the memory once more, the last check that can refuse the run; then prepare folder and state."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
@@ -251,7 +251,7 @@ class RunLoop:
         self._pace.begin(self._done)
 
     def _open(self, goes_on: bool, overwrite: bool) -> None:
-        """Make the folder ready, unless it was moved or deleted since it was locked: compiling takes a while."""
+        """Prepare the folder, unless it was moved or deleted since it was locked: compiling takes a while."""
         assert self._held is not None
         self._folder.check_place(self._held)
         try:
@@ -265,7 +265,7 @@ class RunLoop:
             raise
 
     def _begin_log(self, goes_on: bool, damaged: list[Path], foreign: list[Path]) -> None:
-        """Cut the metrics back to the iteration that the run goes on from, and open the loggers.
+        """Truncate the metrics to the iteration from which the run continues, and open the loggers.
 
         Args:
             goes_on: True if it does.
@@ -317,8 +317,8 @@ class RunLoop:
             self._unread.append((self._done, self._programs.pending(values)))
             if len(self._unread) > 1:
                 yield self._read()
-            evaluation = self._is_due(config.eval_interval) or self._done == self._total
-            light, full = self._is_due(config.checkpoint_interval), self._is_due(config.full_checkpoint_interval)
+            evaluation = self._is_due(config.run.eval_interval) or self._done == self._total
+            light, full = self._is_due(config.run.checkpoint_interval), self._is_due(config.run.full_checkpoint_interval)
             recent = self._saver.is_recent_due(light)
             if not (evaluation or light or full or recent or (interruption and not distributed.are_several())):
                 continue
@@ -351,15 +351,15 @@ class RunLoop:
         return Report(iteration, iteration * env_steps, iteration * updates, values)
 
     def _read(self) -> Report:
-        """Wait for the metrics of the first iteration that are not read yet, and take them in.
+        """Wait for the metrics of the oldest unread iteration, and record them.
 
         Raises:
             NonFiniteError: A guard has counted something.
         """
         iteration, pending = self._unread[0]
-        values = pending.read_per_seed(self._config.seeds)
+        values = pending.read_per_seed(self._config.run.seeds)
         guards = [values.pop(name) for name in list(values) if name.startswith(GUARD)]
-        bad = sorted({self._config.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
+        bad = sorted({self._config.run.seed + seed for counts in guards for seed, count in enumerate(counts) if count != 0})
         if bad:
             self._stop_nonfinite(f"iteration {iteration}, seed {', '.join(map(str, bad))}", values)
         self._progress.since_evaluation.append(values)
@@ -368,16 +368,16 @@ class RunLoop:
         return self._report(iteration, values)
 
     def _begin_evaluation(self) -> Pending:
-        """Evaluate the learner; `_evaluate` waits for the outcome."""
+        """Start evaluating the learner; `_evaluate` waits for the outcome."""
         assert self._loop is not None
         self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)
         return self._programs.pending(outcome)
 
     def _evaluate(self, report: Report, outcome: Pending) -> Report:
-        """Read what an evaluation has found, write a line per seed, and add the figures to the report."""
+        """Read the results of an evaluation, write a line per seed, and add the figures to the report."""
         progress, speed = self._progress, self._pace.speed(self._done)
-        values = outcome.read_per_seed(self._config.seeds)
+        values = outcome.read_per_seed(self._config.run.seeds)
         if not all(np.isfinite(row).all() for row in values.values()):
             self._stop_nonfinite(f"the evaluation after iteration {self._done}", values)
         means = metrics.with_precision(metrics.average_metrics(progress.since_evaluation))
@@ -387,7 +387,7 @@ class RunLoop:
             "time/env_steps_per_s": speed,
             "time/goodput": self._goodput.account(self._done).goodput or math.nan,
         }
-        rounded = {name: [round(value, 3)] * self._config.seeds for name, value in times.items()}
+        rounded = {name: [round(value, 3)] * self._config.run.seeds for name, value in times.items()}
         counts = {"iteration": self._done, "updates": report.updates, "env_steps": report.env_steps}
         if progress.replay_lost_at is not None:
             counts["resume/replay_lost_at"] = progress.replay_lost_at
@@ -402,7 +402,7 @@ class RunLoop:
         progress.evaluation_due = False
         self._warn_if_filtered(means)
         # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
-        if self._is_due(self._config.eval_interval):
+        if self._is_due(self._config.run.eval_interval):
             progress.since_evaluation = []
         self._show(values, speed)
         self._pace.mark(self._done)
@@ -436,7 +436,7 @@ class RunLoop:
         return dataclasses.replace(self._progress, wall_s=self._progress.wall_s + time.monotonic() - self._started)
 
     def _save_and_end(self, evaluation_due: bool, interruption: Interruption) -> None:
-        """Save everything and raise what the signal stands for."""
+        """Save everything and raise the signal's exception."""
         assert self._loop is not None
         self._console.stop()
         self._progress.evaluation_due = evaluation_due
@@ -459,7 +459,7 @@ class RunLoop:
         assert self._loop is not None
         if self._owed_evaluation or not self._saver.has(LIGHT, self._done):
             self._saver.light(self._loop, self._done, self._progress_now())
-        if self._config.full_checkpoint_interval and (self._owed_evaluation or not self._saver.has(FULL, self._done)):
+        if self._config.run.full_checkpoint_interval and (self._owed_evaluation or not self._saver.has(FULL, self._done)):
             self._saver.full(self._loop, self._done, self._progress_now())
         self._saver.finish()
         self._console.stop()

@@ -23,7 +23,7 @@ class Pace:
         self.begun, self._begun_at = done, self._marked_at
 
     def mark(self, done: int) -> None:
-        """Records the end of an evaluation, from which `speed` is measured."""
+        """Record the end of an evaluation, from which `speed` is measured."""
         self._marked, self._marked_at = done, time.monotonic()
 
     def speed(self, done: int) -> float:

@@ -57,7 +57,7 @@ class Saver:
     ):
         self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
         self._check = check
-        self._keeps_full = programs.config.full_checkpoint_interval > 0
+        self._keeps_full = programs.config.run.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
         """Return True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
@@ -131,6 +131,7 @@ class Saver:
         self._say(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
         if self.is_recent_due(light=True):  # in case the user does not wait
             self.recent(loop, iteration, progress)
+        self._checkpoints.wait()  # one of this iteration may still be on its way: it is not written twice
         if not self.has(LIGHT, iteration) or progress.evaluation_due:
             self.light(loop, iteration, progress)
         self._checkpoints.wait()
@@ -206,7 +207,7 @@ class Saver:
                 dumped = f"state dumped to {file}"
             except OSError as error:
                 dumped = f"the state cannot be written to {file} ({error.strerror or type(error).__name__})"
-            simulated = made_by_simulation(loop, self._programs.config.num_envs)
+            simulated = made_by_simulation(loop, self._programs.config.run.num_envs)
             if simulated is None and not leaves and values and all(name.startswith("eval/") for name in values):
                 simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves

@@ -34,7 +34,7 @@ __all__ = ["NonFiniteError", "Report", "Terminated", "Trainer", "enable_compilat
 
 
 class Trainer:
-    """A configuration, the programs it stands for, and the run folder. Nothing is compiled, allocated or written yet.
+    """Configuration, its programs, and the run folder. Nothing is compiled, allocated or written at first.
 
     Args:
         config: The run.
@@ -42,7 +42,7 @@ class Trainer:
         run_dir: Folder of the files of `run`; None: `jaxrl_vis.run.storage.folder.default_folder`.
         resume: Go on with the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
-        log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
+        log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
         keep_programs: Trace nothing that an earlier process has traced (`jaxrl_vis.run.compiled.trace_cache`).
 
     Attributes:
@@ -76,42 +76,42 @@ class Trainer:
 
     @property
     def program(self) -> Any:
-        """The jitted functions, as they were given."""
+        """Jitted functions, as passed to the constructor."""
         return self.programs.program
 
     @property
     def run_keys(self) -> jax.Array:
-        """[S] typed keys: seed i of `run` starts from ``jax.random.key(config.seed + i)``."""
+        """[S] typed keys: seed i of `run` starts from ``jax.random.key(config.run.seed + i)``."""
         return self.programs.run_keys
 
     @property
     def shapes(self) -> LoopState:
-        """Shapes and types of the loop state; traced, not allocated."""
+        """Shapes and dtypes of the loop state; traced, not allocated."""
         return self.programs.shapes
 
     def compile(self) -> dict[str, Any]:
-        """Compile everything that a run needs, side by side; `run` does it by itself. Returns the programs by name."""
+        """Compile everything that a run needs, in parallel, and return the programs by name; `run` does so by itself."""
         return self.programs.compile()
 
     def init(self, key: jax.Array) -> LoopState:
-        """A fresh learner with an empty replay.
+        """Initialise a learner with an empty replay.
 
         Args:
-            key: A typed key. With one seed it is that seed's key, so ``init(jax.random.key(0))`` is what `run` starts from with
-                ``seed=0``; with several it is split into one each. Or [S] keys, taken as they are.
+            key: Typed key. With one seed it is that seed's key, so `run` with ``seed=0`` starts from
+                ``init(jax.random.key(0))``; with several it is split. Or [S] keys, one per seed.
 
         Raises:
-            RequestError: ``key`` is a seed, a key of the old kind, or of another number of seeds.
+            RequestError: ``key`` is an integer, an untyped key, or has the wrong number of seeds.
         """
         _check_key("init", key)
         if key.ndim == 0:
-            key = key[None] if self.config.seeds == 1 else jax.random.split(key, self.config.seeds)
-        if key.shape != (self.config.seeds,):
-            raise RequestError(f"init takes one key, or one for each of {self.config.seeds} seeds, not {key.shape} of them")
+            key = key[None] if self.config.run.seeds == 1 else jax.random.split(key, self.config.run.seeds)
+        if key.shape != (self.config.run.seeds,):
+            raise RequestError(f"init takes one key, or one for each of {self.config.run.seeds} seeds, not {key.shape} of them")
         return self.programs.init(key)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
-        """One iteration: a rollout, then gradient steps. ``loop`` is donated: use what is returned.
+        """Run one iteration: a rollout, then gradient steps. ``loop`` is donated: use the returned one.
 
         Returns:
             The new state, and metrics of [S] float32 that the device may still be working on.
@@ -119,7 +119,7 @@ class Trainer:
         return self.programs.train_iteration(loop)
 
     def evaluate(self, loop: LoopState | TrainState, key: jax.Array | None = None) -> Metrics:
-        """``eval/success``, ``eval/goal_distance`` and its median, [S] float32, of the policy without noise.
+        """Evaluate the policy without noise: ``eval/success``, ``eval/goal_distance`` and its median, [S] float32.
 
         Args:
             loop: The learner.
@@ -138,15 +138,15 @@ class Trainer:
         """Train to the end and yield a `Report` per iteration, one iteration late.
 
         Compiles; evaluates every ``eval_interval`` iterations and at the end; writes metrics, checkpoints, the curve and the
-        video into the run folder; and says on stdout what it does, which cannot fail. Signals that would end the process are
-        acted upon between two iterations, in the main thread and where the caller has no handler of its own. Whoever leaves the
-        loop early keeps what was saved until then; the next call goes on from there.
+        video into the run folder; and reports on stdout, where errors are ignored. Signals that would end the process are
+        handled between iterations, in the main thread and unless the caller has handlers. After leaving the loop early, the
+        next call continues from the last save.
 
         Raises:
             RequestError: The folder, the saved run or the memory does not suit the configuration, or another process writes
                 into the folder. Nothing was changed.
-            NonFiniteError: A number is not finite any more. The state was dumped, and was not saved as a checkpoint.
-            StorageError: A file could not be written. What was saved before is good.
+            NonFiniteError: A number is not finite. The state was dumped, not saved as a checkpoint.
+            StorageError: A file could not be written. Earlier checkpoints are intact.
             Terminated: A signal other than Ctrl-C, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
@@ -154,7 +154,7 @@ class Trainer:
         return loop.reports(self._resume, self._overwrite)
 
     def _go_on_next_time(self) -> None:
-        """Resume where `run` is called again; a finished run says that there is nothing left to do."""
+        """Prepare the next call of `run`, which resumes; after a finished run, it reports that nothing is left to do."""
         self._resume, self._overwrite = True, False
 
 
@@ -176,14 +176,14 @@ def make_trainer(
     Args:
         config: The run.
         run_dir: Folder of the files of `Trainer.run`; None: below ``runs/``, named after the configuration.
-        resume: Go on with the run in that folder; in an empty one it starts at the beginning, and says so.
+        resume: Go on with the run in that folder; in an empty one it starts from the beginning, and reports so.
         overwrite: Delete the run in that folder and start again.
-        log: Loggers that are told beside metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the run that goes on.
+        log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
         keep_programs: Trace nothing that an earlier process has traced. For processes that have replaced nothing in this
             package's modules, which would not be seen (`jaxrl_vis.run.compiled.trace_cache`).
 
     Raises:
-        RequestError: The configuration asks for something that cannot be, or contradicts the saved run.
+        RequestError: The configuration is contradictory, or differs from the saved run.
     """
     if not isinstance(config, Config):
         raise RequestError(f"make_trainer takes a configuration, such as jaxrl_vis.preset('cpu'), not {config!r}")
@@ -194,7 +194,7 @@ def make_trainer(
         hush_cache()
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
             start_devices()
-            if is_built_in(config.env) and not own_names(config):
+            if is_built_in(config.environment.env) and not own_names(config):
                 locate_env(config)  # imports MuJoCo, meanwhile
             check_devices()
         config = locate_env(config)

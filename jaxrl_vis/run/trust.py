@@ -41,7 +41,7 @@ def is_trusted(run_dir: Path, config: Config) -> bool:
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
-    """Store that the custom parts of a run may be imported.
+    """Remember that the custom parts of a run may be imported.
 
     Args:
         run_dir: The run folder.
@@ -103,7 +103,7 @@ def _files(config: Config) -> dict[str, Path | None]:
     files = {}
     for kind, name in own_names(config).items():
         try:
-            files[name] = task_modules.find(task_modules.split(name)[0], config.env_folder)
+            files[name] = task_modules.find(task_modules.split(name)[0], config.environment.env_folder)
         except (ValueError, OSError) as error:  # not of this form, or an invalid folder
             raise RequestError(f"the {kind} {name!r} cannot be found: {error}") from error
     return files

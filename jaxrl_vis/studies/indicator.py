@@ -10,7 +10,7 @@ Figure 5.1 can also be drawn for the two tasks from states, and for the hand and
 
 from typing import Any
 
-from jaxrl_vis.config import PRESETS
+from jaxrl_vis.config import changes, general_values
 from jaxrl_vis.studies.engine.study import Family, Study, Variant
 
 _OURS: dict[str, Any] = {"method": "indicator_balance_filter"}
@@ -23,14 +23,14 @@ VARIANTS: dict[str, Variant] = {
     "autoencoder": Variant("autoencoder", {"method": "autoencoder"}, "#b4531f"),
     "indicator": Variant("indicator", {"method": "indicator"}, "#3b5bdb"),
     "indicator_balance_filter": Variant("indicator, balanced and filtered", _OURS, "#0f7b6c"),
-    "balance_only": Variant("indicator, balanced, no filter", {"method": "indicator", "balance_probability": 0.5}, "#6b7a1f"),
+    "balance_only": Variant("indicator, balanced, no filter", changes(method="indicator", balance_probability=0.5), "#6b7a1f"),
     # Ablations of the thesis (5.1.6): every relabelled goal is the next observation; every goal is relabelled.
-    "all_next": Variant("p1 = 0.45, p2 = 1", _OURS | {"relabel_probability": 0.45, "balance_probability": 1.0}, "#a61e8c"),
+    "all_next": Variant("p1 = 0.45, p2 = 1", _OURS | changes(relabel_probability=0.45, balance_probability=1.0), "#a61e8c"),
     "all_relabelled": Variant("p1 = 1", _OURS | {"relabel_probability": 1.0}, "#c28f00"),
     # Estimators with errors in a cluttered quarter of the workspace, with as many anywhere, and without bias.
     "clutter": Variant(
         "10 % false positives, in a cluttered quarter",
-        _ORACLE | {"reward_false_positives": 0.1, "reward_clutter": 0.25},
+        _ORACLE | changes(reward_false_positives=0.1, reward_clutter=0.25),
         "#b4531f",
     ),
     "false_positives": Variant("10 % false positives, anywhere", _ORACLE | {"reward_false_positives": 0.1}, "#c28f00"),
@@ -47,9 +47,6 @@ REACHER, FETCH, SAWYER = "VisualReacher", "VisualFetchReach", "VisualSawyerReach
 HAND, FINGER = "VisualHandReach", "VisualFingerTurn"
 _OTHERS = {"Reacher": 100_000, "FetchReach": 100_000, HAND: 700_000, FINGER: 500_000}
 # All methods use unshifted images (the autoencoder compares them, and does not work with shifted ones), and relabel alike.
-_LEARNER = ("num_envs", "updates_per_iteration", "eval_interval", "encoders", "target_encoder")
-_OWN = (*_LEARNER, "random_shift", "relabel_probability", "balance_probability")
-_AS_ELSEWHERE = {preset: {name: getattr(PRESETS[preset], name) for name in _OWN} for preset in ("fast", "cpu")}
 
 FAMILY = Family(
     name="indicator",
@@ -60,8 +57,8 @@ FAMILY = Family(
     # goals.
     of_task={
         ("fast", REACHER): {"image_size": 100},
-        ("cpu", REACHER): _AS_ELSEWHERE["cpu"],
-        **{(preset, task): own for preset, own in _AS_ELSEWHERE.items() for task in (FETCH, "FetchReach")},
+        ("cpu", REACHER): general_values("cpu", REACHER),
+        **{(name, task): general_values(name, task) for name in ("fast", "cpu") for task in (FETCH, "FetchReach")},
         ("fast", HAND): {"random_shift": 0},
         ("fast", FINGER): {"trivial_goals": 1.0},
         ("cpu", FINGER): {"trivial_goals": 1.0},

@@ -11,9 +11,9 @@ Every figure also has a run without auxiliary losses as the reference of speed-u
 from collections.abc import Sequence
 from typing import Any
 
-from jaxrl_vis.config import OF_TASK, PRESETS
+from jaxrl_vis.config import changes, general_values
+from jaxrl_vis.config.methods import AuxTaskName
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.methods import AuxTaskName
 from jaxrl_vis.studies.engine.study import Family, Study, Variant
 
 _AUX_COLOURS: dict[AuxTaskName, str] = {
@@ -34,19 +34,19 @@ VARIANTS: dict[str, Variant] = {
     "sum": Variant("plain sum", _ALL | {"weighting": "sum"}, "#c28f00"),
     **{
         f"fixed_{weight:g}": Variant(
-            f"fixed weights {weight:g}", _ALL | {"weighting": "fixed", "weighting_fixed": weight}, colour
+            f"fixed weights {weight:g}", _ALL | changes(weighting="fixed", weighting_fixed=weight), colour
         )
         for weight, colour in ((0.1, "#d98a8a"), (1.0, "#c25555"), (10.0, "#8f2424"))
     },
     "balance": Variant("gradient balancing", _ALL | {"weighting": "balance"}, "#3b5bdb"),
     "cosine": Variant("cosine similarity", _ALL | {"weighting": "cosine"}, "#b4531f"),
-    "ol_aux_5": Variant("OL-AUX-5", _ALL | {"weighting": "ol_aux", "weighting_interval": 5}, "#0f7b6c"),
+    "ol_aux_5": Variant("OL-AUX-5", _ALL | changes(weighting="ol_aux", weighting_interval=5), "#0f7b6c"),
     "ol_aux_5_ablation": Variant(
-        "OL-AUX-5 (ablation)", _ALL | {"weighting": "ol_aux_ablation", "weighting_interval": 5}, "#3b5bdb"
+        "OL-AUX-5 (ablation)", _ALL | changes(weighting="ol_aux_ablation", weighting_interval=5), "#3b5bdb"
     ),
-    "ol_aux_1": Variant("OL-AUX-1", _ALL | {"weighting": "ol_aux", "weighting_interval": 1}, "#a61e8c"),
+    "ol_aux_1": Variant("OL-AUX-1", _ALL | changes(weighting="ol_aux", weighting_interval=1), "#a61e8c"),
     **{
-        name: Variant(f"{name.replace('_', ' ')} alone", {"aux_tasks": (name,), "weighting": "balance"}, _AUX_COLOURS[name])
+        name: Variant(f"{name.replace('_', ' ')} alone", changes(aux_tasks=(name,), weighting="balance"), _AUX_COLOURS[name])
         for name in AUX_TASKS
     },
 }
@@ -58,14 +58,13 @@ LEVELS: dict[str, tuple[float, ...]] = {FETCH: (0.5, 0.9), FINGER: (0.3, 0.5, 0.
 
 # The authors did not stack images of the finger, and evaluated these two every 40 k steps.
 _OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
-    ("paper", FINGER): {"frame_stack": 1, "eval_interval": 10},
+    ("paper", FINGER): changes(frame_stack=1, eval_interval=10),
     ("paper", HAND): {"eval_interval": 10},
 }
 QUICK: dict[str, Any] = {
     # The same for all tasks: FetchReach's values of this preset would take more iterations.
-    **{name: getattr(PRESETS["cpu"], name) for name in OF_TASK["cpu", "FetchReach"]},
-    **{"env_steps": 19_200, "updates_per_iteration": 100, "batch_size": 64},
-    **{"eval_interval": 1, "eval_episodes": 64},
+    **general_values("cpu", "FetchReach"),
+    **changes(env_steps=19_200, updates_per_iteration=100, batch_size=64, eval_interval=1, eval_episodes=64),
 }
 """Changes of the preset ``cpu`` for `figure --quick`: six evaluations, 600 gradient steps."""
 

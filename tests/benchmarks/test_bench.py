@@ -296,9 +296,9 @@ def test_what_one_of_several_devices_does() -> None:
     """The measure of efficiency: a run of one device with its share of the seeds, or of the learner."""
     config = preset("debug", seeds=6, num_envs=8, batch_size=16, replay_transitions=800)
     seeds = train.share_of_one(config.replace(devices=2))
-    assert (seeds.devices, seeds.seeds, seeds.num_envs, seeds.batch_size) == (1, 3, 8, 16)
+    assert (seeds.run.devices, seeds.run.seeds, seeds.run.num_envs, seeds.run.batch_size) == (1, 3, 8, 16)
     parts = train.share_of_one(config.replace(devices=4, data_devices=2))
-    assert (parts.seeds, parts.num_envs, parts.batch_size, parts.replay_transitions) == (3, 4, 8, 400)
+    assert (parts.run.seeds, parts.run.num_envs, parts.run.batch_size, parts.run.replay_transitions) == (3, 4, 8, 400)
 
 
 def test_a_table_says_where_an_iteration_goes() -> None:
@@ -312,7 +312,7 @@ def test_a_table_says_where_an_iteration_goes() -> None:
 @pytest.mark.usefixtures("dots")
 def test_several_learners_are_measured_together(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = Settings(env="Dot", seeds=2)
-    assert update.training_config(settings).seeds == 2
+    assert update.training_config(settings).run.seeds == 2
     monkeypatch.setattr(update, "training_config", lambda _, **overrides: preset("debug", seeds=2, **overrides))
     (found,) = update.measure(dataclasses.replace(settings, repeats=1).for_this_device())
     assert found.config["seeds"] == 2 and found.value > 0.0
@@ -331,7 +331,7 @@ def test_settings_of_images_go_to_environments_that_have_them() -> None:
     images, none = Settings(env="Dot", image_size=16, pixels="rgb"), Settings(env="Reacher", image_size=16, pixels="rgb")
     assert images.image_config() == {"env": "Dot", "image_size": 16, "pixels": "rgb"}
     assert none.image_config() == {"env": "Reacher"}
-    assert update.training_config(images).image_size == 16
+    assert update.training_config(images).environment.image_size == 16
     with pytest.raises(RequestError, match="needs an environment with images, and Reacher has none"):
         bench.run("render", env="Reacher")
 

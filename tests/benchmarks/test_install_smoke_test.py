@@ -1,4 +1,4 @@
-"""The smoke test of the installation: it reports every unexpected result, and its commands are those of the README."""
+"""The smoke test of the installation: it reports every unexpected result, and its commands are those of docs/start.md."""
 
 import runpy
 import shlex
@@ -58,8 +58,8 @@ def test_it_starts_without_the_settings_of_the_caller(monkeypatch, tmp_path):
     assert not list(Path(environment["HOME"]).iterdir())
 
 
-@pytest.mark.parametrize("line", SCRIPT["readme_commands"]())
-def test_commands_of_the_readme_can_be_typed_and_made_tiny(line):
+@pytest.mark.parametrize("line", SCRIPT["first_commands"]())
+def test_first_commands_can_be_typed_and_made_tiny(line):
     for words in (shlex.split(line), shlex.split(SCRIPT["tiny"](line))):
         command, _ = all_commands()[words[1]]
         options = parse(command, words[2:])

@@ -12,8 +12,9 @@ from test_provenance import commit
 
 from benchmarks.ledger import __main__ as ledger
 from benchmarks.ledger import ablations, evidence, pages, records, staleness
-from benchmarks.ledger import readme_tables as tables
-from benchmarks.ledger.readme_rows import DEVICES, LEARNING, Figure, Learning
+from benchmarks.ledger import result_tables as tables
+from benchmarks.ledger.comparison_table import comparison_table
+from benchmarks.ledger.result_rows import DEVICES, LEARNING, Figure, Learning
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset
@@ -167,26 +168,27 @@ def test_every_table_between_markers_has_a_writer() -> None:
 
 
 @pytest.fixture
-def readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The README of an otherwise empty checkout, which is the only page with tables."""
-    monkeypatch.setattr(pages, "PAGES", {"README.md": pages.PAGES["README.md"]})
-    readme = tmp_path / "README.md"
-    readme.write_text("before\n<!-- results table: begin -->\nold\n<!-- results table: end -->\nbetween\n")
-    return readme
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The page of results of an otherwise empty checkout, which is the only page with tables."""
+    monkeypatch.setattr(pages, "PAGES", {tables.PAGE: pages.PAGES[tables.PAGE]})
+    page = tmp_path / tables.PAGE
+    page.parent.mkdir(parents=True)
+    page.write_text("before\n<!-- results table: begin -->\nold\n<!-- results table: end -->\nbetween\n")
+    return page
 
 
-def test_tables_go_between_their_markers(readme: Path) -> None:
-    folder = readme.parent
+def test_tables_go_between_their_markers(page: Path, tmp_path: Path) -> None:
+    folder = tmp_path
     with pytest.raises(RequestError, match="speed table: begin"):
         list(pages.write_pages(folder, folder))
-    assert list(pages.outdated(folder, folder))[0].startswith("README.md: there are no markers")
-    with readme.open("a") as file:
+    assert list(pages.outdated(folder, folder))[0].startswith(f"{tables.PAGE}: there are no markers")
+    with page.open("a") as file:
         file.write("<!-- speed table: begin (so) -->\n<!-- speed table: end -->\nafter\n")
-    assert list(pages.write_pages(folder, folder)) == [(readme, True)]
-    text = readme.read_text()
+    assert list(pages.write_pages(folder, folder)) == [(page, True)]
+    text = page.read_text()
     assert "old" not in text and text.count(tables.MISSING) >= len(LEARNING)
     assert text.startswith("before\n<!-- results") and "-->\nbetween\n<!--" in text and text.endswith("-->\nafter\n")
-    assert list(pages.write_pages(folder, folder)) == [(readme, False)]
+    assert list(pages.write_pages(folder, folder)) == [(page, False)]
     missing = list(tables.missing_rows(folder))
     assert any("has no evidence" in line for line in missing) and any("has no record" in line for line in missing)
 
@@ -223,6 +225,29 @@ def test_figures_have_three_digits(value: float, text: str) -> None:
     assert tables.short(value) == text
 
 
+def test_the_comparison_takes_the_variant_that_is_hardest_for_us(tmp_path: Path) -> None:
+    device = DEVICES["H200"]
+    scene = {"scene": "primitives", "image_size": 64, "pixels": "rgbd"}
+    stored = []
+    for poses, ours, ratio in (("start", 2000.0, 2.0), ("scattered", 9000.0, 9.0)):
+        config = {**scene, "poses": poses}
+        stored += [
+            kept(ours, name="render/scene", device=device, config={**config, "images": 4}),
+            kept(
+                1000.0,
+                name="render/peer_warp",
+                device=device,
+                config={**config, "images": 8},
+                details={"ours_over_peer": ratio},
+            ),
+        ]
+    (tmp_path / "render.json").write_text(json.dumps(stored))
+    rows = comparison_table(tmp_path).splitlines()[2:]
+    assert len(rows) == 5
+    (row,) = [row for row in rows if tables.MISSING not in row]
+    assert row.endswith("| 2.00 k images/s | MuJoCo Warp: 1.00 k images/s | 2 times |")
+
+
 def rows_of(success: list[float], seed: int = 0, every: int = 1000) -> list[dict[str, Any]]:
     return [
         {
@@ -242,7 +267,7 @@ def rows_of(success: list[float], seed: int = 0, every: int = 1000) -> list[dict
 def make_run(folder: Path, rows: list[dict[str, Any]], **overrides: Any) -> Path:
     folder.mkdir(parents=True)
     about = {
-        "schema": 1,
+        "schema": 2,
         "preset": "debug",
         "git_revision": "a" * 40,
         "versions": {"jax": "1"},
@@ -312,25 +337,28 @@ def test_a_row_says_what_its_runs_reached(tmp_path: Path) -> None:
 
 def test_rows_ask_for_five_seeds_on_a_gpu() -> None:
     for row in LEARNING:
-        assert sum(config.seeds for config in row.runs.values()) == (3 if "cpu" in next(iter(row.runs)) else 5)
+        assert sum(config.run.seeds for config in row.runs.values()) == (3 if "cpu" in next(iter(row.runs)) else 5)
 
 
-def test_the_command_line_checks(readme: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert ledger.main(["stale", "--results", str(readme.parent)], checkout=readme.parent) == 1
+@pytest.mark.usefixtures("page")
+def test_the_command_line_checks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert ledger.main(["stale", "--results", str(tmp_path)], checkout=tmp_path) == 1
     assert "has no evidence fetch_reach_oracle" in capsys.readouterr().out
 
 
-def test_tables_are_not_written_from_a_folder_that_is_not_there(readme: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A name that was misspelt once replaced every figure of the README by `MISSING`."""
-    before = (records.CHECKOUT / "README.md").read_text()
-    readme.write_text(before)
+def test_tables_are_not_written_from_a_folder_that_is_not_there(
+    page: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A name that was misspelt once replaced every figure of the page by `MISSING`."""
+    before = (records.CHECKOUT / tables.PAGE).read_text()
+    page.write_text(before)
     for action in ("tables", "stale"):
-        assert ledger.main([action, "--results", str(readme.parent / "nowhere")], checkout=readme.parent) == 2
+        assert ledger.main([action, "--results", str(tmp_path / "nowhere")], checkout=tmp_path) == 2
         assert "there is no folder of records" in capsys.readouterr().err
-    assert readme.read_text() == before
+    assert page.read_text() == before
 
 
-@pytest.mark.usefixtures("readme")
+@pytest.mark.usefixtures("page")
 def test_a_damaged_file_of_records_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "env.json").write_text('[{"schema": 1,')
     assert ledger.main(["stale", "--results", str(tmp_path)], checkout=tmp_path) == 2

@@ -4,7 +4,6 @@ import concurrent.futures
 import dataclasses
 import json
 import math
-import os
 
 import pytest
 
@@ -16,7 +15,6 @@ from benchmarks.soak.soak import Soak
 FAULTS, WORKERS = 2, 2
 
 
-@pytest.mark.skipif("JAXRL_VIS_SOAK" not in os.environ, reason="takes both cores for a minute: JAXRL_VIS_SOAK=1 runs it")
 def test_a_minute_of_faults(tmp_path):
     soak = Soak(tmp_path, FAULTS, 0, math.inf, note=lambda record: None, alone=False)
     soak.undisturbed()

@@ -1,4 +1,3 @@
-import dataclasses
 import json
 import os
 import re
@@ -19,10 +18,10 @@ from jaxrl_vis.cli.eval import Eval
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.play import Play
 from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import PRESETS, Config, preset
+from jaxrl_vis.config import PRESETS, Config, fields, preset
+from jaxrl_vis.config.methods import METHODS, MethodName
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
 from jaxrl_vis.host import provenance
-from jaxrl_vis.methods import METHODS, MethodName
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.command import training_options
 
@@ -190,7 +189,7 @@ def test_help_shows_what_auto_takes_here(
     text = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
     assert f"(default: auto, which is {preset} on this machine; its values are the defaults shown below)" in text
     for name in ("image_size", "num_envs", "batch_size"):
-        value = getattr(PRESETS[preset], name)
+        value = PRESETS[preset].value(name)
         assert re.search(rf"--{name.replace('_', '-')} INT [^(]*\(default: {value}; ", text)
 
 
@@ -205,19 +204,31 @@ def test_resuming_what_is_not_there_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_examples_of_the_readme_leave_nothing_untracked(checkout: Path) -> None:
-    readme = (checkout / "README.md").read_text()
-    files = re.findall(r"(?:--out|--gallery|--json|--run-dir) ([\w./]+)", readme)
+def test_examples_of_the_first_page_leave_nothing_untracked(checkout: Path) -> None:
+    page = (checkout / "docs" / "start.md").read_text()
+    files = re.findall(r"(?:--out|--gallery|--json|--run-dir) ([\w./]+)", page)
     assert {"reach.gif", "tasks.png", "runs/mine"} <= set(files)
     if provenance.is_checkout(checkout):
         for file in files:
             assert provenance.git("check-ignore", f"{file}/x" if file.startswith("runs") else file, folder=checkout), file
 
 
+def test_the_whole_configuration_is_shown_with_its_sources(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ["train", "VisualFetchReach", "--preset", "fast", "--batch-size", "64", "--run-dir", str(tmp_path / "run")]
+    assert cli.main([*words, "--show-config"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    shown = {line.split()[0]: line.split()[1:] for line in lines if line and not line.startswith("[")}
+    assert set(shown) == {field.name for field in fields.describe(Config)}
+    assert shown["batch_size"] == ["64", "given"]
+    assert shown["num_envs"] == ["25", "preset", "fast,", "for", "VisualFetchReach"]
+    assert shown["discount"] == ["None"]
+    assert not (tmp_path / "run").exists()
+
+
 def test_flags_may_contradict_a_preset_both_ways() -> None:
     for name, word, expected in (("paper", "--clip-targets-above", True), ("cpu", "--no-clip-targets-above", False)):
-        assert training_config(parse(Train, ["--preset", name, word])).clip_targets_above is expected
-        assert training_config(parse(Train, ["--preset", name])).clip_targets_above is not expected
+        assert training_config(parse(Train, ["--preset", name, word])).ddpg.clip_targets_above is expected
+        assert training_config(parse(Train, ["--preset", name])).ddpg.clip_targets_above is not expected
 
 
 def test_auto_follows_the_hardware() -> None:
@@ -256,7 +267,7 @@ def test_help_explains_every_option(capsys: pytest.CaptureFixture[str], monkeypa
     for options in texts.values():
         for option, text in options.items():
             assert re.search(r"\w.*[.)]$", text), option
-    assert set(texts["train"]) >= {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(Config)} - {"--env"}
+    assert set(texts["train"]) >= {f"--{field.name.replace('_', '-')}" for field in fields.describe(Config)} - {"--env"}
     assert "(default: 32; paper 100, fast 64, debug 16)" in texts["train"]["--image-size"]
     assert "(default: True; paper False)" in texts["train"]["--clip-targets-above"]
     assert "(default: oracle)" in texts["train"]["--method"]

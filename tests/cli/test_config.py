@@ -11,12 +11,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxrl_vis import fields
-from jaxrl_vis.config import PRESETS, Config, Pixels, config_from_dict, preset
+from jaxrl_vis.config import PRESETS, Config, Pixels, config_from_dict, fields, preset, validate
+from jaxrl_vis.config.methods import METHODS, MethodName
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.methods import METHODS, MethodName
-from jaxrl_vis.resolved import resolve
-from jaxrl_vis.validation import validate
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis_envs.pixels import CHANNELS
 
 BAD_VALUES: tuple[tuple[str, Any, str], ...] = (
@@ -37,7 +35,7 @@ BAD_VALUES: tuple[tuple[str, Any, str], ...] = (
     ("weighting_log", True, "weighting_log is an option of weighting cosine"),
     ("aux_form", "release", "aux_form release is a form of auxiliary tasks, and there are none: add --aux-tasks"),
     ("randomize_strength", 3.0, "randomize_strength 3.0 has no effect: choose what varies with --randomize"),
-    ("replay_mean_age", 0, "replay_mean_age must be from 1 to"),
+    ("replay_mean_age", 0, "replay_mean_age must be at least 1, not 0"),
     ("trivial_goals", 1.5, "trivial_goals is a share and must lie in [0, 1]"),
     ("encoders", "joint", "encoders cannot be 'joint'"),
     ("num_envs", 10**20, "num_envs must be at most"),
@@ -72,7 +70,7 @@ def test_the_largest_seeds_are_different_ones() -> None:
     config = validate(preset("debug", seed=2**32 - 2, seeds=2))
     with pytest.raises(RequestError, match="seed 4294967294 is too large: the last of 3"):
         validate(config.replace(seeds=3))
-    first, last = (jax.random.key_data(jax.random.key(seed)) for seed in (config.seed, config.seed + 1))
+    first, last = (jax.random.key_data(jax.random.key(seed)) for seed in (config.run.seed, config.run.seed + 1))
     assert not np.array_equal(first, last)
 
 
@@ -85,11 +83,11 @@ def test_presets_make_sense_and_come_back_from_json(name: str) -> None:
 def test_a_preset_leaves_out_what_the_method_cannot_do() -> None:
     """The finger's presets look at true states, which indicator methods do without."""
     for name, env in (("fast", "VisualFingerTurn"), ("cpu", "FingerTurn")):
-        assert validate(preset(name, env=env)).trivial_goals < 1.0
-        assert validate(preset(name, env=env, trivial_goals=0.9)).trivial_goals == 0.9
+        assert validate(preset(name, env=env)).goals.trivial_goals < 1.0
+        assert validate(preset(name, env=env, trivial_goals=0.9)).goals.trivial_goals == 0.9
         for method in METHODS:
             config = validate(preset(name, env=env, method=method))
-            assert config.trivial_goals == 1.0 or METHODS[method].reward == "oracle"
+            assert config.goals.trivial_goals == 1.0 or METHODS[method].reward == "oracle"
     with pytest.raises(RequestError, match="indicatr"):
         validate(preset("fast", env="VisualFingerTurn", method="indicatr"))
 
@@ -97,50 +95,48 @@ def test_a_preset_leaves_out_what_the_method_cannot_do() -> None:
 def test_numbers_from_elsewhere_are_welcome() -> None:
     config = validate(preset("debug", seed=np.int64(3), action_noise=np.float32(0.5)))
     assert config_from_dict(dataclasses.asdict(config)) == config
-    assert isinstance(config_from_dict({"discount": 0}).discount, float)
+    assert isinstance(config_from_dict({"ddpg": {"discount": 0}}).ddpg.discount, float)
 
 
 def test_a_preset_shifts_images_where_there_are_some() -> None:
-    assert preset("fast", env="VisualFetchReach").random_shift > 0
-    assert preset("fast", env="VisualFetchReach", method="indicator").random_shift > 0
-    assert preset("fast", env="VisualFetchReach", random_shift=0).random_shift == 0
-    assert preset("fast", env="VisualHandReach").random_shift > 0
-    assert preset("fast", env="FetchReach").random_shift == preset("fast", env="HandReach").random_shift == 0
-    assert validate(preset("fast", env="VisualFetchReach", method="autoencoder")).random_shift == 0
+    assert preset("fast", env="VisualFetchReach").network.random_shift > 0
+    assert preset("fast", env="VisualFetchReach", method="indicator").network.random_shift > 0
+    assert preset("fast", env="VisualFetchReach", random_shift=0).network.random_shift == 0
+    assert preset("fast", env="VisualHandReach").network.random_shift > 0
+    assert preset("fast", env="FetchReach").network.random_shift == preset("fast", env="HandReach").network.random_shift == 0
+    assert validate(preset("fast", env="VisualFetchReach", method="autoencoder")).network.random_shift == 0
 
 
 def test_a_preset_relabels_as_the_method_and_the_observations_ask_for() -> None:
-    assert preset("fast", env="VisualFetchReach").balance_probability == 0.3
+    assert preset("fast", env="VisualFetchReach").goals.balance_probability == 0.3
     indicator = preset("fast", env="VisualFetchReach", method="indicator_balance_filter")  # with a balance of its own
-    assert (indicator.relabel_probability, indicator.balance_probability) == (0.8, None)
-    assert preset("cpu", env="VisualReacher").balance_probability == 0.3
+    assert (indicator.goals.relabel_probability, indicator.goals.balance_probability) == (0.8, None)
+    assert preset("cpu", env="VisualReacher").goals.balance_probability == 0.3
     for other in ({"env": "FetchReach"}, {"env": "Reacher"}, {"env": "VisualFetchReach", "method": "autoencoder"}):
         config = preset("cpu", **other)
-        assert (config.relabel_probability, config.balance_probability) == (0.9, None)
+        assert (config.goals.relabel_probability, config.goals.balance_probability) == (0.9, None)
 
 
 @pytest.mark.parametrize(
     ("values", "complaint"),
     [
         ([1], "a configuration must be a dictionary"),
-        ({"frames": "two"}, "frame_stack must be a whole number, not 'two'"),
-        ({"frames": 2, "frame_stack": 3}, "frame_stack is given twice"),
-        ({"batch_sizes": 2}, "unknown option 'batch_sizes'; did you mean batch_size"),
-        ({"num_envs": "abc"}, "num_envs must be a whole number, not 'abc'"),
-        ({"method": "indicator", "env": 5}, "env must be a word, not 5"),
-        ({"hidden_sizes": [8, None]}, "hidden_sizes must be a whole number, not None"),
-        ({"hidden_sizes": 8}, "hidden_sizes must be a list"),
-        ({"discount": [0.9]}, "discount must be a finite number"),
+        ({"rum": {}}, "unknown group of options 'rum'; did you mean run"),
+        ({"run": 3}, "run must be a dictionary of options, not int"),
+        ({"ddpg": {"batch_size": 2}}, "unknown option 'batch_size' in ddpg"),
+        ({"environment": {"frame_stack": "two"}}, "frame_stack must be a whole number, not 'two'"),
+        ({"run": {"batch_sizes": 2}}, "unknown option 'batch_sizes' in run; did you mean batch_size"),
+        ({"run": {"num_envs": "abc"}}, "num_envs must be a whole number, not 'abc'"),
+        ({"reward": {"method": "indicator"}, "environment": {"env": 5}}, "env must be a word, not 5"),
+        ({"network": {"hidden_sizes": [8, None]}}, "hidden_sizes must be a whole number, not None"),
+        ({"network": {"hidden_sizes": 8}}, "hidden_sizes must be a list"),
+        ({"ddpg": {"discount": [0.9]}}, "discount must be a finite number"),
     ],
 )
 def test_a_saved_configuration_of_the_wrong_types_is_refused_by_name(values: Any, complaint: str) -> None:
     with pytest.raises(RequestError) as refused:
         config_from_dict(values)
     assert complaint in str(refused.value) and "\n" not in str(refused.value)
-
-
-def test_fields_are_known_by_their_old_names() -> None:
-    assert config_from_dict({"frames": 3, "env": "VisualReacher"}) == Config(env="VisualReacher", frame_stack=3)
 
 
 def test_words_become_values() -> None:
@@ -164,7 +160,7 @@ def test_allowed_values_are_written_once() -> None:
 
 def test_defaults_follow_the_method() -> None:
     """Thesis, section 5.1.4: R+ = 1 and R- = -1 for the indicator; the filter's threshold is the middle of its band."""
-    resolved = {name: resolve(Config(method=name), 50) for name in METHODS}
+    resolved = {name: resolve(Config().replace(method=name), 50) for name in METHODS}
     discount = 1 - 1 / 50
     for name, (positive, balance) in {
         "oracle": (0.0, 0.0),
@@ -185,13 +181,13 @@ def test_defaults_follow_the_method() -> None:
 
 def test_a_threshold_needs_a_method_that_filters() -> None:
     with pytest.raises(RequestError, match="--method indicator_balance_filter"):
-        resolve(Config(filter_threshold=0.0), 50)
+        resolve(Config().replace(filter_threshold=0.0), 50)
     with pytest.raises(RequestError, match="outside its band"):
-        resolve(Config(method="indicator_balance_filter", filter_threshold=1000.0), 50)
+        resolve(Config().replace(method="indicator_balance_filter", filter_threshold=1000.0), 50)
 
 
 @pytest.mark.parametrize("option", [{"n_step": 3}, {"trivial_goals": 0.5}])
 @pytest.mark.parametrize("method", [name for name in METHODS if METHODS[name].reward != "oracle"])
 def test_what_reads_true_states_is_refused_where_there_are_none(option: dict[str, Any], method: MethodName):
     with pytest.raises(RequestError, match=next(iter(option))):
-        validate(Config(method=method, **option))
+        validate(Config().replace(method=method, **option))

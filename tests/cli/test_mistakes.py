@@ -49,7 +49,9 @@ def folder(here: Path) -> Path:
     """The current folder: runs/mine, which is trained no further than its config.json, and a task in my_task.py."""
     run = here / "runs" / "mine"
     (run / "checkpoints").mkdir(parents=True)
-    (run / "config.json").write_text(json.dumps({"schema": 1, "config": {"env": "Reacher", "preset": "debug"}}))
+    (run / "config.json").write_text(
+        json.dumps({"schema": 2, "config": {"environment": {"env": "Reacher"}, "run": {"preset": "debug"}}})
+    )
     (here / "my_task.py").write_text("class MyReach:\n    pass\n")
     (here / "model.zip").write_text("")
     return here

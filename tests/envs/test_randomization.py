@@ -13,8 +13,7 @@ from learners import train_iteration
 from point_mass import PointMass, PointMassConfig
 
 import jaxrl_vis_envs
-from jaxrl_vis import config as config_file
-from jaxrl_vis.config import preset
+from jaxrl_vis.config import groups, preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import make_train_step
@@ -236,7 +235,7 @@ def test_the_gpu_kernel_draws_varied_scenes(monkeypatch: pytest.MonkeyPatch) -> 
 def test_typical_ranges_and_bad_ones() -> None:
     assert typical() == OFF and not OFF.active
     assert typical("dynamics", strength=0.5).mass == 0.5 * KINDS["dynamics"]["mass"]
-    assert set(KINDS) == set(get_args(config_file.Randomized))
+    assert set(KINDS) == set(get_args(groups.Randomized))
     assert {name for kind in KINDS.values() for name in kind} == set(Randomization.__dataclass_fields__)
     for bad in (lambda: Randomization(mass=-0.1), lambda: Randomization(colour=float("nan")), lambda: Randomization(mass=1.0)):
         with pytest.raises(ValueError, match="of the randomization"):

@@ -39,7 +39,7 @@ def test_no_accelerator_where_one_is_asked_for(
     """Every command says in one line what was asked for, what there is and how to mend it."""
     run = tmp_path / "run"
     run.mkdir()
-    (run / "config.json").write_text(json.dumps({"schema": 1, "config": {"env": "Reacher"}}))
+    (run / "config.json").write_text(json.dumps({"schema": 2, "config": {"environment": {"env": "Reacher"}}}))
     (tmp_path / "my_task.py").write_text("import jax\njax.numpy.ones(3)")
     commands = [["doctor"], ["train"], ["train", "--preset", "debug"], ["train", "my_task:MyReach"], ["eval", str(run)]]
     commands += [["play", str(run)], ["envs"], ["bench", "env"]]

@@ -1,6 +1,5 @@
 """Parts of a person's own, one file each in a folder outside the package: those of docs/extending.md, trained as it says."""
 
-import dataclasses
 import json
 import re
 import sys
@@ -11,15 +10,15 @@ import pytest
 from doc_blocks import ROOT, blocks, commands
 
 import jaxrl_vis
-from jaxrl_vis import cli, fields
-from jaxrl_vis.config import Config, preset
+from jaxrl_vis import cli
+from jaxrl_vis.config import Config, fields, preset
+from jaxrl_vis.config.methods import METHODS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import plugins
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.environment import locate_env
 from jaxrl_vis.learner.train_step import ALGORITHMS
 from jaxrl_vis.learner.weighting import WEIGHTINGS
-from jaxrl_vis.methods import METHODS
 from jaxrl_vis.run import trust
 
 PAGE = ROOT / "docs" / "extending.md"
@@ -49,7 +48,7 @@ def test_a_part_of_ones_own_is_one_file_and_trains(elsewhere: Path, kind: str) -
     assert rows and all(np.isfinite(value) for row in rows for value in row.values() if isinstance(value, float))
     expected = {"method": "train/positive_share", "loss": "train/weight/flipped", "weighting": "train/loss/egomotion"}
     assert expected.get(kind, "train/imitation_loss") in rows[-1]
-    assert json.loads(Path("run", "config.json").read_text())["config"]["env_folder"] == str(elsewhere)
+    assert json.loads(Path("run", "config.json").read_text())["config"]["environment"]["env_folder"] == str(elsewhere)
     if kind == "algorithm":
         policy = jaxrl_vis.load_policy("run")
         image = np.zeros(policy.observation_spec.shape, np.uint8)
@@ -107,5 +106,5 @@ def test_names_are_those_of_the_registries() -> None:
         ("algorithm", ALGORITHMS),
     ):
         assert fields.choices(hints[field]) == tuple(known)
-    own = dataclasses.replace(Config(), method="a:b", aux_tasks=("egomotion", "c:d"))
+    own = Config().replace(method="a:b", aux_tasks=("egomotion", "c:d"))
     assert plugins.own_names(own) == {"method": "a:b", "aux_tasks 2": "c:d"}

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxrl_vis.config import preset
+from jaxrl_vis.config import preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import optical_flow
@@ -18,10 +18,9 @@ from jaxrl_vis.learner.memory.replay import Indices, Replay
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis.learner.weighting import make_weighting
-from jaxrl_vis.resolved import resolve
 from jaxrl_vis.types import Episodes, Statistics
-from jaxrl_vis.validation import validate
 
 SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 ACTIONS, HORIZON, EPISODES, BATCH = 2, 6, 4, 16
@@ -100,7 +99,9 @@ def learner(way=None, **overrides):
         return algorithm.apply(working, gradients), gradients, metrics
 
     batch = chosen_batch(stored("optical_flow" in auxiliary.tasks), drawn_places(), jax.random.key(2))
-    start = fresh(chosen.aux_tasks, chosen.encoders, chosen.target_encoder, chosen.encoder_filters)
+    start = fresh(
+        chosen.auxiliary.aux_tasks, chosen.network.encoders, chosen.network.target_encoder, chosen.network.encoder_filters
+    )
     start = start.replace(weighting=auxiliary.init_state(start.critic))
     return algorithm, update, algorithm.begin(start, Statistics(normalizer.init(SPEC), None)), batch
 

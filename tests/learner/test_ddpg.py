@@ -118,7 +118,7 @@ def test_one_trace_and_a_new_episode_every_time():
     goals = []
     for _ in range(3):
         loop, _ = train_iteration(program, loop)
-        written = (int(loop.iteration) - 1) % program.replay.num_rollouts * program.config.num_envs
+        written = (int(loop.iteration) - 1) % program.replay.num_rollouts * program.config.run.num_envs
         goals.append(np.asarray(loop.replay.episodes.states)[0, written, -1, 0])
     assert traces == 1
     assert len(set(goals)) == 3

@@ -8,7 +8,7 @@ import pytest
 from learners import begin, rollout, train_iteration
 from test_ddpg import DISCOUNT, trained
 
-from jaxrl_vis.config import preset
+from jaxrl_vis.config import preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.acting.rollout import add_noise
 from jaxrl_vis.learner.ddpg import diagnostics
@@ -17,11 +17,10 @@ from jaxrl_vis.learner.memory import reward_errors
 from jaxrl_vis.learner.memory.replay import Replay
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis.learner.train_step import make_train_step
-from jaxrl_vis.resolved import resolve
 from jaxrl_vis.run.storage.metrics import with_precision
 from jaxrl_vis.types import Batch, Episodes
-from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import goals
 
 BEST = 1.0 / (1.0 - DISCOUNT)

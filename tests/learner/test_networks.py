@@ -33,7 +33,7 @@ def test_the_encoder_is_a_stack_of_strided_convolutions(size):
         params = networks.init_critic(jax.random.key(0))
         frames = jax.random.randint(jax.random.key(1), (2, 3, size, size), 0, 256).astype(jnp.uint8)
         statistics = normalizer.update(normalizer.init(networks.observation_spec), frames[:, None])
-        scale = normalizer.scale(statistics, networks.config.normalizer_floor)
+        scale = normalizer.scale(statistics, networks.config.network.normalizer_floor)
         values = jnp.clip((frames - statistics.mean) * scale, -5, 5).transpose(0, 2, 3, 1)
         for level, filters in enumerate((4, 8, 16)):
             kernel = params["encoder"][f"kernel_{level}"].reshape(2, 2, -1, filters)

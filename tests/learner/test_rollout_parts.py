@@ -82,7 +82,7 @@ def test_iterations_are_the_same(programs: Programs, whole: Programs) -> None:
 def test_rollouts_are_the_same_and_explore(program: TrainStep, programs: Programs, whole: Programs) -> None:
     train = programs.init(programs.run_keys).train
     parts = programs.play(train, programs.run_keys)
-    joined = jax.tree.map(lambda *leaves: join_parts(leaves, CONFIG.num_envs, axis=1), *parts)
+    joined = jax.tree.map(lambda *leaves: join_parts(leaves, CONFIG.run.num_envs, axis=1), *parts)
     (expected,) = whole.play(train, programs.run_keys)
     assert len(parts) == 2
     assert_near(joined, expected)
@@ -100,7 +100,7 @@ def test_a_gpu_plays_all_at_once(program: TrainStep, programs: Programs, whole: 
     """And evaluates with a program of its own."""
     assert (program.part_size, program.plays_any) == (5, True)
     assert set(programs.names) == {"play", "learn", "init", "broken_leaves", "keys"}
-    assert (whole.program.part_size, whole.program.plays_any) == (CONFIG.num_envs, False)
+    assert (whole.program.part_size, whole.program.plays_any) == (CONFIG.run.num_envs, False)
     assert set(whole.names) == {"play", "learn", "evaluate", "init", "broken_leaves", "keys"}
     assert set(programs.of_training()) == set(whole.of_training()) == {"play", "learn", "keys"}
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import cli
-from jaxrl_vis.config import Config, preset
+from jaxrl_vis.config import Config, preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
 from jaxrl_vis.learner.ddpg.ddpg import GradientSteps, make_ddpg
@@ -26,10 +26,9 @@ from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.parallel.sharding import make_layout
 from jaxrl_vis.learner.parallel.shards import DATA, Shards
-from jaxrl_vis.resolved import resolve
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis.run.compiled import memory
 from jaxrl_vis.types import Batch, Episodes, ReplayState, TrainState
-from jaxrl_vis.validation import validate
 
 
 @pytest.fixture(scope="module")
@@ -215,10 +214,12 @@ def make_batch(config: Config) -> Batch:
     keys = iter(jax.random.split(jax.random.key(2), 6))
     images = jax.random.randint(next(keys), (3, SIZE, 2, 16, 16), 0, 255).astype(jnp.uint8)
     success = jax.random.bernoulli(next(keys), 0.3, (SIZE,)).astype(jnp.float32)
-    reward = jnp.where(jax.random.bernoulli(next(keys), 0.4, (SIZE,)), 1.0, -1.0) if config.method != "autoencoder" else None
+    reward = (
+        jnp.where(jax.random.bernoulli(next(keys), 0.4, (SIZE,)), 1.0, -1.0) if config.reward.method != "autoencoder" else None
+    )
     actions, states = (jax.random.uniform(next(keys), (SIZE, 2), minval=-1.0) for _ in range(2))
     batch = Batch(images, actions, states, states, reward=reward, success=success)
-    if not config.aux_tasks:
+    if not config.auxiliary.aux_tasks:
         return batch
     auxiliary = make_auxiliary(config, SPEC, 2, 1, jnp.float32)
     return auxiliary.with_targets(jax.random.key(0), batch, {})
@@ -240,7 +241,7 @@ def test_gradients_and_metrics_of_parts_are_those_of_the_whole_batch(changes: di
     batch = jax.jit(functools.partial(make_batch, config))()
     train = jax.jit(functools.partial(make_learner, config))()
     whole = jax.jit(functools.partial(gradients, config, Shards()))(train, batch)
-    filters = config.method == "indicator_balance_filter"
+    filters = config.reward.method == "indicator_balance_filter"
     assert 0.0 < whole[1]["train/filtered_share"] < 1.0 if filters else whole[1]["train/filtered_share"] == 0.0
 
     def part_of(leaf: jax.Array) -> jax.Array:

@@ -17,7 +17,7 @@ from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.memory.replay import Indices, make_replay
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
-from jaxrl_vis.resolved import resolve
+from jaxrl_vis.learner.resolved import resolve
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis.types import Episodes
 from jaxrl_vis_envs.base import push_history, start_history

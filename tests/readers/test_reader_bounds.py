@@ -25,9 +25,10 @@ from jaxrl_vis.stalks.grasping.masks import painter
 from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io import masks
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name, readable
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
 from jaxrl_vis.stalks.phenotyping.report.tables import write_rows
 from jaxrl_vis_envs.plants import read

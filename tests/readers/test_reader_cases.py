@@ -1,6 +1,7 @@
 """What readers of files from outside say of cases that spoilt files (test_readers.py) seldom come to, one by one."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import weights_file
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, find_plots, read_odometry
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_disparity, read_image
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 
 SIZE = {"width": 20, "height": 12}
 OUTLINE = [2, 3, 8, 3, 8, 9]
@@ -65,6 +67,10 @@ def test_rows_of_odometry_are_those_of_pairs(tmp_path):
     "table, told",
     [
         ("", "needs a column distance_m, or time_s and --speed"),
+        ("left,distance\nleft_0.png,1\n", "its column distance does not say its unit"),
+        ("time_s\n1608946479573159936\n1608946479673159936\n", "name the column time_ns"),
+        ("distance_m\n1\n\n,\nfar\n", "no number in line 5 ('far')"),
+        ("left;distance_m\nleft_0.png;1,2,3\n", "no number in line 2 ('1,2,3')"),
         ("left,metres\nleft_0.png,1\n", "needs a column distance_m, or time_s and --speed"),
         ("distance_m\n1\n", "has 1 rows for 2 pairs, so nobody can tell which is which"),
         ("distance_m\n1\n2\n3\n", "has 3 rows for 2 pairs, so nobody can tell which is which"),
@@ -174,13 +180,13 @@ def test_annotations_that_are_not_there_or_cannot_be_read_are_told(tmp_path):
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(RequestError, match="there are no annotations in "):
             read_annotations(folder)
-    for name in ("a.xml", "annotations.json"):
-        (tmp_path / name).mkdir()
+    for name, make in (("a.xml", os.mkfifo), ("annotations.json", os.mkdir)):
+        make(tmp_path / name)
         with pytest.raises(RequestError, match=f"cannot read .*{name}: "):
             read_annotations(tmp_path)
 
 
-def test_shapes_of_labelme_that_enclose_nothing_are_left_out(tmp_path):
+def test_shapes_of_labelme_that_enclose_nothing_are_told(tmp_path):
     shapes = [
         {"label": "stalk", "points": [[1, 2], [3, 2], [3, 5]]},
         {"label": "stalk", "points": [[1, 2], [3, 2]]},
@@ -188,6 +194,12 @@ def test_shapes_of_labelme_that_enclose_nothing_are_left_out(tmp_path):
         {"label": "stalk", "shape_type": "circle", "points": [[1, 2], [3, 2], [3, 5]]},
     ]
     data = {"imagePath": "x\\a.png", "imageWidth": 20, "imageHeight": 12, "shapes": shapes}
+    for place, told in ((1, "annotation 2 is a polygon of 2 points"), (3, "annotation 4 is a circle, which has no width")):
+        data["shapes"] = [shapes[0]] * place + [shapes[place]]
+        (tmp_path / "a.json").write_text(json.dumps(data))
+        with pytest.raises(RequestError, match=told):
+            read_annotations(tmp_path)
+    data["shapes"] = [shapes[0], shapes[2]]
     (tmp_path / "a.json").write_text(json.dumps(data))
     assert [each["bbox"] for each in read_annotations(tmp_path)["annotations"]] == [[1, 2, 2, 3], [2, 3, 4, 4]]
 

@@ -4,6 +4,7 @@ Valid files are spoilt (`mutations`) and read in another process (`readers_worke
 kind at least a third of the examples come past the parser. `make fuzz` tries many more, and other ones each time.
 """
 
+import base64
 import json
 import os
 from collections import Counter
@@ -99,6 +100,52 @@ def test_calibrations_of_ros(worker):
     hold(worker, "calibration", both)
 
 
+def _lines(tree, mark: str) -> str:
+    """A table of names and values as programs print it, a line each."""
+    return "".join(f"{name}{mark}{value}\n" for name, value in tree.items()) if isinstance(tree, dict) else str(tree)
+
+
+_CAMERA = {"camera_model": "pinhole", "intrinsics": [500.0, 501.0, 319.5, 239.5], "resolution": [640, 480]}
+_CAMERA |= {"distortion_model": "radtan", "distortion_coeffs": [0.1, 0.0, 0.0, 0.0]}
+_POSE = [[1.0, 0.0, 0.0, -0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+KALIBR = {"cam0": _CAMERA, "cam1": {**_CAMERA, "resolution": [640, 480], "T_cn_cnm1": _POSE}}
+REALSENSE = {"baseline": "-50.0", "rectified.0.width": "640", "rectified.0.height": "480", "rectified.0.fx": "500.0"}
+REALSENSE |= {"rectified.0.ppx": "319.5", "rectified.0.ppy": 239.5}
+MIDDLEBURY = {"cam0": "[500 0 319.5; 0 500 239.5; 0 0 1]", "cam1": "[500 0 340.5; 0 500 239.5; 0 0 1]", "doffs": 21.0}
+MIDDLEBURY |= {"baseline": 100.0, "width": 640, "height": 480}
+KITTI = {name: " ".join(map(str, matrix)) for name, matrix in (("P0", _MATRIX), ("P1", _RIGHT))}
+_CAM = {"fx": 500, "fy": 501.5, "cx": 319.5, "cy": 239.5, "k1": -0.1}
+ZED = {"LEFT_CAM_VGA": _CAM, "RIGHT_CAM_VGA": _CAM, "STEREO": {"Baseline": 120.1, "RX_VGA": 0.01, "CV_VGA": 0.0, "RZ_VGA": 0.0}}
+SECTIONS = {"image": {"width": 640, "height": 480}}
+SECTIONS |= {f"rig/{side}": {"projection": " ".join(map(str, matrix))} for side, matrix in (("l", _MATRIX), ("r", _RIGHT))}
+
+
+def _sections(tree, mark: str) -> str:
+    parts = tree.items() if isinstance(tree, dict) else ()
+    return "".join(f"[{name}]\n{_lines(values, mark)}\n" for name, values in parts)
+
+
+def test_calibrations_of_other_programs(worker):
+    """kalibr, RealSense, Middlebury, KITTI, ZED, and the older form of ROS."""
+    chains = also_as_text(
+        trees(KALIBR).map(lambda tree: yaml_text(json.loads(json.dumps(tree)))), yaml_text(json.loads(json.dumps(KALIBR)))
+    )
+    tables = also_as_text(trees(REALSENSE).map(json_text), json_text(REALSENSE))
+    middlebury = also_as_text(trees(MIDDLEBURY).map(lambda tree: _lines(tree, "=")), _lines(MIDDLEBURY, "="))
+    kitti = also_as_text(trees(KITTI, 1).map(lambda tree: _lines(tree, ": ")), _lines(KITTI, ": "))
+    zed = also_as_text(trees(ZED).map(lambda tree: _sections(tree, "=")), _sections(ZED, "="))
+    ros = also_as_text(trees(SECTIONS).map(lambda tree: _sections(tree, "\n")), _sections(SECTIONS, "\n"))
+    forms = {
+        "chain.yaml": chains,
+        "d435.json": tables,
+        "calib.txt": middlebury,
+        "calib_k.txt": kitti,
+        "SN1.conf": zed,
+        "ost.txt": ros,
+    }
+    hold(worker, "cameras", st.one_of(named(name, data) for name, data in forms.items()))
+
+
 # --- annotations ---
 _PIXELS = ANNOTATED[0] * ANNOTATED[1]
 _SIZE = list(ANNOTATED)
@@ -178,13 +225,60 @@ def test_annotations_of_labelme(worker):
     hold(worker, "labelme", named("a.json", also_as_text(trees(LABELME).map(json_text), json_text(LABELME))))
 
 
+_SHARE = {"x": 20.0, "y": 10.0, "width": 30.0, "height": 50.0, "rotation": 0.0, "rectanglelabels": ["stalk"]}
+_SHAPE = {"value": _SHARE, "original_width": ANNOTATED[1], "original_height": ANNOTATED[0]}
+_OUTLINE = {"points": [[10, 10], [40, 10], [40, 80]], "polygonlabels": ["stalk"]}
+LABEL_STUDIO = [{"data": {"image": "/data/a.png"}, "annotations": [{"result": [_SHAPE, {**_SHAPE, "value": _OUTLINE}]}]}]
+_MASK = base64.b64encode(cv2.imencode(".png", np.full((30, 6), 255, np.uint8))[1].tobytes()).decode()
+PAINTED = {
+    **LABELME,
+    "imagePath": "a.png",
+    "shapes": [
+        {"label": "stalk", "shape_type": "mask", "points": [[10, 10], [15, 39]], "mask": _MASK},
+        {"label": "stalk", "shape_type": "rotation", "points": [[30, 10], [36, 10], [36, 40], [30, 40]], "group_id": 1},
+        {"label": "stalk", "shape_type": "polygon", "points": [[40, 10], [46, 10], [46, 40]], "group_id": 1},
+    ],
+}
+YOLO = [[0, 0.5, 0.5, 0.2, 0.4], [0, 0.1, 0.1, 0.3, 0.1, 0.3, 0.6], [1, 0.5, 0.5, 0.2, 0.4]]
+CVAT = (
+    '<annotations><image id="0" name="a.png" width="64" height="48"><box label="stalk" xtl="{}" ytl="10" xbr="20" ybr="{}"/>'
+    '<polygon label="stalk" points="30,10;36,10;{},40"/><mask label="stalk" rle="{}" left="40" top="10" width="6" height="30"/>'
+    "</image></annotations>"
+)
+TURNED = {**VOC, "object": [{"name": "stalk", "robndbox": {"cx": 15.0, "cy": 25, "w": 6, "h": 30, "angle": 0.1}}]}
+
+
+def test_annotations_of_other_programs(worker):
+    """Label Studio, LabelMe's masks, YOLO, CVAT and roLabelImg."""
+    studio = also_as_text(trees(LABEL_STUDIO).map(json_text), json_text(LABEL_STUDIO))
+    painted = also_as_text(trees(PAINTED).map(json_text), json_text(PAINTED))
+    rows = trees(YOLO).map(lambda tree: "\n".join(" ".join(map(str, row)) for row in tree if isinstance(row, list)))
+    names = st.sampled_from(("stalk\nleaf\n", "leaf\n", ""))
+    yolo = st.tuples(also_as_text(rows, "0 0.5 0.5 0.2 0.4\n"), names)
+    values = st.sampled_from(("10", "12.5", "-3", "nan", "1e400", "x", "", "0,180", "0, 90, 90", "10, 160, 9", "1e9", "180"))
+    cvat = st.lists(values, min_size=4, max_size=4).map(lambda four: CVAT.format(*four))
+    whole = CVAT.format("10", "40", "36", "0, 180")
+    turned = also_as_text(trees(TURNED).map(lambda tree: xml_text(tree, "annotation")), xml_text(TURNED, "annotation"))
+    forms = [
+        named("tasks.json", studio),
+        named("a.json", painted),
+        yolo.map(lambda both: {"a.txt": both[0], "classes.txt": both[1].encode()}),
+        named("annotations.xml", st.one_of(written(cvat), texts(whole))),
+        named("a.xml", turned),
+    ]
+    hold(worker, "annotations", st.one_of(forms))
+
+
 # --- tables ---
-_HEAD = ("pair", "left", "time_s", "distance_m")
-_ROWS = [[str(place), f"left_{name}.png", f"{0.1 * place:.4f}", f"{0.06 * place:.5f}"] for place, name in enumerate(PAIRS)]
+_HEAD = ("pair", "left", "time_s", "distance_m", "x", "y", "latitude", "longitude")
+_ROWS = [
+    [str(place), f"left_{name}.png", *(f"{step * place:.5f}" for step in (0.1, 0.06, 0.06, 0.01, 1e-5, 0.0))]
+    for place, name in enumerate(PAIRS)
+]
 
 
 def test_odometries(worker):
-    columns = st.lists(st.sampled_from(_HEAD), min_size=1, max_size=4, unique=True)
+    columns = st.lists(st.sampled_from(_HEAD), min_size=1, max_size=5, unique=True)
     cells = st.sampled_from(("", "1e400", "nan", "x", "'=1", '"', "-1", "٣", "left_000.png", "../left_001.png", "1_0", " 1 "))
 
     @st.composite
@@ -203,12 +297,26 @@ def test_odometries(worker):
     hold(worker, "odometry", named("odometry.csv", st.one_of(tables(), tables(), texts(valid))))
 
 
+def test_plans_of_fields(worker):
+    head = ["plot_id", "range", "row", "genotype"]
+    cells = st.sampled_from(("", "plot_000", "plot_001", "1", "x", "'=1", '"', "\0", "A;B", "x" * 300))
+    rows = st.lists(st.lists(cells, min_size=0, max_size=5), max_size=6).map(
+        lambda rows: [head, ["plot_000", "1", "2", "A"], *rows]
+    )
+    mark = st.sampled_from((",", ";", "\t"))
+    tables = st.tuples(rows, mark).map(lambda both: "\n".join(both[1].join(row) for row in both[0]))
+    valid = "plot,range\n0,1\n1,1\n2,2\n"
+    hold(worker, "plan", named("plan.csv", st.one_of(written(tables), texts(valid))))
+
+
 # --- images ---
 def _images() -> dict[str, bytes]:
     rng = np.random.default_rng(0)
     colour = rng.integers(0, 255, (*IMAGE, 3), np.uint8)
     kinds = {".png": colour, ".jpg": colour, ".tiff": colour, "16.png": rng.integers(0, 60000, IMAGE, np.uint16)}
     encoded = {f"a{end}": cv2.imencode(f".{end.rpartition('.')[2]}", image)[1].tobytes() for end, image in kinds.items()}
+    bitmaps = {".bmp": colour, ".ppm": colour, ".pgm": rng.integers(0, 60000, IMAGE, np.uint16)}
+    encoded |= {f"b{end}": cv2.imencode(end, image)[1].tobytes() for end, image in bitmaps.items()}
     encoded["big.tiff"] = cv2.imencode(".tiff", kinds["16.png"])[1].tobytes()
     return encoded
 
@@ -235,6 +343,13 @@ def test_images(worker):
 
 
 _WORDS = (
+    "cam0",
+    "cam1",
+    "im",
+    "raw",
+    "rect",
+    "1608946479.47",
+    "1608946479473160331",
     "left",
     "right",
     "L",
@@ -260,7 +375,8 @@ def test_names_of_images(worker):
     """Any names in any folders; the files are empty."""
     stem = st.lists(st.sampled_from(_WORDS), min_size=1, max_size=4).map("".join)
     name = st.tuples(stem, st.sampled_from(_ENDS)).map("".join)
-    alone = st.tuples(st.sampled_from(("", "", "left/", "right/", "L/", "R/", "plot/", "disparity/")), name).map("".join)
+    folders = ("", "", "left/", "right/", "L/", "R/", "plot/", "a/b/", "disparity/", "cam0/", "cam1/data/", "image_02/")
+    alone = st.tuples(st.sampled_from(folders), name).map("".join)
     pair = alone.flatmap(lambda one: st.just([f"left_{one}".replace("/", "_"), f"right_{one}".replace("/", "_")]))
     nested = st.sampled_from(("left/0.png", "right/0.png", "left/1.png", "right/1.png")).map(lambda one: [one])
     names = st.lists(alone.map(lambda one: [one]) | pair | nested, min_size=1, max_size=6).map(lambda lists: sum(lists, []))

@@ -30,13 +30,11 @@ from jaxrl_vis import cli, config
 from jaxrl_vis.cli.checks import check_env
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import OPTIONS, RESUMABLE, Config, marked, validate
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run import trainer
 from jaxrl_vis.run.storage import metrics
-from jaxrl_vis.run.storage.folder import MAY_CHANGE
-from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.names import TASKS
 
@@ -100,7 +98,7 @@ def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 def missing(what: str) -> bool:
     """Returns True if a requirement in a mark is missing: a module, a name in one, or an option of `train`."""
     if what.startswith("--"):
-        return what[2:] not in {field.name for field in (*dataclasses.fields(Config), *dataclasses.fields(Train))}
+        return what[2:] not in {*OPTIONS, *(field.name for field in dataclasses.fields(Train))}
     module, _, name = what.rpartition(".")
     try:
         if importlib.util.find_spec(what) is not None:
@@ -166,11 +164,11 @@ def test_what_is_typed_first_suits_a_laptop(page: Path) -> None:
     assert call is not None
     asked = eval(call[0], {"jaxrl_vis": jaxrl_vis})
     program = make_train_step(make_env(asked), asked)
-    assert asked.seeds * program.replay_bytes < 2**30
+    assert asked.run.seeds * program.replay_bytes < 2**30
 
 
 def checked_environment(env: str, env_options: tuple[str, ...], randomize: tuple[str, ...]) -> None:
-    make_env(Config(env=env, env_options=env_options, randomize=randomize))  # type: ignore[arg-type]
+    make_env(Config().replace(env=env, env_options=env_options, randomize=randomize))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("page", pages_with("sh"), ids=page_name)
@@ -192,7 +190,7 @@ def test_shell_blocks_could_be_typed(page: Path, reader: Path) -> None:
                 options = parse(cli.all_commands()[name][0], rest)
                 if name == "train":
                     asked = validate(training_config(options))
-                    checked_environment(asked.env, asked.env_options, asked.randomize)
+                    checked_environment(asked.environment.env, asked.environment.env_options, asked.environment.randomize)
                 elif name == "bench" and options.env:
                     check_env(options.env)
 
@@ -248,13 +246,13 @@ def load_tool(name: str) -> Any:
 def test_the_configuration_page_is_that_of_the_source() -> None:
     tool = load_tool("configuration")
     assert tool.PAGE.read_text() == tool.page(tool.PAGE.read_text()), "run python docs/tools/configuration.py"
-    assert set(read_keys(tool.PAGE, "fields")) == {field.name for field in dataclasses.fields(Config)}
+    assert set(read_keys(tool.PAGE, "fields")) == set(OPTIONS)
 
 
 def test_runs_page_lists_what_may_change_and_every_exit_status() -> None:
     page = (DOCS / "runs.md").read_text()
     fields = page.partition("These fields may change: ")[2].partition(". ")[0]
-    assert set(re.findall(r"`(\w+)`", fields)) == set(MAY_CHANGE)
+    assert set(re.findall(r"`(\w+)`", fields)) == set(marked(RESUMABLE))
     statuses = {int(status) for status in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
     assert statuses == {0, 1, 3, 130, 143} | set(cli._STATUS.values())
 
@@ -264,11 +262,11 @@ def test_thesis_options_are_fields() -> None:
     paper = config.PRESETS["paper"]
     for name, value in re.findall(r"`(\w+)=([^`]+)`", page):
         if name not in ("method", "env_options"):
-            assert getattr(paper, name) == eval(value), name
+            assert paper.value(name) == eval(value), name
     for line in page.splitlines():
         if line.startswith("| ") and "(5" in line or "eq. 5" in line:
             options = re.findall(r"`(\w+)`", line.split("|")[3])
-            assert set(options) <= {field.name for field in dataclasses.fields(Config)}
+            assert set(options) <= set(OPTIONS)
 
 
 def test_the_table_of_tasks_is_that_of_the_environments() -> None:
@@ -277,7 +275,7 @@ def test_the_table_of_tasks_is_that_of_the_environments() -> None:
     cells = {name: [cell.strip() for cell in rest.split("|")] for name, rest in rows}
     assert set(cells) == set(TASKS)
     for name, (goal, action, horizon, threshold, period, chance, difficulty) in cells.items():
-        env = jaxrl_vis.learner.environment.make_env(Config(env=name))
+        env = jaxrl_vis.learner.environment.make_env(Config().replace(env=name))
         assert env.chance is not None
         assert goal.endswith(f", {env.goal_state_size}") and int(action.split(":")[0]) == env.action_size
         assert int(horizon) == env.horizon and threshold == f"{env.threshold:g} {env.distance_unit}"
@@ -327,7 +325,7 @@ def test_every_page_is_in_the_menu_and_reached_from_the_readme() -> None:
             or f"(docs/{page.name})" in readme
             or f"({page.name})" in "".join(other.read_text() for other in DOCS.glob("*.md"))
         )
-    for guide in ("tasks", "learner", "configuration", "runs", "extending", "adapters", "renderer", "glossary"):
+    for guide in ("start", "tasks", "learner", "configuration", "runs", "extending", "adapters", "renderer", "glossary"):
         assert f"(docs/{guide}.md)" in readme
 
 
@@ -401,6 +399,17 @@ def test_columns_of_the_site_are_wide_enough_to_read() -> None:
     assert fit("<td><code>image_size 16</code></td>") == "<td><code>image_size 16</code></td>"
 
 
+def test_rows_of_wide_tables_have_labels_for_phones() -> None:
+    label = load_tool("hooks").label_cells
+    head = "<table><thead><tr><th>a</th><th>b &amp; <code>c</code></th><th>d</th></tr></thead>"
+    narrow = head + "<tbody><tr><td>1</td><td>2</td><td>3</td></tr></tbody></table>"
+    assert label(narrow) == narrow
+    wide = label(narrow.replace("<td>2", '<td class="long">2'))
+    assert wide.startswith("<table data-cards>") and "<th>a</th>" in wide
+    assert '<td data-label="a">1</td><td data-label="b &amp; c" class="long">2</td>' in wide
+    assert "[data-cards] td" in (DOCS / "site.css").read_text()
+
+
 def test_pages_of_the_site_name_files_that_it_does_not_hold() -> None:
     hooks = load_tool("hooks")
     assert (
@@ -408,3 +417,4 @@ def test_pages_of_the_site_name_files_that_it_does_not_hold() -> None:
     )
     assert hooks.name_files_outside("[benchmarks/results](../benchmarks/results)") == "`benchmarks/results`"
     assert hooks.name_files_outside("![image](../x.png)") == "![image](../x.png)"
+    assert hooks.name_files_outside("[a](../b.md) [c](../../d.py)", depth=1) == "[a](../b.md) c (`d.py`)"

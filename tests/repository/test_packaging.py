@@ -19,14 +19,10 @@ ROOT = Path(__file__).resolve().parents[2]
 # file of a folder may have a row of its own.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "host"),  # `host` itself is empty
-    ("fields",),
-    ("methods",),
     ("config", "types"),
-    ("validation",),
     ("host.cache_entries", "host.provenance", "host.spreadsheets", "host.streams"),
     ("host.files",),
     ("host.devices", "host.distributed", "host.plugins", "host.weights_file"),
-    ("resolved",),
     ("learner",),
     ("report",),
     ("run",),

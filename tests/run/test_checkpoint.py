@@ -13,11 +13,12 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
 
-from jaxrl_vis.errors import RequestError
-from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.errors import RequestError, Terminated
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, REPLACED, Checkpoints
 
 FAKE = Path(__file__).parents[1] / "fake_program.py"
 
@@ -237,3 +238,51 @@ def test_kill_while_saving_keeps_the_checkpoint_before(tmp_path, clean_environme
     assert restored.tier == FULL and restored.iteration >= newest and not lines
     assert int(restored.loop.iteration) == restored.iteration
     assert not [name for name in os.listdir(full) if "tmp" in name]  # and the half-written one is gone
+
+
+def test_a_checkpoint_that_is_still_being_written_is_not_written_twice(tmp_path, monkeypatch):
+    """A signal comes right after the light checkpoint of an iteration was begun, and the disk is slow."""
+    save, iterations, saved = Checkpoints._save, Checkpoints.iterations, []
+
+    def complete(checkpoints, tier):
+        return [number for number in iterations(checkpoints, tier) if (tier, number) not in checkpoints._unsummed]
+
+    def interrupted(checkpoints, tier, iteration, items, progress):
+        save(checkpoints, tier, iteration, items, progress)
+        saved.append((tier, iteration))
+        if len(saved) == 1:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Checkpoints, "iterations", complete)
+    monkeypatch.setattr(Checkpoints, "_save", interrupted)
+    with pytest.raises(Terminated):
+        list(make_fake_trainer(small_config(full_checkpoint_interval=0), tmp_path / "run").run())
+    assert saved[0][0] == LIGHT and saved.count(saved[0]) == 1
+
+
+@pytest.mark.parametrize("tier", [LIGHT, FULL])
+def test_a_kill_while_a_checkpoint_is_replaced_leaves_the_old_one(states, saved, tier, monkeypatch):
+    loops, shapes = states
+
+    class KilledError(BaseException):
+        pass
+
+    def killed(*_, **__):
+        raise KilledError
+
+    replacing = Checkpoints(saved)
+    monkeypatch.setattr(ocp.CheckpointManager, "save", killed)
+    with pytest.raises(KilledError):
+        replacing._save(tier, 3, {}, {})
+    monkeypatch.undo()
+    shutil.rmtree(saved / (FULL if tier == LIGHT else LIGHT))
+    resumed = Checkpoints(saved)
+    restored = resumed.restore_for_resume(shapes)
+    assert (restored.tier, restored.iteration, restored.progress) == (tier, 3, {"wall_s": 4.5})
+
+    (resumed.save_light if tier == LIGHT else resumed.save_full)(
+        3, loops[2].train if tier == LIGHT else loops[2], {"wall_s": 9.0}
+    )
+    resumed.close()
+    assert Checkpoints(saved).restore_for_resume(shapes).progress == {"wall_s": 9.0}
+    assert not (saved / REPLACED).exists()

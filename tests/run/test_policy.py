@@ -96,7 +96,7 @@ def test_it_acts_as_the_learner_does(name: str, seeds: tuple[int, ...], runs: di
         assert np.ptp(actions[-1]) > 1e-4
     if len(seeds) > 1:
         assert not np.allclose(*actions)
-        assert policies[name].seed == 3 and policies[name].config.seeds == 2
+        assert policies[name].seed == 3 and policies[name].config.run.seeds == 2
 
 
 def test_it_works_inside_a_scan(policies: dict[str, jaxrl_vis.Policy]) -> None:
@@ -196,11 +196,11 @@ def test_it_plays_in_gymnasium(name: str, policies: dict[str, jaxrl_vis.Policy])
     assert not np.array_equal(envs.learner_view()[0][0], envs.learner_view()[0][1])
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/adapters.md"])
+@pytest.mark.parametrize("page", ["docs/start.md", "docs/adapters.md"])
 def test_examples_of_the_pages_run(page: str, runs: dict[str, Path], checkout: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (checkout / page).read_text(), re.DOTALL)
     (block,) = [text for text in blocks if "load_policy" in text]
     names: dict[str, Any] = {"jax": jax, "jaxrl_vis": jaxrl_vis}
     exec(compile(block.replace("runs/mine", str(runs["VisualTold"])), page, "exec"), names)
     assert names["action"].shape == (1,)
-    assert page == "README.md" or names["actions"].shape == (16, 1) and names["truncated"]
+    assert page == "docs/start.md" or names["actions"].shape == (16, 1) and names["truncated"]

@@ -303,7 +303,7 @@ def test_a_place_for_results_that_no_system_knows_is_one_line(capsys, words):
 
 
 @pytest.mark.parametrize("words", [["eval"], ["play"], ["train", "--resume", "--run-dir"]], ids=["eval", "play", "resume"])
-@pytest.mark.parametrize("contents", [b"[" * 10**5, b'{"schema": 1, "log": 5}', b'{"schema": 1, "run_id": 5}', b"\xff", b"[]"])
+@pytest.mark.parametrize("contents", [b"[" * 10**5, b'{"schema": 2, "log": 5}', b'{"schema": 2, "run_id": 5}', b"\xff", b"[]"])
 def test_a_config_file_that_cannot_be_used_is_one_line(tmp_path, capsys, words, contents):
     (tmp_path / "config.json").write_bytes(contents)
     assert cli.main([*words, str(tmp_path)]) == 2

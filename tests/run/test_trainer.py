@@ -40,7 +40,7 @@ def test_a_run_reports_logs_and_draws(straight, capsys):
     assert rows[3]["train/critic_loss"] == pytest.approx(means, rel=1e-6)
     assert (path / "curve.png").stat().st_size > 10_000 and (path / "video.gif").stat().st_size > 3_000
     record = json.loads((path / "config.json").read_text())
-    assert record["schema"] == 1 and record["config"]["num_envs"] == 2 and record["versions"]["jax"] == jax.__version__
+    assert record["schema"] == 2 and record["config"]["run"]["num_envs"] == 2 and record["versions"]["jax"] == jax.__version__
     assert {"git_revision", "preset", "device"} <= set(record)
     assert read_config(path) == small_config()
 
@@ -200,7 +200,7 @@ def test_init_takes_one_key_or_one_per_seed():
 
 def test_names_of_default_folders():
     assert default_folder(Config()) == Path("runs/VisualFetchReach-oracle-fast-seed0")
-    assert default_folder(Config(seeds=5)).name == "VisualFetchReach-oracle-fast-seeds0to4"
+    assert default_folder(Config().replace(seeds=5)).name == "VisualFetchReach-oracle-fast-seeds0to4"
 
 
 def test_metrics_file_survives_a_torn_line(tmp_path):

@@ -139,7 +139,7 @@ def test_a_cache_that_cannot_be_written_is_no_hindrance(stranger, cache):
 @pytest.mark.parametrize("env", ["a/b:Reach", "a:b:c", ":", "a\0b:Reach"])
 def test_a_task_that_is_not_so_written_is_one_line(stranger, capsys, env):
     record = json.loads((stranger / "config.json").read_text())
-    record["config"]["env"] = env
+    record["config"]["environment"]["env"] = env
     (stranger / "config.json").write_text(json.dumps(record))
     assert cli.main(["eval", "run"]) == 2
     assert capsys.readouterr().err.count("\n") == 1

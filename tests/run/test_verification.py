@@ -1,5 +1,6 @@
 """`jaxrl-vis verify`: a run is repeated, and whatever was changed in its folder is found."""
 
+import dataclasses
 import hashlib
 import json
 import math
@@ -13,7 +14,7 @@ import pytest
 from fake_program import FakeProgram, interrupted_at, small_config
 
 from jaxrl_vis import cli
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import Config, config_from_dict
 from jaxrl_vis.run.storage import recent
 from jaxrl_vis.run.storage.checkpoint import Checkpoints
 from jaxrl_vis.run.storage.folder import read_config, read_record, read_run_id
@@ -75,7 +76,7 @@ def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
 
 def change_config(path: Path, **changes: Any) -> None:
     record = json.loads((path / "config.json").read_text())
-    record["config"] |= changes
+    record["config"] = dataclasses.asdict(config_from_dict(record["config"]).replace(**changes))
     (path / "config.json").write_text(json.dumps(record))
 
 

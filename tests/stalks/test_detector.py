@@ -23,7 +23,7 @@ from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.images import rgb8
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_counts
 from jaxrl_vis.stalks.phenotyping.training.augment import move, vary_snips
-from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
+from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, _Pool, train
 from jaxrl_vis.stalks.phenotyping.training.examples import (
     MAX_STALKS,
     Example,
@@ -220,24 +220,52 @@ def drawing(seed: int) -> Example:
 
 
 def test_stalks_move_with_their_images():
-    """Where the image is bright after it was moved, there the stalk is."""
+    """Where the image is bright after it was moved, there the stalk is; some images are narrower than others."""
     examples = [drawing(seed) for seed in range(8)]
     images = np.zeros((8, 64, 64, 3), np.uint8)
     images[:, :60] = [each.image for each in examples]
     stalks, kinds = (np.stack([getattr(each, name) for each in examples]) for name in ("stalks", "kinds"))
-    sizes = jnp.tile(jnp.array([60, 64]), (len(images), 1))
-    moved, places, kinds = move(jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), sizes, jax.random.key(0))
+    sizes = np.tile([60, 64], (len(images), 1))
+    narrow = stalks[:, 0, 2] < 44
+    images[narrow, :, 48:], sizes[narrow, 1] = 0, 48
+    assert 0 < narrow.sum() < len(images)
+    moved, places, kinds = move(
+        jnp.asarray(images), jnp.asarray(stalks), jnp.asarray(kinds), jnp.asarray(sizes), jax.random.key(0)
+    )
     assert moved.dtype == jnp.uint8
     compared = 0
-    for image, stalk, kind in zip(np.asarray(moved), np.asarray(places)[:, 0], np.asarray(kinds)[:, 0]):
+    for image, stalk, kind, width in zip(np.asarray(moved), np.asarray(places)[:, 0], np.asarray(kinds)[:, 0], sizes[:, 1]):
         for line in range(int(np.ceil(stalk[1])), int(stalk[3]), 5):
             bright = np.flatnonzero(image[line, :, 0] > 120)
-            if kind == STALK and bright.size and bright[0] > 0 and bright[-1] < 63:
+            if kind == STALK and bright.size and bright[0] > 0 and bright[-1] < width - 1:
                 middle = stalk[4] + (stalk[5] - stalk[4]) * (line + 0.5 - stalk[1]) / (stalk[3] - stalk[1])
                 assert bright.mean() + 0.5 == pytest.approx(middle, abs=1.2)
                 assert stalk[0] - 1.2 <= bright[0] and bright[-1] + 1 <= stalk[2] + 1.2
                 compared += 1
     assert compared > 20
+
+
+def test_images_of_several_sizes_are_batched_together():
+    """A larger image that comes late makes batches larger; snips of a batch are of one size."""
+    plan = Plan(images=26, first=24, batch=16, snips=4)
+    small, large = drawing(0), drawing(1)
+    large = dataclasses.replace(
+        large, image=np.pad(large.image, ((0, 40), (0, 70), (0, 0))), snips=large.snips[:, :24], masks=large.masks[:, :24]
+    )
+    pool = _Pool([iter([small] * 24), iter([large, large])], plan)
+    try:
+        pool.fill(26)
+        rng = np.random.default_rng(0)
+        for _ in range(4):
+            images, stalks, kinds, sizes = pool.images(rng)
+            assert images.shape == (16, 128, 160, 3) and stalks.shape[:2] == kinds.shape
+            assert {tuple(size) for size in sizes} <= {(60, 64), (100, 134)}
+            for image, size in zip(images, sizes):
+                np.testing.assert_array_equal(image[size[0] :], 0)
+            strips = pool.strips(rng)
+            assert strips is not None and strips[0].shape[:3] == strips[1].shape
+    finally:
+        pool.close()
 
 
 @pytest.fixture(scope="module")

@@ -67,12 +67,20 @@ def test_training_goes_on_from_weights_and_boxes_leave_masks_alone(folder, weigh
     assert max(differences(tmp_path / "none.safetensors", weights).values()) < 1e-3  # they are kept in 16 bits
     assert train(tmp_path / "more.safetensors", folder, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
     said = capsys.readouterr().out
-    assert f"from {weights}" in said and "masks stay as they are" in said
+    assert f"from {weights}" in said and "masks stay as they are" in said and "stalks: stalk (3)" in said
     _, settings, about = read_weights(tmp_path / "more.safetensors")
     assert settings == dataclasses.replace(TINY, density=0.0)  # all the candidates of a new training
     assert about["origin"] == f"annotated images, from {weights}"
     changes = differences(tmp_path / "more.safetensors", weights)
     assert changes["detector"] > 1e-3 and changes["segmenter"] == 0.0
+
+
+def test_labels_name_stalks_of_data(folder, tmp_path, capsys):
+    out = str(tmp_path / "out.safetensors")
+    assert cli.main(["phenotype", "train", out, "--label", "stem"]) == 2
+    assert "--label goes with --data" in capsys.readouterr().err
+    assert cli.main(["phenotype", "train", out, "--data", str(folder), "--label", "stem", "leaf"]) == 2
+    assert "nothing is called stem, leaf there, but stalk (3)" in capsys.readouterr().err
 
 
 def test_outlines_teach_masks(folder, weights, tmp_path):
@@ -154,8 +162,8 @@ def test_what_is_wrong_with_an_annotation_is_told_with_its_number(tmp_path, anno
 @pytest.mark.parametrize(
     ("image", "part"),
     [
-        ({"width": None}, "image row.png needs a width and a height in pixels, not None and 60"),
-        ({"height": 0}, "image row.png needs a width and a height in pixels, not 64 and 0"),
+        ({"width": None, "file_name": "a.png"}, "image a.png needs a width and a height in pixels, not None and 60"),
+        ({"height": 0, "file_name": "a.png"}, "image a.png needs a width and a height in pixels, not 64 and 0"),
         ({"file_name": None}, "image number 1 needs an id and a file_name"),
     ],
 )

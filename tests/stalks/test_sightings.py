@@ -11,7 +11,8 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match, summary
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths
-from jaxrl_vis.stalks.phenotyping.io.folders import find_plots, read_odometries, read_odometry, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries, read_odometry, why_no_odometry
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, follow

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from jaxrl_vis import cli
+from jaxrl_vis.config import validate
 from jaxrl_vis.host.spreadsheets import to_csv
 from jaxrl_vis.run.storage.folder import SCHEMA
 from jaxrl_vis.studies import indicator
@@ -23,7 +24,6 @@ from jaxrl_vis.studies.figures.make import make_figure
 from jaxrl_vis.studies.figures.show import Request
 from jaxrl_vis.studies.figures.tables import Named, steps_table, weights_table
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, LEVELS, STUDIES, VARIANTS
-from jaxrl_vis.validation import validate
 from jaxrl_vis_envs import registry
 
 EVERY = 20_000
@@ -43,8 +43,8 @@ def made_up(cell: Cell, runs: Path, success: Callable[[int], float], every: int 
     rows = [
         {"seed": seed, "iteration": n, "env_steps": n * every, "updates": n * every // 100}
         | {"eval/success": min(1.0, max(0.0, success(n * every) + 0.01 * (seed - 2)))}
-        | {f"train/weight/{name}": extra.get(name, 1.0) * (1 + n / 100) for name in cell.config.aux_tasks}
-        for n in range(1, -(-cell.config.env_steps // every) + 1)
+        | {f"train/weight/{name}": extra.get(name, 1.0) * (1 + n / 100) for name in cell.config.auxiliary.aux_tasks}
+        for n in range(1, -(-cell.config.run.env_steps // every) + 1)
         for seed in cell.seeds
     ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -62,7 +62,7 @@ def all_cells(figure: str, tasks=(), variants=(), **scope) -> dict[tuple[str, st
 def test_the_cells_are_those_of_the_issue() -> None:
     cells = all_cells("5.4")
     assert len(cells) == 12 and all(len(parts) == 1 for parts in cells.values())
-    budgets = {(task, variant): parts[0].config.env_steps for (task, variant), parts in cells.items()}
+    budgets = {(task, variant): parts[0].config.run.env_steps for (task, variant), parts in cells.items()}
     assert {budgets[FETCH, name] for name in ("none", "balance", "cosine", "ol_aux_5")} == {250_000}
     assert {budgets[HAND, name] for name in ("none", "balance", "cosine", "ol_aux_5")} == {2_000_000}
     assert [budgets[FINGER, name] for name in ("none", "balance", "cosine", "ol_aux_5")] == [
@@ -72,24 +72,31 @@ def test_the_cells_are_those_of_the_issue() -> None:
         2_500_000,
     ]
     config = cells[FINGER, "ol_aux_5"][0].config
-    assert (config.preset, config.seed, config.seeds, config.frame_stack) == ("paper", 0, 5, 1)
-    assert (config.weighting, config.weighting_interval, config.aux_tasks) == ("ol_aux", 5, AUX_TASKS)
-    assert cells[FINGER, "none"][0].config.aux_tasks == ()
+    assert (config.run.preset, config.run.seed, config.run.seeds, config.environment.frame_stack) == ("paper", 0, 5, 1)
+    assert (config.auxiliary.weighting, config.auxiliary.weighting_interval, config.auxiliary.aux_tasks) == (
+        "ol_aux",
+        5,
+        AUX_TASKS,
+    )
+    assert cells[FINGER, "none"][0].config.auxiliary.aux_tasks == ()
     alone = all_cells("5.5")
-    assert alone[HAND, "egomotion"][0].config.aux_tasks == ("egomotion",)
-    assert {parts[0].config.env_steps for (task, _), parts in alone.items() if task != FETCH} == {1_000_000}
+    assert alone[HAND, "egomotion"][0].config.auxiliary.aux_tasks == ("egomotion",)
+    assert {parts[0].config.run.env_steps for (task, _), parts in alone.items() if task != FETCH} == {1_000_000}
     ablations = all_cells("5.7")
-    assert {(task, parts[0].config.env_steps) for (task, _), parts in ablations.items()} == {(FETCH, 250_000), (HAND, 600_000)}
-    assert ablations[HAND, "ol_aux_1"][0].config.weighting_interval == 1
-    assert ablations[HAND, "ol_aux_5_ablation"][0].config.weighting == "ol_aux_ablation"
+    assert {(task, parts[0].config.run.env_steps) for (task, _), parts in ablations.items()} == {
+        (FETCH, 250_000),
+        (HAND, 600_000),
+    }
+    assert ablations[HAND, "ol_aux_1"][0].config.auxiliary.weighting_interval == 1
+    assert ablations[HAND, "ol_aux_5_ablation"][0].config.auxiliary.weighting == "ol_aux_ablation"
 
 
 @pytest.mark.parametrize("preset", ["paper", "fast", "cpu", "debug"])
 def test_every_variant_can_be_made_with_every_preset(preset: str) -> None:
     for parts in all_cells("5.4", variants=tuple(VARIANTS), preset=preset).values():
         config = parts[0].config
-        assert config.updates_per_iteration % config.weighting_interval == 0
-        assert bool(config.aux_tasks) == (config.weighting not in ("none", "none_log"))
+        assert config.run.updates_per_iteration % config.auxiliary.weighting_interval == 0
+        assert bool(config.auxiliary.aux_tasks) == (config.auxiliary.weighting not in ("none", "none_log"))
 
 
 def test_families_keep_configurations_apart() -> None:
@@ -100,7 +107,7 @@ def test_families_keep_configurations_apart() -> None:
             for figure in STUDIES:
                 changes = {"env_options": options}
                 for parts in all_cells(figure, variants=tuple(VARIANTS), preset=preset, changes=changes).values():
-                    assert parts[0].config.env_options == options
+                    assert parts[0].config.environment.env_options == options
                     assert cells_by_name.setdefault(parts[0].name, parts[0]) == parts[0]
 
 
@@ -250,7 +257,7 @@ def test_rewards_with_and_without_ground_truth_are_compared(tmp_path: Path, caps
     runs, out = tmp_path / "runs", tmp_path / "f.png"
     study = indicator.STUDIES["5.1"]
     cells = make_cells(study, tuple(study.steps), study.variants, Scope("fast"))
-    assert {(cell.config.method, cell.config.image_size) for (cell,) in cells.values()} == {
+    assert {(cell.config.reward.method, cell.config.environment.image_size) for (cell,) in cells.values()} == {
         (method, size) for method in study.variants for size in (64, 100)
     }
     for (task, variant), (cell,) in cells.items():

@@ -75,7 +75,7 @@ class Script:
 
     def __call__(self, cell: Cell, folder: Path, goes_on: bool) -> Sequence[str]:
         self.calls.append((cell.family, goes_on))
-        words = [str(folder), str(cell.config.env_steps), str(cell.config.seeds), saved(cell)]
+        words = [str(folder), str(cell.config.run.env_steps), str(cell.config.run.seeds), saved(cell)]
         return [sys.executable, "-c", SCRIPT, *words, self.behaviour.get(cell.family, ""), *["--resume"] * goes_on]
 
 

@@ -32,8 +32,8 @@ def test_every_task_is_trained_with_every_method_and_seed(tmp_path: Path) -> Non
         "FetchReach-indicator-debug-seeds0to1-300",
         "FetchReach-indicator-debug-seed2-300",
     ]
-    assert len(cells) == 8 and {cell.config.env for cell in cells} == {"FetchReach", "Reacher"}
-    assert {(cell.config.method, cell.config.seed, cell.config.seeds) for cell in cells} == {
+    assert len(cells) == 8 and {cell.config.environment.env for cell in cells} == {"FetchReach", "Reacher"}
+    assert {(cell.config.reward.method, cell.config.run.seed, cell.config.run.seeds) for cell in cells} == {
         (method, *seeds) for method in ("oracle", "indicator") for seeds in ((0, 2), (2, 1))
     }
 

@@ -35,7 +35,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     program = make_train_step(settings.make_env(), config)
     comparison.check_config(program)
     ours = update.measure_program(program, settings)
-    if names := [name for name, value in LEFT_OUT.items() if getattr(preset, name) != value]:
+    if names := [name for name, value in LEFT_OUT.items() if preset.value(name) != value]:
         ours = dataclasses.replace(ours, config={**ours.config, "without": " ".join(names)})
     yield ours
     seeds = update.start(program).replace(iteration=jnp.zeros(1, jnp.int32))

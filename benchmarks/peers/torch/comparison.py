@@ -21,7 +21,7 @@ import numpy as np
 import jaxrl_vis_envs
 from jaxrl_vis.bench.record import Measurement
 from jaxrl_vis.bench.timing import measure as measure_time
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import OPTIONS, Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.ddpg.ddpg import make_ddpg
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
@@ -117,7 +117,7 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
 
         train = distinguishable(train, program, replay)
         pairs = [
-            (moments.mean, normalizer.scale(moments, config.normalizer_floor))
+            (moments.mean, normalizer.scale(moments, config.network.normalizer_floor))
             for moments in (train.statistics.observations, train.statistics.goals)
         ]
         return train, jax.vmap(choose)(jax.random.split(jax.random.key(11), STEPS)), pairs
@@ -136,7 +136,7 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
     losses, gradients = [], []
     with jax.default_matmul_precision("highest"):
         for index in range(STEPS):
-            turn = (index + 1) % config.actor_interval == 0
+            turn = (index + 1) % config.ddpg.actor_interval == 0
             choice = jax.tree.map(lambda leaf, index=index: leaf[index], choices)
             now, step_losses, step_gradients = jax.device_get(stepped(turn, now, replay, choice))
             losses.append(step_losses)
@@ -178,12 +178,12 @@ def compare(reference: Reference, losses: np.ndarray, gradients: Mapping[str, np
 def _rules(learner: Any, program: TrainStep, train: TrainState, encoder: str, dtype: Any) -> Any:
     """Make `learner.Rules` of a configuration. The parameters tell which networks have an encoder."""
     config, resolved = program.config, program.resolved
-    numbers = {**dataclasses.asdict(config), **dataclasses.asdict(resolved), "threshold": float(program.env.threshold)}
+    numbers = {**config.flat(), **dataclasses.asdict(resolved), "threshold": float(program.env.threshold)}
     known = {
         "encoder": encoder,
         "dtype": dtype,
-        "levels": len(config.encoder_filters),
-        "hidden": len(config.hidden_sizes),
+        "levels": len(config.network.encoder_filters),
+        "hidden": len(config.network.hidden_sizes),
         "shared_encoder": "encoder" not in train.agent.actor,
         "target_encoder": "encoder" in train.agent.target_critic,
         "actor_interval": numbers.get("actor_interval", 1),
@@ -283,9 +283,9 @@ def check_config(program: TrainStep) -> None:
     """
     config: Config = program.config
     for name in ("random_shift", "n_step", "trivial_goals", "replay_mean_age"):
-        if getattr(config, name) != getattr(Config, name):
-            raise RequestError(f"the peer torch does not have {name}: leave it at {getattr(Config, name)}")
-    if config.method != "oracle" or not program.networks.sees_images:
+        if config.value(name) != OPTIONS[name].default:
+            raise RequestError(f"the peer torch does not have {name}: leave it at {OPTIONS[name].default}")
+    if config.reward.method != "oracle" or not program.networks.sees_images:
         raise RequestError("the peer torch learns from images with the method oracle: choose a Visual environment")
 
 

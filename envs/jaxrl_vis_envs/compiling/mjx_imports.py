@@ -47,7 +47,7 @@ def _defer_mesh_libraries() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hide_notice() -> Iterator[None]:
-    """Print the output from inside without MJX's notice."""
+    """Remove MJX's notice from the output printed in this context."""
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed):

@@ -1,1 +1,1 @@
-"""Acting: rollouts, in parts or whole, and evaluations."""
+"""Rollouts, whole or in parts, and evaluations."""

@@ -1,4 +1,4 @@
-"""Play whole episodes with the current policy, all environments in step.
+"""Rollouts: whole episodes of the current policy, with all environments in lockstep.
 
 reset S x E environments (each draws its goal image once)
 scan over T:  act -> advance -> observe        observations [T, S, E, ...], each kept once
@@ -36,7 +36,7 @@ class Exploration(NamedTuple):
 
     @property
     def is_none(self) -> bool:
-        """True if actions are known to be the policy's own; not so of numbers that a compiled program is given."""
+        """True if there is certainly no noise; False for traced values, which are unknown."""
         return all(isinstance(value, float | int) and value == 0 for value in self)
 
 
@@ -44,7 +44,7 @@ NO_EXPLORATION = Exploration()
 
 
 class Acting(NamedTuple):
-    """An environment, and the algorithm whose agents act in it.
+    """Environment, and the algorithm whose agents act in it.
 
     Attributes:
         env: The environment.
@@ -58,7 +58,7 @@ class Acting(NamedTuple):
 
 
 def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: Draws = ONE) -> jax.Array:
-    """Return actions [E, A] float32 in [-1, 1] with noise where it is asked for.
+    """Add exploration noise to actions, if there is any: [E, A] float32 in [-1, 1].
 
     Args:
         action: [E, A] float32 in [-1, 1], the policy's own.
@@ -78,13 +78,13 @@ def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: 
 
 
 def split_keys(keys: jax.Array, num_envs: int, draws: Draws = ONE) -> tuple[jax.Array, jax.Array]:
-    """Keys of a rollout: [S] typed keys -> those of all S x E resets, seed after seed, and those of the policies, [S]."""
+    """Split the keys of a rollout, [S], into those of all S x E resets, seed by seed, and those of the policies, [S]."""
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     return jax.vmap(lambda key: draws.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
 
 
 def add_noise(key: jax.Array, observations: jax.Array, deviation: float, draws: Draws = ONE) -> jax.Array:
-    """Observations [E, ...] as a noisy camera shows them: same shape and dtype; bytes are rounded and clipped.
+    """Add camera noise to observations [E, ...]: same shape and dtype; bytes are rounded and clipped.
 
     Args:
         key: [] a typed key.
@@ -113,7 +113,7 @@ class Rollout(NamedTuple):
 
 
 def _episode_major(*parts: jax.Array) -> jax.Array:
-    """Steps [T, S, K, ...] one after the other, as episodes: [S, K, T, ...]."""
+    """Move the time axis behind the episodes: [T, S, K, ...] -> [S, K, T, ...]."""
     return jnp.moveaxis(jnp.concatenate(parts), 0, 2)
 
 

@@ -1,4 +1,4 @@
-"""Rollouts in parts of a few environments each, which the threads of a CPU play side by side.
+"""Rollouts divided into parts of a few environments, which the threads of a CPU run in parallel.
 
 A GPU plays all environments at once, and so do several devices. One CPU plays `PART_SIZE` at a time, in as many threads as it
 has cores (`jaxrl_vis.run.compiled.threaded_rollout`): XLA would divide single operations among its threads, and those of a
@@ -27,12 +27,12 @@ Played = tuple[Episodes, Metrics]
 
 
 def part_size(num_envs: int) -> int:
-    """Return P, the smallest size that needs no more parts of at most `PART_SIZE` environments than necessary."""
+    """Return P, the smallest part size with as few parts as parts of `PART_SIZE` environments would take."""
     return math.ceil(num_envs / math.ceil(num_envs / PART_SIZE))
 
 
 def join_parts(parts: Sequence[Any], count: int, xp: ModuleType = jnp, axis: int = 0) -> Any:
-    """Concatenate arrays of parts along the axis of environments, and cut off what is beyond ``count``.
+    """Concatenate arrays of parts along the environment axis, and truncate to ``count`` environments.
 
     Args:
         parts: Arrays with P environments along ``axis``.
@@ -46,10 +46,10 @@ def join_parts(parts: Sequence[Any], count: int, xp: ModuleType = jnp, axis: int
 
 @dataclasses.dataclass(frozen=True)
 class RolloutPart:
-    """Random numbers of a few environments of a rollout, in a program that plays any few of them.
+    """Random numbers of one part of a rollout, in a program that can run any part.
 
     It has the methods that `rollout.play` calls on `shards.Shards`. Environment ``first + i`` starts as it does where all are
-    played at once, and its actions have the same noise. Noise of images is drawn for each part by itself: drawing that of all
+    played at once, and its actions have the same noise. Image noise is drawn separately for each part: drawing that of all
     environments would take longer than drawing the images.
 
     Attributes:
@@ -61,22 +61,22 @@ class RolloutPart:
     total: int
 
     def draw(self, draw: Callable[[tuple[int, ...]], jax.Array], shape: tuple[int, ...]) -> jax.Array:
-        """Return this part of the numbers that all environments draw, of ``shape``; zeros beyond them."""
+        """Draw the numbers of all environments, and return this part's, of ``shape``; padded with zeros."""
         drawn = draw((self.total, *shape[1:]))
         filled = jnp.concatenate([drawn, jnp.zeros(shape, drawn.dtype)])  # the last part may be longer than what is left
         return jax.lax.dynamic_slice_in_dim(filled, self.first, shape[0])
 
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-        """Return standard normal numbers of ``shape`` that no other part draws."""
+        """Draw standard normal numbers of ``shape``, different in every part."""
         return jax.random.normal(jax.random.fold_in(key, self.first), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
-        """Return keys number ``first`` to ``first + count - 1`` of those that `jax.random.split` makes of ``key``."""
+        """Return this part's slice of the keys that `jax.random.split` makes for all environments."""
         return jax.vmap(jax.random.fold_in, (None, 0))(key, self.first + jnp.arange(count))
 
 
 def played_spec(env: GoalEnv, size: int, seeds: int) -> Played:
-    """Return shapes and dtypes of a part that was played, without tracing its program.
+    """Return shapes and dtypes of the result of one part, without tracing its program.
 
     Args:
         env: The environment.

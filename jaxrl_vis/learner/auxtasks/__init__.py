@@ -32,7 +32,7 @@ NAMES: tuple[str, ...] = tuple(_MAKERS)
 
 
 def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[str, AuxTask]:
-    """Make the tasks of these names, by `AuxTask.name`.
+    """Build the named tasks; return them by `AuxTask.name`.
 
     Args:
         names: Some of `NAMES`, and ``module:Name`` of functions of a `Spec` that return an `AuxTask`; or none.

@@ -10,7 +10,7 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Make the task.
+    """Build the task.
 
     As in the authors' release (``spec.options.in_grey``), one grey channel of the newest image is reconstructed rather than all
     channels of the observation. Here it is the luminance of the normalised channels; the release normalises again.

@@ -1,4 +1,4 @@
-"""Auxiliary tasks and their weighting as parts of a learner: made from a `Config`, with what each of its steps does for them.
+"""Auxiliary tasks and their weighting as parts of a learner, built from a `Config`.
 
 collecting   what tasks compute of whole episodes (`AuxTask.episode`)
 sampling     views and targets of a batch (`AuxTask.view`, `AuxTask.target`)
@@ -23,7 +23,7 @@ _EPISODES_AT_ONCE = 10  # whose arrays are computed together: some 500 images fi
 
 @dataclasses.dataclass(frozen=True)
 class Auxiliary:
-    """The auxiliary tasks of a learner, which may be none, and how their losses are weighted.
+    """Auxiliary tasks of a learner, possibly none, and the weighting of their losses.
 
     Attributes:
         tasks: By name.
@@ -47,11 +47,11 @@ class Auxiliary:
         return (*after, *(name for name, task in self.tasks.items() if task.view is not None))
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
-        """Fresh parameters of all heads, by task."""
+        """Initialise the parameters of all heads, by task."""
         return {name: task.init(task.fold(key)) for name, task in self.tasks.items()}
 
     def init_state(self, critic: Params) -> WeightingState | None:
-        """The weighting's state; None where there is nothing to weight and nothing to remember.
+        """Initialise the weighting's state; None without a weighting.
 
         Args:
             critic: All parameters of the critic, in whose encoder gradients are compared.
@@ -59,12 +59,12 @@ class Auxiliary:
         return None if self.weighting.name == "none" else self.start(critic)
 
     def start(self, critic: Params) -> WeightingState:
-        """The weighting's state before the first update."""
-        kept = (critic,) if self.weighting.hold is not None else ()
-        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *kept)
+        """Return the weighting's state before the first update."""
+        held = (critic,) if self.weighting.hold is not None else ()
+        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *held)
 
     def with_stored(self, episodes: Episodes) -> Episodes:
-        """Return a rollout's episodes with the arrays that tasks compute once an episode."""
+        """Add the arrays that tasks compute once per episode to a rollout's episodes."""
         images, stored = episodes.observations[:, :-1], {}
         for name, task in self.tasks.items():
             if task.episode is not None:
@@ -72,7 +72,7 @@ class Auxiliary:
         return episodes.replace(stored=stored)
 
     def stored_spec(self, observation: jax.ShapeDtypeStruct, horizon: int) -> dict[str, jax.ShapeDtypeStruct]:
-        """Return shapes and dtypes of the arrays that lie beside one episode, by task.
+        """Return shapes and dtypes of the arrays stored with one episode, by task.
 
         Args:
             observation: Shape and dtype of one observation.
@@ -82,7 +82,7 @@ class Auxiliary:
         return {name: jax.eval_shape(task.episode, images) for name, task in self.tasks.items() if task.episode is not None}
 
     def with_targets(self, key: jax.Array, batch: Batch, stored: dict[str, jax.Array]) -> Batch:
-        """Return a batch with the views and the targets of all tasks.
+        """Add the views and targets of all tasks to a batch.
 
         Args:
             key: [] a typed key, from which views are drawn.
@@ -99,7 +99,7 @@ class Auxiliary:
         return batch.replace(views=views, targets=targets)
 
     def losses(self, heads: dict[str, Params], view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, jax.Array]:
-        """Return the loss of each task, [] float32 by name.
+        """Compute the loss of each task, [] float32 by name.
 
         Args:
             heads: From `init_heads`.
@@ -113,12 +113,12 @@ class Auxiliary:
     def predictions(
         self, heads: dict[str, Params], view: View, latents: dict[str, jax.Array], batch: Batch
     ) -> dict[str, jax.Array]:
-        """Return the prediction of each task (`AuxTask.predict`), by name; arguments as of `losses`."""
+        """Compute the prediction of each task (`AuxTask.predict`), by name; arguments as for `losses`."""
         views = self._views(view, latents, batch)
         return {name: task.predict(heads[name], views[name]) for name, task in self.tasks.items()}
 
     def _views(self, view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, View]:
-        """The inputs of each task, with its target shifted as the batch's images are."""
+        """Return the inputs of each task, with its target shifted like the batch's images."""
         views = {}
         for name, task in self.tasks.items():
             target = batch.targets.get(name)
@@ -131,7 +131,7 @@ class Auxiliary:
 def make_auxiliary(
     config: Config, observation: jax.ShapeDtypeStruct, action_size: int, frame_stack: int, dtype: Any
 ) -> Auxiliary:
-    """The auxiliary tasks and the weighting that a configuration asks for.
+    """Build the auxiliary tasks and the weighting of a configuration.
 
     Args:
         config: The run.
@@ -143,47 +143,50 @@ def make_auxiliary(
     Raises:
         RequestError: They do not go together, or not with the rest of the configuration.
     """
-    if config.weighting in WEIGHTINGS:
-        weighting = make_weighting(config.weighting, **_options(config))
+    if config.auxiliary.weighting in WEIGHTINGS:
+        weighting = make_weighting(config.auxiliary.weighting, **_options(config))
     else:
-        maker = find("weighting", config.weighting, WEIGHTINGS, config.env_folder)
-        weighting = call("weighting", config.weighting, maker, of=Weighting)
-    if config.aux_tasks and not weighting.auxiliary:
+        maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
+        weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
+    if config.auxiliary.aux_tasks and not weighting.auxiliary:
         raise RequestError(
-            f"aux_tasks are given, but weighting {config.weighting} learns none: choose --weighting ol_aux, or leave them out"
+            f"aux_tasks are given, but weighting {config.auxiliary.weighting} learns none: choose --weighting ol_aux, or leave "
+            "them out"
         )
-    if weighting.auxiliary and not config.aux_tasks:
+    if weighting.auxiliary and not config.auxiliary.aux_tasks:
         raise RequestError(
-            f"weighting {config.weighting} has no auxiliary tasks to weight: add --aux-tasks with some of "
+            f"weighting {config.auxiliary.weighting} has no auxiliary tasks to weight: add --aux-tasks with some of "
             f"{' '.join(auxtasks.NAMES)}, or use --weighting none"
         )
-    if config.updates_per_iteration % weighting.interval:
+    if config.run.updates_per_iteration % weighting.interval:
         raise RequestError(
-            f"weighting_interval ({weighting.interval}) must divide updates_per_iteration ({config.updates_per_iteration})"
+            f"weighting_interval ({weighting.interval}) must divide updates_per_iteration ({config.run.updates_per_iteration})"
         )
-    if config.aux_tasks and config.n_step > 1:
+    if config.auxiliary.aux_tasks and config.study.n_step > 1:
         raise RequestError("n_step and aux_tasks exclude each other: targets are of single steps")
-    options = auxtasks.RELEASE if config.aux_form == "release" else auxtasks.Options()
-    spec = Spec(observation, action_size, config.latent_size, frame_stack, len(config.encoder_filters), dtype, options)
+    options = auxtasks.RELEASE if config.study.aux_form == "release" else auxtasks.Options()
+    spec = Spec(
+        observation, action_size, config.network.latent_size, frame_stack, len(config.network.encoder_filters), dtype, options
+    )
     way: Way = "per_loss" if weighting.needs == "gradients" else "latents"
-    return Auxiliary(auxtasks.make(config.aux_tasks, spec, config.env_folder), weighting, way)
+    return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, way)
 
 
 def _options(config: Config) -> dict[str, Any]:
-    """Arguments of the function that makes the configuration's weighting."""
+    """Return the arguments for the constructor of the configuration's weighting."""
     options: dict[str, Any] = {}
-    if config.weighting in ("ol_aux", "ol_aux_ablation"):
+    if config.auxiliary.weighting in ("ol_aux", "ol_aux_ablation"):
         options |= {
-            "interval": config.weighting_interval,
-            "learning_rate": config.critic_learning_rate,
-            "beta": config.weighting_beta,
+            "interval": config.auxiliary.weighting_interval,
+            "learning_rate": config.ddpg.critic_learning_rate,
+            "beta": config.auxiliary.weighting_beta,
         }
-        if config.weighting_main_grad != "main":
-            options["main_grad"] = config.weighting_main_grad
-        if config.weighting_window != 1:
-            options["window"] = config.weighting_window
-    if config.weighting == "fixed":
-        options["weights"] = config.weighting_fixed
-    if config.weighting == "cosine":
-        options["log"] = config.weighting_log
+        if config.study.weighting_main_grad != "main":
+            options["main_grad"] = config.study.weighting_main_grad
+        if config.study.weighting_window != 1:
+            options["window"] = config.study.weighting_window
+    if config.auxiliary.weighting == "fixed":
+        options["weights"] = config.auxiliary.weighting_fixed
+    if config.auxiliary.weighting == "cosine":
+        options["log"] = config.study.weighting_log
     return options

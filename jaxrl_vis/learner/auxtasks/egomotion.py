@@ -1,4 +1,4 @@
-"""Egomotion: how an image was rotated, from its latent and the new one, by a linear layer (thesis, 5.2.3.1)."""
+"""Egomotion: the rotation of an image, from its latents before and after, by a linear layer (thesis, 5.2.3.1)."""
 
 import math
 
@@ -14,7 +14,7 @@ MAX_ANGLE = math.radians(30.0)
 
 
 def make(spec: Spec) -> AuxTask:
-    """Make the task. With ``spec.options.max_shift``, three numbers are predicted rather than the angle alone."""
+    """Build the task. With ``spec.options.max_shift``, it predicts the shift as well as the angle."""
     options = spec.options
 
     def predict(params: Params, view: View) -> jax.Array:
@@ -34,7 +34,7 @@ def make(spec: Spec) -> AuxTask:
 def egomotion_pair(
     key: jax.Array, images: jax.Array, border: Border = "clip", max_shift: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """Images rotated by random angles, evenly up to 30 degrees either way, and possibly shifted.
+    """Rotate images by random angles, uniform up to 30 degrees either way, and optionally shift them.
 
     Args:
         key: [] a typed key.
@@ -53,7 +53,7 @@ def egomotion_pair(
 
 
 def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border = "clip") -> jax.Array:
-    """Images rotated about their centres, then shifted: [B, C, H, W] uint8. What comes from outside is 0.
+    """Rotate images about their centres, then shift them: [B, C, H, W] uint8, 0 outside of the image.
 
     Args:
         images: [B, C, H, W] uint8.

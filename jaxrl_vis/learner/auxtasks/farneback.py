@@ -35,7 +35,7 @@ _BORDER_WEIGHTS = (0.14, 0.14, 0.4472, 0.4472, 0.4472)  # of the outermost pixel
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Settings that OpenCV calls pyr_scale, levels, winsize, iterations, poly_n and poly_sigma; by default the release's.
+    """Settings, called pyr_scale, levels, winsize, iterations, poly_n and poly_sigma in OpenCV; defaults as in the release.
 
     Attributes:
         scale: Size of a level of the pyramid over that of the next finer one.
@@ -59,7 +59,7 @@ Planes = tuple[Any, ...]
 
 
 def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settings()) -> jax.Array:
-    """Displacements [B, H, W, 2] float32, (right, down) in pixels, of what is seen at each pixel of the first images.
+    """Compute the flow from each pixel of the first images: [B, H, W, 2] float32, (right, down) in pixels.
 
     Args:
         images_t: [B, H, W] grey levels, 0 to 255, of any dtype.
@@ -71,7 +71,7 @@ def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settin
 
 
 def flow_along(images: jax.Array, settings: Settings = Settings()) -> jax.Array:
-    """`flow` from each image of a sequence to the next one: [T + 1, H, W] -> [T, H, W, 2]; each is expanded once."""
+    """Compute `flow` between successive images, [T + 1, H, W] -> [T, H, W, 2], expanding each image only once."""
     expansions = jax.vmap(functools.partial(_expansions, settings=settings))(images)
     before, after = (jax.tree.map(lambda plane, part=part: plane[part], expansions) for part in (slice(-1), slice(1, None)))
     return _between(before, after, settings)
@@ -83,29 +83,29 @@ def _between(before: list[Planes], after: list[Planes], settings: Settings) -> j
 
 
 def _displacements(before: list[Planes], after: list[Planes], settings: Settings) -> Planes:
-    """Displacements to the right and down, from the expansions of two images, the coarsest level first."""
-    found: Planes = ()
+    """Compute displacements (right, down) from the expansions of two images, coarsest level first."""
+    displacements: Planes = ()
     for expansion_t, expansion_tp1 in zip(before, after, strict=True):
         rows, columns = expansion_t[0].shape
-        if not found:
-            found = (jnp.zeros((rows, columns)),) * 2
+        if not displacements:
+            displacements = (jnp.zeros((rows, columns)),) * 2
         else:
-            resize_rows, resize_columns = (_resizing(new, old) for new, old in zip((rows, columns), found[0].shape))
-            found = tuple(_product(resize_rows, plane, resize_columns.T) / settings.scale for plane in found)
+            resize_rows, resize_columns = (_resizing(new, old) for new, old in zip((rows, columns), displacements[0].shape))
+            displacements = tuple(_product(resize_rows, plane, resize_columns.T) / settings.scale for plane in displacements)
         for _ in range(settings.iterations):
-            equations = _equations(expansion_t, expansion_tp1, *found)
-            found = _solve(tuple(_mean_in_window(plane, settings.window) for plane in equations))
-    return found
+            equations = _equations(expansion_t, expansion_tp1, *displacements)
+            displacements = _solve(tuple(_mean_in_window(plane, settings.window) for plane in equations))
+    return displacements
 
 
 def _mean_in_window(plane: jax.Array, window: int) -> jax.Array:
-    """The mean of a square window around each pixel of a plane [H, W] that is repeated at its borders."""
+    """Average a plane [H, W] over a square window around each pixel; borders are replicated."""
     rows, columns = (_filter(size, np.full(window, 1.0 / window), "edge") for size in plane.shape)
     return _product(rows, plane, columns.T)
 
 
 def _product(left: np.ndarray, plane: jax.Array, right: np.ndarray) -> jax.Array:
-    """``left @ plane @ right`` for a plane [H, W]."""
+    """Compute ``left @ plane @ right`` for a plane [H, W]."""
     return _by_rows(left, _by_columns(plane, right))
 
 
@@ -119,13 +119,13 @@ def _by_rows(left: np.ndarray, plane: jax.Array) -> jax.Array:
 
 
 def _scales(height: int, width: int, settings: Settings) -> list[float]:
-    """Sizes of the pyramid's levels over that of the image, the coarsest first."""
+    """Return the scales of the pyramid's levels relative to the image, coarsest first."""
     scales = [settings.scale**level for level in range(settings.levels, 0, -1)]
     return [*(scale for scale in scales if min(height, width) * scale >= _SMALLEST_LEVEL), 1.0]
 
 
 def _filter(size: int, taps: np.ndarray, border: str) -> np.ndarray:
-    """The matrix [size, size] of a correlation with ``taps``, an odd number of them; ``border`` as of `np.pad`."""
+    """Return the matrix [size, size] of the correlation with an odd number of ``taps``; ``border`` as in `np.pad`."""
     source = np.pad(np.arange(size), len(taps) // 2, mode=border)  # type: ignore[call-overload]
     matrix = np.zeros((size, size))
     for tap, weight in enumerate(taps):
@@ -134,13 +134,13 @@ def _filter(size: int, taps: np.ndarray, border: str) -> np.ndarray:
 
 
 def _gaussian(radius: int, sigma: float) -> np.ndarray:
-    """Weights at -radius, ..., radius, whose sum is 1."""
+    """Return Gaussian weights at -radius, ..., radius, normalised to a sum of 1."""
     weights = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / sigma))
     return weights / weights.sum()
 
 
 def _smoothing(size: int, scale: float) -> np.ndarray:
-    """The matrix [size, size] of the Gaussian filter that comes before an image is resized to ``scale``."""
+    """Return the matrix [size, size] of the Gaussian filter applied before resizing to ``scale``."""
     if scale == 1.0:
         return _filter(size, np.array([0.25, 0.5, 0.25]), "reflect")
     sigma = (1.0 / scale - 1.0) / 2.0
@@ -148,7 +148,7 @@ def _smoothing(size: int, scale: float) -> np.ndarray:
 
 
 def _resizing(new: int, old: int) -> np.ndarray:
-    """The matrix [new, old] of linear interpolation between pixels' centres, with what is outside as at the border."""
+    """Return the matrix [new, old] of linear interpolation between pixel centres, with replicated borders."""
     position = (np.arange(new) + 0.5) * old / new - 0.5
     below = np.floor(position).astype(int)
     matrix = np.zeros((new, old))
@@ -159,7 +159,7 @@ def _resizing(new: int, old: int) -> np.ndarray:
 
 @functools.cache
 def _fits(new: int, old: int, scale: float, radius: int, sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Matrices [new, old] that smooth and resize a line of pixels, and fit it at each by value, slope and curvature.
+    """Return matrices [new, old] that smooth and resize a line of pixels, and fit value, slope and curvature at each pixel.
 
     The fit's normal equations separate: with g the Gaussian and m2, m4 its moments, the weights at distance x from the pixel
     are g, x g / m2 and (x^2 - m2) g / (m4 - m2^2). Those of a quadratic in two dimensions are products of these.
@@ -174,20 +174,20 @@ def _fits(new: int, old: int, scale: float, radius: int, sigma: float) -> tuple[
 
 
 def _expansions(image: jax.Array, settings: Settings) -> list[Planes]:
-    """Coefficients of an image [H, W] at each level, the coarsest first: b (right, down), then A's (xx, yy, xy)."""
+    """Compute the expansion of an image [H, W] at each level, coarsest first: b (right, down), then A (xx, yy, xy)."""
     (height, width), shape = image.shape, (settings.radius, settings.sigma)
-    image, found = image.astype(jnp.float32), []
+    image, expansions = image.astype(jnp.float32), []
     for scale in _scales(height, width, settings):
         value_y, slope_y, curvature_y = _fits(round(height * scale), height, scale, *shape)
         value_x, slope_x, curvature_x = _fits(round(width * scale), width, scale, *shape)
         value, slope, curvature = (_by_columns(image, fit.T) for fit in (value_x, slope_x, curvature_x))
         pairs = (value_y, slope), (slope_y, value), (value_y, curvature), (curvature_y, value), (0.5 * slope_y, slope)
-        found.append(tuple(_by_rows(of_rows, planes) for of_rows, planes in pairs))
-    return found
+        expansions.append(tuple(_by_rows(of_rows, planes) for of_rows, planes in pairs))
+    return expansions
 
 
 def _equations(expansion_t: Planes, expansion_tp1: Planes, found_right: jax.Array, found_down: jax.Array) -> Planes:
-    """A'A (xx, xy, yy) and A'(b_t - b_t+1)/2 (x, y) at each pixel, [rows, columns] each.
+    """Compute A'A (xx, xy, yy) and A'(b_t - b_t+1)/2 (x, y) at each pixel, [rows, columns] each.
 
     Args:
         expansion_t, expansion_tp1: From `_expansions`.
@@ -208,7 +208,7 @@ def _equations(expansion_t: Planes, expansion_tp1: Planes, found_right: jax.Arra
 
 
 def _border_weights(size: int) -> np.ndarray:
-    """Weights [size] of pixels along one axis."""
+    """Return the weights [size] of pixels along one axis."""
     weights, border = np.ones(size), len(_BORDER_WEIGHTS)
     weights[:border] *= _BORDER_WEIGHTS
     weights[-border:] *= _BORDER_WEIGHTS[::-1]
@@ -216,7 +216,7 @@ def _border_weights(size: int) -> np.ndarray:
 
 
 def _solve(equations: Planes) -> Planes:
-    """Displacements to the right and down that solve the equations of each pixel, from `_equations`."""
+    """Solve the equations of each pixel, from `_equations`, for displacements (right, down)."""
     xx, xy, yy, right, down = equations
     # Nothing moves farther than the image is wide. Along a straight edge, the determinant is rounding and nothing else.
     limit = max(xx.shape)

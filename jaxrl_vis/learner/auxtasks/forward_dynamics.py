@@ -8,7 +8,7 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Make the task.
+    """Build the task.
 
     With ``spec.options.detach`` the next latent is a target only. The authors' release lets gradients into it, so that the
     encoder can lower the loss by making all latents alike.

@@ -1,8 +1,8 @@
-"""The two kinds of heads that auxiliary tasks have: one linear layer, and a decoder from latents to an image.
+"""Heads of auxiliary tasks: a linear layer, and a decoder from latents to an image.
 
 A transposed 2x2 convolution with stride 2 makes a 2x2 block of every pixel, so it IS a matrix product of [pixels, channels in]
-with [channels in, 4 * channels out]. As in the encoder (`networks`), images stay in nested 2x2 blocks (`blocks`), where what
-comes out of one layer is what goes into the next: no copy in between, and none at the end if the target has that order, too.
+with [channels in, 4 * channels out]. As in the encoder (`networks`), images stay in nested 2x2 blocks (`blocks`), where the
+output of one layer is the input of the next: no copy in between, and none at the end if the target has that order, too.
 """
 
 from typing import Any
@@ -23,18 +23,18 @@ _CHANNELS, _FINEST_CHANNELS = 64, 16
 
 
 def init_linear(key: jax.Array, inputs: int, outputs: int) -> Params:
-    """Parameters of `linear`; like all last layers, named so that it stays in float32 (`Networks.compute_copy`)."""
+    """Initialise `linear`; like all last layers, it is named so that it stays in float32 (`Networks.compute_copy`)."""
     return {"output": {"kernel": _glorot(key, (inputs, outputs)), "bias": jnp.zeros((outputs,))}}
 
 
 def linear(params: Params, *inputs: jax.Array) -> jax.Array:
-    """One linear layer on inputs [B, ...] side by side: [B, outputs] float32."""
+    """Apply a linear layer to concatenated inputs [B, ...]: [B, outputs] float32."""
     values = jnp.concatenate([part.astype(jnp.float32) for part in inputs], axis=-1)
     return values @ params["output"]["kernel"] + params["output"]["bias"]
 
 
 def init_decoder(key: jax.Array, inputs: int, shape: tuple[int, int, int], levels: int) -> Params:
-    """Parameters of `decode`.
+    """Initialise `decode`.
 
     Args:
         key: [] a typed key.
@@ -55,7 +55,7 @@ def init_decoder(key: jax.Array, inputs: int, shape: tuple[int, int, int], level
 
 
 def decode(params: Params, values: jax.Array, dtype: Any) -> jax.Array:
-    """A dense layer and transposed convolutions, with ReLU in between: [B, inputs] -> [B, blocks, 4^levels * C] float32.
+    """Apply a dense layer and transposed convolutions with ReLUs: [B, inputs] -> [B, blocks, 4^levels * C] float32.
 
     Args:
         params: From `init_decoder`.
@@ -69,12 +69,12 @@ def decode(params: Params, values: jax.Array, dtype: Any) -> jax.Array:
 
 
 def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype: Any) -> jax.Array:
-    """The mean squared error of what `decode` makes, [] float32, by one kernel for the finest two layers.
+    """Compute the mean squared error of `decode`, [] float32, with one kernel for the finest two layers.
 
     Args:
         params: From `init_decoder`; see `has_kernel`.
         values: [B, inputs].
-        patches: [at least B, patches, 64 C'], what is to be decoded, as `kernels.patches.to_patches` orders it.
+        patches: [at least B, patches, 64 C'], the targets, in the order of `kernels.patches.to_patches`.
         dtype: Dtype of the computation.
     """
     *coarser, before, finer, finest = _layers(params)
@@ -85,7 +85,7 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
 
 
 def has_kernel(batch: int, shape: tuple[int, int, int], levels: int) -> bool:
-    """Return True if `decoding_error` supports ``batch`` images of shape C, H, W and a decoder of so many levels."""
+    """Return True if `decoding_error` supports ``batch`` images of shape C, H, W and a decoder of this many levels."""
     channels, height, width = shape
     cells = batch * (height >> levels) * (width >> levels) * 4 ** (levels - 2)
     is_whole = levels >= encoder_kernel_patches.LEVELS and cells % LEAST_ROWS == 0
@@ -93,7 +93,7 @@ def has_kernel(batch: int, shape: tuple[int, int, int], levels: int) -> bool:
 
 
 def _layers(params: Params) -> list[Params]:
-    """From the coarsest to the finest."""
+    """Return the layers from the coarsest to the finest."""
     return [params["dense"], *(params[f"up_{level}"] for level in range(len(params) - 1))]
 
 

@@ -1,4 +1,4 @@
-"""Grey levels of observations, and images read between their pixels."""
+"""Grey levels of observations, and interpolation between pixels."""
 
 from collections.abc import Callable, Sequence
 
@@ -9,7 +9,7 @@ _LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601, which OpenCV uses, too
 
 
 def grey(images: jax.Array, frame_stack: int = 1) -> jax.Array:
-    """Luminance of the newest image of each observation, or its depth where it has no colours: [B, H, W] float32.
+    """Return the luminance of each observation's newest image, or its depth if it has no colours: [B, H, W] float32.
 
     Args:
         images: [B, C, H, W] of any dtype: R, G, B and D, R, G and B, or D, for each image of the stack, the newest first.
@@ -23,12 +23,12 @@ def grey(images: jax.Array, frame_stack: int = 1) -> jax.Array:
 
 
 def read_planes_between(planes: Sequence[jax.Array], x: jax.Array, y: jax.Array) -> list[jax.Array]:
-    """Planes at any place, by linear interpolation between the centres of pixels: [...] float32 each.
+    """Sample planes by linear interpolation between pixel centres: [...] float32 each.
 
     Args:
         planes: [H, W] each, of any dtype.
-        x, y: [...] float32, columns and rows, counted from the centre of the first; outside of the image, what is read is that
-            of the nearest border.
+        x, y: [...] float32, columns and rows, counted from the centre of the first; outside of the image, the nearest border
+            pixel is read.
     """
     height, width = planes[0].shape
     first, right, down = _neighbours(height, width, x, y)
@@ -41,14 +41,14 @@ def read_planes_between(planes: Sequence[jax.Array], x: jax.Array, y: jax.Array)
 
 
 def _neighbours(height: int, width: int, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the index of the upper left one of the four pixels around each place, and the distances right and down of it."""
+    """Return the index of the upper left of the four pixels around each point, and the offsets right and down from it."""
     x, y = jnp.clip(x, 0.0, width - 1.0), jnp.clip(y, 0.0, height - 1.0)
     left, top = jnp.clip(jnp.floor(x), 0, width - 2), jnp.clip(jnp.floor(y), 0, height - 2)
     return (top * width + left).astype(jnp.int32), x - left, y - top
 
 
 def _between(pixel: Callable[[int], jax.Array], width: int, right: jax.Array, down: jax.Array) -> jax.Array:
-    """Linear interpolation between four pixels, given by their distance from the upper left one."""
+    """Interpolate linearly between four pixels, at an offset from the upper left one."""
     upper = (1.0 - right) * pixel(0) + right * pixel(1)
     lower = (1.0 - right) * pixel(width) + right * pixel(width + 1)
     return (1.0 - down) * upper + down * lower
@@ -58,9 +58,9 @@ _BYTES = 4  # in a word
 
 
 def to_words(images: jax.Array) -> jax.Array:
-    """Four channels side by side in a word: [B, C, H, W] uint8 -> [B, ceil(C / 4), H, W] uint32, padded with zeros.
+    """Pack four channels into each word: [B, C, H, W] uint8 -> [B, ceil(C / 4), H, W] uint32, padded with zeros.
 
-    What is read at a pixel is then read once for four channels.
+    A pixel is then read once for four channels.
     """
     batch, channels, *size = images.shape
     padded = jnp.pad(images, [(0, 0), (0, -channels % _BYTES), (0, 0), (0, 0)]).astype(jnp.uint32)
@@ -81,7 +81,7 @@ def _byte(words: jax.Array, byte: int) -> jax.Array:
 
 
 def read_words_between(words: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """`read_planes_between` of bytes in words, rounded: [words, ...] uint32.
+    """Apply `read_planes_between` to bytes packed in words, rounding: [words, ...] uint32.
 
     Args:
         words: [words, H, W] uint32 from `to_words`.

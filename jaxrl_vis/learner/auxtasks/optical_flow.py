@@ -1,4 +1,4 @@
-"""Optical flow: how strongly each pixel moves between two images, from the latents of both, by a decoder (thesis, 5.2.3.1)."""
+"""Optical flow: its magnitude at each pixel, from the latents of two images, by a decoder (thesis, 5.2.3.1)."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Make the task. The flow is computed once an episode: that takes longer than all the rest of a gradient step."""
+    """Build the task. The flow is computed once per episode, since it takes longer than the rest of a gradient step."""
     stretch = spec.options.stretch
     _, height, width = spec.observation.shape
     whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
@@ -46,12 +46,12 @@ _BYTES_PER_PIXEL, _LARGEST_BYTE = 16.0, 255.0
 
 
 def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
-    """Strengths [...] as a replay keeps them: uint8, in steps of 1/16 pixel up to 15.9; stretched masks in 255 steps."""
+    """Quantize strengths [...] for the replay: uint8, in steps of 1/16 pixel up to 15.9; stretched masks in 255 steps."""
     return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _LARGEST_BYTE).astype(jnp.uint8)
 
 
 def from_bytes(kept: jax.Array, stretch: bool = False) -> jax.Array:
-    """Undo `to_bytes` but for its rounding: [...] float32."""
+    """Invert `to_bytes`, up to rounding: [...] float32."""
     return kept.astype(jnp.float32) / _scale(stretch)
 
 
@@ -60,22 +60,22 @@ def _scale(stretch: bool) -> float:
 
 
 def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
-    """The length of the optical flow at every pixel: [B, H, W] float32, in pixels.
+    """Compute the magnitude of the optical flow at every pixel: [B, H, W] float32, in pixels.
 
     Args:
         images_t: [B, C, H, W] uint8, observations before the action.
         images_tp1: The same after it.
         frame_stack: Images that an observation stacks; the newest ones count.
-        stretch: Whether each mask is stretched to [0, 1], as in the authors' release, where grey levels lie in [0, 1], too. How
-            fast things move is lost, and where nothing moves, traces of rounding are stretched. With such grey levels
-            Farneback's regularisation outweighs the images (`farneback`), so that sharp edges count more than their speed.
+        stretch: True to stretch each mask to [0, 1], as in the authors' release, whose grey levels lie in [0, 1], too. This
+            discards speeds, and amplifies rounding errors where nothing moves. At such grey levels, Farneback's regularisation
+            outweighs the images (`farneback`), so that sharp edges count more than their speed.
     """
     unit = _unit(stretch)
     return _strength(farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit), stretch)
 
 
 def flow_strength_along(images: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
-    """`flow_strength` from each image of a sequence [T + 1, C, H, W] to the next one: [T, H, W] float32."""
+    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32."""
     return _strength(farneback.flow_along(grey(images, frame_stack) / _unit(stretch)), stretch)
 
 

@@ -1,4 +1,4 @@
-"""The interface of an auxiliary task, and the records that it reads.
+"""Interface of an auxiliary task, and the records that it reads.
 
 A task is a head on the latents of an encoder and a loss. It declares what it wants beyond the latents of an observation:
 
@@ -25,7 +25,7 @@ proportions that has none, and scaled to its old size, as in the thesis. ``zero`
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Differences between the thesis and the authors' release; the defaults are the thesis's, `RELEASE` the others.
+    """Options in which the thesis and the authors' release differ: the defaults follow the thesis, `RELEASE` the release.
 
     Attributes:
         detach: Whether the loss of forward dynamics leaves the next latent alone. The thesis does not say; in the release, it
@@ -49,7 +49,7 @@ RELEASE = Options(detach=False, border="zero", max_shift=0.1, in_grey=True, stre
 
 @dataclasses.dataclass(frozen=True)
 class Spec:
-    """Sizes and options that auxiliary tasks are made for.
+    """Sizes and options that auxiliary tasks are built for.
 
     Attributes:
         observation: Shape [C, H, W] and dtype uint8 of one observation.
@@ -71,7 +71,7 @@ class Spec:
 
 
 class Transitions(NamedTuple):
-    """B transitions as they were sampled, before images are shifted or normalised.
+    """Batch of B sampled transitions, before images are shifted or normalised.
 
     Attributes:
         images_t: [B, C, H, W] uint8, before the action.
@@ -89,7 +89,7 @@ class Transitions(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class View(Replaceable):
-    """Inputs of an auxiliary task's loss, of B transitions; what a task does not declare may be left out.
+    """Inputs of an auxiliary task's loss for B transitions; those that the task does not declare may be missing.
 
     Attributes:
         latent_t: [B, L] any float dtype, of the observations before the action.
@@ -112,7 +112,7 @@ class View(Replaceable):
 
 
 class AuxTask(NamedTuple):
-    """An auxiliary task: a head on the latents of an encoder, and its loss. Pure.
+    """Auxiliary task: a head on the latents of an encoder, and its loss. Pure.
 
     Attributes:
         name: Unique among the tasks of a run; names its head, its metrics and its weight.
@@ -145,7 +145,7 @@ class AuxTask(NamedTuple):
     draws_unfolded: bool = False
 
     def fold(self, key: jax.Array) -> jax.Array:
-        """Return the task's own key."""
+        """Derive the task's own key."""
         return jax.random.fold_in(key, zlib.crc32(self.name.encode()) if self.number is None else self.number)
 
 

@@ -1,1 +1,1 @@
-"""Deep deterministic policy gradient with goals, its losses, its optimiser and what it logs."""
+"""Goal-conditioned deep deterministic policy gradient: losses, optimiser and diagnostics."""

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba, 2015) for several networks at once: what `optax.adam` computes, with its states, in fewer GPU kernels.
+"""Adam (Kingma and Ba, 2015) for several networks at once: `optax.adam` with its states, in fewer GPU kernels.
 
 XLA makes one kernel of the steps of all arrays of one shape, whichever network they belong to, if there is an array that these
 steps all read. A single number does not count. So what changes from one step to the next, for all networks and both moments,
@@ -19,22 +19,22 @@ _SMALL = 1e-8
 
 
 def init(params: Params) -> Any:
-    """The optax state before the first step."""
+    """Return optax's state before the first step."""
     return optax.adam(0.0).init(params)
 
 
 def count(state: Any) -> jax.Array:
-    """[] int32, steps that a state has seen."""
+    """Return the number of steps that a state has seen, [] int32."""
     return state[0].count
 
 
 def with_count(state: Any, steps: jax.Array) -> Any:
-    """The state with another `count`."""
+    """Return the state with another `count`."""
     return (state[0]._replace(count=steps), *state[1:])
 
 
 def corrections(counts: jax.Array) -> jax.Array:
-    """Return divisors of moments, which began at 0: [N, 2] float32, for the first and the second moment.
+    """Return the bias corrections of the first and the second moment: divisors [N, 2] float32.
 
     Args:
         counts: [N] int32, steps of N networks, from 1.
@@ -43,7 +43,7 @@ def corrections(counts: jax.Array) -> jax.Array:
 
 
 def step(params: Params, gradient: Params, state: Any, learning_rate: float, correction: jax.Array) -> tuple[Params, Any]:
-    """One step of one network: new parameters, and a state with new moments and the old `count`.
+    """Take one step of one network; return new parameters, and a state with new moments and the old `count`.
 
     Args:
         params: float32.
@@ -53,7 +53,7 @@ def step(params: Params, gradient: Params, state: Any, learning_rate: float, cor
         correction: [2] float32, a row of `corrections`.
     """
     moments = state[0]
-    first, second = (_averaged(*each, gradient) for each in zip(_DECAYS, (1, 2), (moments.mu, moments.nu), strict=True))
+    first, second = (_averaged(*terms, gradient) for terms in zip(_DECAYS, (1, 2), (moments.mu, moments.nu), strict=True))
 
     def moved(leaf: jax.Array, mean: jax.Array, square: jax.Array) -> jax.Array:
         return leaf - learning_rate * (mean / correction[0] / (jnp.sqrt(square / correction[1]) + _SMALL))

@@ -28,8 +28,8 @@ from jaxrl_vis.learner.ddpg.latent_reward import LatentReward, make_latent_rewar
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
-from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
@@ -45,7 +45,7 @@ class Agent(Replaceable):
 
     Attributes:
         actor, critic: Online parameters. The actor is a head alone where it shares the critic's encoder.
-        target_actor, target_critic: Slowly following copies; heads alone where there is no target encoder.
+        target_actor, target_critic: Slowly following copies; heads alone without target encoders.
         actor_optimizer, critic_optimizer: optax states.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
         weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
@@ -77,7 +77,7 @@ class ActorParams(NamedTuple):
 
 
 class Working(NamedTuple):
-    """An agent between two gradient steps of one iteration.
+    """Agent between two gradient steps of one iteration.
 
     Attributes:
         agent: The agent; its counters are those of the beginning.
@@ -94,7 +94,7 @@ class Working(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """A batch as `GradientSteps.gradients` takes it.
+    """Batch in the form that `GradientSteps.gradients` takes.
 
     Attributes:
         batch: With rewards.
@@ -111,7 +111,7 @@ class Gradients(NamedTuple):
     """Gradients of a batch.
 
     Attributes:
-        critic, actor: For the optimisers, float32; None for an actor that stays as it is.
+        critic, actor: For the optimisers, float32; None if the actor is not updated.
         weighting: State of the weighting after this batch; None where there is nothing to remember.
         autoencoder: For the optimiser of the autoencoder that makes rewards; None where there is none.
     """
@@ -142,18 +142,18 @@ class GradientSteps(NamedTuple):
     end: Callable[[Working], Agent]
 
 
-def _networks_of(state: Agent) -> tuple[Params, ...]:
-    """The four networks' parameters, in the order of `ComputeCopies`."""
+def _network_parameters(state: Agent) -> tuple[Params, ...]:
+    """Return the parameters of the four networks, in the order of `ComputeCopies`."""
     return state.actor, state.critic, state.target_actor, state.target_critic
 
 
 def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, key: jax.Array) -> Agent:
-    """An agent that has learned nothing: targets equal the online networks."""
+    """Initialise an agent; its target networks equal the online networks."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
     target_actor, target_critic = networks.init_target(actor), networks.init_target(critic)
     if auxiliary.tasks:
-        actor_key, critic_key = (jax.random.fold_in(each, _HEADS) for each in (actor_key, critic_key))
+        actor_key, critic_key = (jax.random.fold_in(network_key, _HEADS) for network_key in (actor_key, critic_key))
         critic["heads"] = auxiliary.init_heads(critic_key)
         if "encoder" in actor:
             actor["heads"] = auxiliary.init_heads(actor_key)
@@ -170,13 +170,13 @@ def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward
     )
 
 
-def _counts_of(agent: Agent) -> jax.Array:
-    """`Working.counts`: one array, because XLA has a kernel for each counter that is one number."""
+def _stack_counts(agent: Agent) -> jax.Array:
+    """Stack `Working.counts` in one array: XLA would launch a kernel per scalar counter."""
     return jnp.stack([adam.count(agent.critic_optimizer), adam.count(agent.actor_optimizer), agent.updates])
 
 
 def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
-    """The agent with its own counters again."""
+    """Put the counters back into the agent."""
     return agent.replace(
         critic_optimizer=adam.with_count(agent.critic_optimizer, counts[0]),
         actor_optimizer=adam.with_count(agent.actor_optimizer, counts[1]),
@@ -184,26 +184,26 @@ def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
     )
 
 
-def _copies_of(networks: Networks, agent: Agent) -> ComputeCopies:
-    """All four networks as they are computed with."""
-    return ComputeCopies(*map(networks.compute_copy, _networks_of(agent)))
+def _compute_copies(networks: Networks, agent: Agent) -> ComputeCopies:
+    """Make the compute copies of all four networks."""
+    return ComputeCopies(*map(networks.compute_copy, _network_parameters(agent)))
 
 
 def _begin(networks: Networks, agent: Agent, statistics: Statistics) -> Working:
-    """`GradientSteps.begin`."""
-    return Working(agent, _copies_of(networks, agent), networks.batch_scaling(statistics), _counts_of(agent))
+    """Implement `GradientSteps.begin`."""
+    return Working(agent, _compute_copies(networks, agent), networks.batch_scaling(statistics), _stack_counts(agent))
 
 
 def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config) -> Agent:
-    """One step of both optimisers, and the targets a little after the online networks; ``counts`` include this step."""
+    """Step both optimisers, and update the target networks; ``counts`` include this step."""
     corrections = adam.corrections(counts[:2])
     critic, critic_moments = adam.step(
-        state.critic, gradients.critic, state.critic_optimizer, config.critic_learning_rate, corrections[0]
+        state.critic, gradients.critic, state.critic_optimizer, config.ddpg.critic_learning_rate, corrections[0]
     )
     actor, actor_moments = state.actor, state.actor_optimizer
     if gradients.actor is not None:
-        actor, actor_moments = adam.step(actor, gradients.actor, actor_moments, config.actor_learning_rate, corrections[1])
-    follow = jnp.where(counts[2] % config.target_update_interval == 0, 1.0 - config.target_decay, 0.0)
+        actor, actor_moments = adam.step(actor, gradients.actor, actor_moments, config.ddpg.actor_learning_rate, corrections[1])
+    follow = jnp.where(counts[2] % config.ddpg.target_update_interval == 0, 1.0 - config.ddpg.target_decay, 0.0)
 
     def followed(online: Params, target: Params) -> Params:
         return optax.incremental_update({part: online[part] for part in target}, target, follow)
@@ -220,38 +220,38 @@ def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config
 
 
 def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, goals: jax.Array) -> Metrics:
-    """`Algorithm.diagnose`: the mean value of the policy's actions where the goal itself is observed."""
+    """Implement `Algorithm.diagnose`: the mean value of the policy's actions where the goal itself is observed."""
     own = (statistics.observations,) if statistics.own_goals is None else (statistics.observations, statistics.goals)
-    inputs = [networks.prepare(networks.scaling(each), goals) for each in own]
+    inputs = [networks.prepare(networks.scaling(part), goals) for part in own]
 
     def latents(params: Params) -> jax.Array:
-        encoded = [networks.encode(params, each) for each in inputs]
+        encoded = [networks.encode(params, array) for array in inputs]
         return jnp.stack([encoded[0], encoded[-1]])
 
     action = networks.act(agent.actor, latents(networks.with_encoder(agent.actor, agent.critic)))
     return {"train/value_at_goals": jnp.mean(networks.value(agent.critic, latents(agent.critic), action))}
 
 
-def _metrics_of(found: Weighted, value: jax.Array) -> Metrics:
-    """Return metrics of the critic's losses and their weighting, and the mean of its values [B]."""
+def _loss_metrics(weighted: Weighted, value: jax.Array) -> Metrics:
+    """Return metrics: the critic's losses, their weighting, and the mean of its values [B]."""
     return {
-        "train/critic_loss": found.losses[MAIN],
+        "train/critic_loss": weighted.losses[MAIN],
         "train/value": jnp.mean(value),
-        **{f"train/{name}": number for name, number in found.metrics.items()},
-        **{f"train/loss/{name}": loss for name, loss in found.losses.items() if name != MAIN},
+        **{f"train/{name}": number for name, number in weighted.metrics.items()},
+        **{f"train/loss/{name}": loss for name, loss in weighted.losses.items() if name != MAIN},
     }
 
 
 def make_ddpg(
     networks: Networks, config: Config, resolved: Resolved, auxiliary: Auxiliary | None = None, shards: Shards = ONE
 ) -> GradientSteps:
-    """Make the gradient steps of DDPG for these networks.
+    """Build the gradient steps of DDPG for these networks.
 
     Args:
         networks: Architecture of the parameters.
         config: Learning rates, target decay, action penalty.
         resolved: Discount, bounds of the targets, filter threshold.
-        auxiliary: Auxiliary tasks; None for those that ``config`` asks for, without stacked images.
+        auxiliary: Auxiliary tasks; None: those of ``config``, without stacked images.
         shards: Shards of the learner: batches are those of one shard, gradients and metrics those of the whole.
     """
     if auxiliary is None:
@@ -269,7 +269,7 @@ def make_ddpg(
 
     def gradients(working: Working, prepared: Prepared, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         agent, (batch, inputs, image) = working.agent, prepared
-        now = ComputeCopies(*map(networks.with_compute_copy, _networks_of(agent), working.copies))
+        now = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
         if latent_reward is not None:
             rewarded = latent_reward.of_batch(agent.autoencoder, working.scaling.observations, inputs, batch)
@@ -277,16 +277,16 @@ def make_ddpg(
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
         state = auxiliary.start(now.critic) if agent.weighting is None else agent.weighting
-        found = learning.critic_gradient(now, inputs, image, batch)(now.critic, state)
-        latents, value, keep = found.extra
+        weighted = learning.critic_gradient(now, inputs, image, batch)(now.critic, state)
+        latents, value, keep = weighted.extra
         counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
         )
-        metrics = _metrics_of(found, value)
+        metrics = _loss_metrics(weighted, value)
         actor_gradient, mean_square = None, None
         if with_actor:
             (policy_loss, action), actor_gradient = jax.value_and_grad(learning.of_actor, has_aux=True)(
-                now.actor, now.critic, inputs, latents, image, batch, found.weights
+                now.actor, now.critic, inputs, latents, image, batch, weighted.weights
             )
             actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
             metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))
@@ -294,22 +294,22 @@ def make_ddpg(
             metrics["train/autoencoder_loss"] = rewarded.loss
         of_autoencoder = rewarded.gradient if rewarded is not None else None
         # Of a learner in several parts, this is the one thing that an update waits for the others for.
-        own_gradient = None if learning.reduces_early else found.gradient
+        own_gradient = None if learning.reduces_early else weighted.gradient
         own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts = shards.mean(
             (own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts)
         )
         if mean_square is not None:
             metrics["train/action_size"] = jnp.sqrt(mean_square)
         metrics |= {f"train/{name}": share for name, share in diagnostics.shares(counts, shards.count).items()}
-        critic_gradient = found.gradient if own_gradient is None else own_gradient
-        return Gradients(critic_gradient, actor_gradient, found.state if keeps_state else None, of_autoencoder), metrics
+        critic_gradient = weighted.gradient if own_gradient is None else own_gradient
+        return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_autoencoder), metrics
 
     def apply(working: Working, chosen: Gradients) -> Working:
         counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])
         agent = _apply(working.agent, counts, chosen, config)
         if latent_reward is not None:
             agent = agent.replace(autoencoder=latent_reward.apply(agent.autoencoder, chosen.autoencoder))
-        return working._replace(agent=agent, copies=_copies_of(networks, agent), counts=counts)
+        return working._replace(agent=agent, copies=_compute_copies(networks, agent), counts=counts)
 
     return GradientSteps(
         init=lambda key: _start(networks, auxiliary, latent_reward, key),
@@ -322,14 +322,14 @@ def make_ddpg(
 
 
 def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Agent, Metrics]]:
-    """Make `Algorithm.update` of gradient steps."""
-    interval = config.actor_interval
+    """Build `Algorithm.update` from gradient steps."""
+    interval = config.ddpg.actor_interval
 
     def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
         names: list[str] = []
 
         def take(state: tuple[Working, Prepared], following: Any) -> tuple[tuple[Working, Prepared], jax.Array]:
-            """Take gradient steps of which the last is the actor's, too; unrolled, so that the body has no conditional.
+            """Take gradient steps, of which only the last updates the actor; unrolled, so that the body has no conditional.
 
             Each has its batch already, and reads and prepares the next one. A GPU does that while it computes; with its own
             batch it would have to begin with it.
@@ -365,7 +365,7 @@ def _mean(values: list[jax.Array]) -> jax.Array:
 
 
 def make(setup: Setup) -> Algorithm:
-    """Make DDPG."""
+    """Build DDPG."""
     config, resolved = setup.config, setup.resolved
     networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias)
     steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards)

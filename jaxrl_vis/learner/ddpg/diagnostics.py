@@ -1,4 +1,4 @@
-"""Rewards of a batch, measured against the truth that only a simulation knows.
+"""Diagnostics of a batch's rewards against the ground truth, which only a simulation knows.
 
 Shares of one batch are means of products, so that a quotient of two of them, averaged over many batches, is the share over all
 of these batches: precision of the filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
@@ -20,7 +20,7 @@ def count_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` makes shares of them.
+    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` turns them into shares.
 
     Where a batch is spread over devices, the mean of these over the devices comes in between.
 
@@ -28,7 +28,7 @@ def count_rewards(
         reward: [B] float32.
         keep: [B] float32, 0 for what the filter drops (`losses.keep_mask`).
         reward_positive, reward_negative: R+ and R-.
-        success: [B] float32, 1 where the goal was truly reached; None: nothing is said about the truth.
+        success: [B] float32, 1 where the goal was truly reached; None: no comparison with the truth.
         graded: True if rewards lie anywhere between R- and R+: one in the middle counts as half a positive.
     """
     if graded:
@@ -36,10 +36,10 @@ def count_rewards(
     else:
         positive = (reward == reward_positive).astype(jnp.float32)
     negative = 1.0 - positive
-    found = {"positive_share": jnp.mean(positive), "negative": jnp.sum(negative), "filtered": jnp.sum(1.0 - keep)}
+    counts = {"positive_share": jnp.mean(positive), "negative": jnp.sum(negative), "filtered": jnp.sum(1.0 - keep)}
     if success is None:
-        return found
-    return found | {
+        return counts
+    return counts | {
         "failure": jnp.sum(1.0 - success),
         "false_positive": jnp.sum(positive * (1.0 - success)),
         "false_negative": jnp.sum(negative * success),
@@ -48,12 +48,12 @@ def count_rewards(
 
 
 def of_rewards(*args: Any, **kwargs: Any) -> Metrics:
-    """The `shares` of a batch that is in one place; arguments as of `count_rewards`."""
+    """Compute the `shares` of an undivided batch; arguments as for `count_rewards`."""
     return shares(count_rewards(*args, **kwargs))
 
 
 def shares(counts: Metrics, parts: int = 1) -> Metrics:
-    """Shares of a batch, [] float32 by name; docs/learner.md says what each one means.
+    """Compute shares of a batch, [] float32 by name; docs/learner.md defines them.
 
     Args:
         counts: From `count_rewards`; of a batch in several parts, the mean over these.
@@ -63,10 +63,10 @@ def shares(counts: Metrics, parts: int = 1) -> Metrics:
     def share(part: str, whole: str) -> jax.Array:
         return counts[part] / jnp.maximum(counts[whole], 1.0 / parts)
 
-    found = {"positive_share": counts["positive_share"], "filtered_share": share("filtered", "negative")}
+    result = {"positive_share": counts["positive_share"], "filtered_share": share("filtered", "negative")}
     if "failure" not in counts:
-        return found
-    return found | {
+        return result
+    return result | {
         "false_positive_share": share("false_positive", "failure"),
         "false_negative_share": share("false_negative", "negative"),
         "filtered_false_share": share("filtered_false", "negative"),

@@ -1,9 +1,9 @@
 """Rewards from the latent space of an autoencoder that is trained along with the learner (thesis, section 5.1.5, Auto Encoder).
 
-    reward = R- + (R+ - R-) max(0, cosine of the latents of what was reached and of the goal)
+    reward = R- + (R+ - R-) max(0, cosine of the latents of achieved observation and goal)
 
-The autoencoder has an encoder of its own, like those of actor and critic, and reconstructs what was reached. Rewards are made
-anew for every batch, with the encoder as it is at that moment, and no gradient passes through them.
+The autoencoder has an encoder of its own, like those of actor and critic, and reconstructs achieved observations. Rewards are
+recomputed for every batch with the current encoder, without gradient.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.networks.normalizer import Scaling
-from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Params, Replaceable
 
 _SMALL = 1e-6  # of a latent's length: the direction of a shorter one means nothing
@@ -27,7 +27,7 @@ _SMALL = 1e-6  # of a latent's length: the direction of a shorter one means noth
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class AutoencoderState(Replaceable):
-    """An autoencoder between two gradient steps.
+    """State of the autoencoder between two gradient steps.
 
     Attributes:
         params: ``encoder`` and ``decoder``, nested dictionaries of float32.
@@ -53,15 +53,15 @@ class Rewarded(NamedTuple):
 
 
 def cosine_reward(latent: jax.Array, goal_latent: jax.Array, positive: float = 1.0, negative: float = 0.0) -> jax.Array:
-    """``positive`` for latents [B, L] of one direction, ``negative`` for those at a right angle or more: [B] float32.
+    """Map the angle between latents [B, L] to rewards [B] float32: ``positive`` at 0, ``negative`` at a right angle or more.
 
     Args:
-        latent: [B, L] any float dtype, of what was reached.
+        latent: [B, L] any float dtype, of the achieved observations.
         goal_latent: [B, L], of the goals.
         positive: R+.
         negative: R-.
     """
-    first, second = (each.astype(jnp.float32) for each in (latent, goal_latent))
+    first, second = (array.astype(jnp.float32) for array in (latent, goal_latent))
     lengths = jnp.linalg.norm(first, axis=-1) * jnp.linalg.norm(second, axis=-1)
     cosine = jnp.sum(first * second, axis=-1) / jnp.maximum(lengths, _SMALL**2)
     return jax.lax.stop_gradient(negative + (positive - negative) * jnp.clip(cosine, 0.0, 1.0))
@@ -69,7 +69,7 @@ def cosine_reward(latent: jax.Array, goal_latent: jax.Array, positive: float = 1
 
 @dataclasses.dataclass(frozen=True)
 class LatentReward:
-    """The autoencoder of one configuration; all methods are pure. Make it with `make_latent_reward`."""
+    """Autoencoder of one configuration; all methods are pure. Create it with `make_latent_reward`."""
 
     networks: Networks
     resolved: Resolved
@@ -77,13 +77,13 @@ class LatentReward:
     optimizer: optax.GradientTransformation
 
     def init(self, key: jax.Array) -> AutoencoderState:
-        """A fresh autoencoder."""
+        """Initialise the autoencoder."""
         encoder_key, decoder_key = jax.random.split(key)
         params = {"encoder": self.networks.init_encoder(encoder_key), "decoder": self.task.init(decoder_key)}
         return AutoencoderState(params=params, optimizer=self.optimizer.init(params))
 
     def of_batch(self, state: AutoencoderState, scaling: Scaling, inputs: Inputs, batch: Batch) -> Rewarded:
-        """Rewards of a batch, and the gradient for the autoencoder.
+        """Compute the rewards of a batch, and the autoencoder's gradient.
 
         Args:
             state: The autoencoder.
@@ -111,13 +111,13 @@ class LatentReward:
         return Rewarded(reward, loss, gradient)
 
     def apply(self, state: AutoencoderState, gradient: Params) -> AutoencoderState:
-        """One step of the optimiser."""
+        """Take one step of the optimiser."""
         change, moments = self.optimizer.update(gradient, state.optimizer)
         return AutoencoderState(params=optax.apply_updates(state.params, change), optimizer=moments)
 
 
 def make_latent_reward(networks: Networks, config: Config, resolved: Resolved) -> LatentReward | None:
-    """Make the autoencoder that a configuration rewards with; None where rewards come from elsewhere.
+    """Build the autoencoder that computes the rewards; None if the configuration's method uses none.
 
     Args:
         networks: Architecture of the autoencoder's separate encoder.
@@ -130,12 +130,12 @@ def make_latent_reward(networks: Networks, config: Config, resolved: Resolved) -
     method = resolved.method
     if method.needs_images and not networks.sees_images:
         raise RequestError(
-            f"method {config.method} encodes images, and {config.env} shows states: train on Visual{config.env}, or use "
-            "--method indicator"
+            f"method {config.reward.method} encodes images, and {config.environment.env} shows states: train on "
+            f"Visual{config.environment.env}, or use --method indicator"
         )
     if method.reward != "autoencoder":
         return None
-    shape = networks.observation_spec, networks.action_size, config.latent_size
-    spec = auxtasks.Spec(*shape, levels=len(config.encoder_filters), dtype=networks.dtype)
+    shape = networks.observation_spec, networks.action_size, config.network.latent_size
+    spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
-    return LatentReward(networks, resolved, task, optax.adam(config.critic_learning_rate))
+    return LatentReward(networks, resolved, task, optax.adam(config.ddpg.critic_learning_rate))

@@ -1,4 +1,4 @@
-"""The losses of DDPG with goals, as pure functions of arrays (Lillicrap et al., 2016; thesis, section 5.1).
+"""Losses of goal-conditioned DDPG as pure functions of arrays (Lillicrap et al., 2016; thesis, section 5.1).
 
 Subscripts are time: ``value_t`` belongs to the state before the action, ``value_tp1`` to the one after it.
 """
@@ -20,7 +20,7 @@ def td_target(
     minimum: float = -jnp.inf,
     maximum: float = jnp.inf,
 ) -> jax.Array:
-    """r + gamma Q'(s', pi'(s')) clipped to what a sum of rewards can be: [B] float32, without gradient.
+    """Compute r + gamma Q'(s', pi'(s')), clipped to the range of returns: [B] float32, without gradient.
 
     Episodes end by running out of time, never by a terminal state, so the discount is never zeroed.
 
@@ -35,7 +35,7 @@ def td_target(
 
 
 def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, threshold: float) -> jax.Array:
-    """1 for transitions to learn from, 0 for negatives whose value says that they are false (thesis, 5.1.4): [B] float32.
+    """Return 0 for negatives that their value marks as false, else 1 (thesis, 5.1.4): [B] float32.
 
     Args:
         reward_t: [B] float32, rewards.
@@ -47,17 +47,17 @@ def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, t
     return jax.lax.stop_gradient(1.0 - false_negative.astype(jnp.float32))
 
 
-def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array, kept: jax.Array | None = None) -> jax.Array:
-    """Mean squared temporal-difference error over the transitions with ``keep`` 1: [] float32; 0 where there are none.
+def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array, count: jax.Array | None = None) -> jax.Array:
+    """Compute the mean squared temporal-difference error over transitions with ``keep`` 1: [] float32; 0 if there are none.
 
     Args:
         value_t: [B] float32, the online critic's values.
         target: [B] float32, from `td_target`.
         keep: [B] float32, 0 or 1, from `keep_mask`.
-        kept: [] float32, transitions to divide the sum by; None: the sum of ``keep``, at least 1.
+        count: [] float32, transitions to divide the sum by; None: the sum of ``keep``, at least 1.
     """
-    kept = jnp.maximum(jnp.sum(keep), 1.0) if kept is None else kept
-    return jnp.sum(keep * jnp.square(value_t - target)) / kept
+    count = jnp.maximum(jnp.sum(keep), 1.0) if count is None else count
+    return jnp.sum(keep * jnp.square(value_t - target)) / count
 
 
 def actor_loss(
@@ -68,15 +68,15 @@ def actor_loss(
     whole: Callable[[jax.Array], jax.Array] = lambda mean: mean,
     log_of: Literal["value", "loss"] = "value",
 ) -> jax.Array:
-    """Minus the mean value of the policy's own actions, plus their weighted mean square: [] float32.
+    """Compute minus the mean value of the policy's actions, plus their weighted mean square: [] float32.
 
     Args:
         value_t: [B] float32, the online critic's values of ``action``.
         action: [B, A] float32 in [-1, 1], the policy's own.
         action_penalty: Weight of the mean square.
-        log_below: The greatest value that there can be, R+/(1-gamma): the logarithm of the distance to it takes the place of
-            minus the value, as auxiliary losses that are learned as logarithms ask for. With the rewards 0/-1 of the OL-AUX
-            release, it is 0, and this is the release's log(-Q). None: no logarithm.
+        log_below: The greatest value that there can be, R+/(1-gamma): the logarithm of the distance to it replaces minus the
+            value, to match auxiliary losses learned as logarithms. With the rewards 0/-1 of the OL-AUX release, it is 0, and
+            this is the release's log(-Q). None: no logarithm.
         whole: Makes the mean of the whole batch of that of these transitions, before a logarithm is taken.
         log_of: value, the distance alone, with the mean square added to its logarithm (the release); or loss, both together.
             The slope of a logarithm is the inverse of its argument: with ``value`` it divides the value's gradient, but not

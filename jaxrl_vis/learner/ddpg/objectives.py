@@ -1,4 +1,4 @@
-"""Losses of the critic and the actor for a batch, auxiliary ones included, and one weighted gradient for each.
+"""Losses of critic and actor for a batch, including auxiliary losses, and their weighted gradients.
 
 Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
 it needs in one pass:
@@ -24,13 +24,13 @@ from jaxrl_vis.learner.ddpg import losses
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import Shards
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
-from jaxrl_vis.resolved import Resolved
 from jaxrl_vis.types import Batch, Params
 
 
 class ComputeCopies(NamedTuple):
-    """Networks of an agent in the dtype that they are computed with (`Networks.compute_copy`)."""
+    """Networks of an agent in the compute dtype (`Networks.compute_copy`)."""
 
     actor: Params
     critic: Params
@@ -39,7 +39,7 @@ class ComputeCopies(NamedTuple):
 
 
 def _encode(networks: Networks, params: Params, inputs: Inputs, *names: str) -> jax.Array:
-    """Latents [names, B, latent] of the observations of these names."""
+    """Encode the named observations: [names, B, latent]."""
     return networks.encode_pieces(params, inputs.pieces(*names)).reshape(len(names), inputs.size, -1)
 
 
@@ -60,18 +60,18 @@ class Latents(NamedTuple):
 
 
 def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, apart: bool) -> Latents:
-    """Latents of all observations that losses read, with gradient.
+    """Encode all observations that losses read, with gradient.
 
     Most auxiliary losses read two of them or one. Encoded ``apart``, the gradient of each loss passes through these alone.
     """
     names = ("before", "goal", *auxiliary.encoded)
     if apart:
-        found = [_encode(networks, params, inputs, name)[0] for name in names]
-        pair = jnp.stack(found[:2])
+        latents = [_encode(networks, params, inputs, name)[0] for name in names]
+        pair = jnp.stack(latents[:2])
     else:
-        found = _encode(networks, params, inputs, *names)
-        pair = found[:2]
-    return _with_others(auxiliary, pair, found[0], found[2:])
+        latents = _encode(networks, params, inputs, *names)
+        pair = latents[:2]
+    return _with_others(auxiliary, pair, latents[0], latents[2:])
 
 
 def _with_others(auxiliary: Auxiliary, pair: jax.Array, before: jax.Array, others: Iterable[jax.Array]) -> Latents:
@@ -84,7 +84,7 @@ _MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
-    """Latents that the critic's main loss reads, and those that auxiliary losses read, as functions of the encoder.
+    """Return functions of the encoder: to the latents of the critic's main loss, and to those of the auxiliary losses.
 
     The main loss looks at goals and auxiliary losses never do, so gradients have less to pass through.
     """
@@ -96,7 +96,7 @@ def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[
 
 
 def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
-    """Latents as losses take them, from what was encoded at once or by `_encoders`."""
+    """Collect the latents for the losses, encoded at once or by `_encoders`."""
     if isinstance(found, Latents):
         return found
     before, *others = found[_OTHERS_READ]
@@ -104,17 +104,17 @@ def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> La
 
 
 def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
-    """Latents [2, B, latent] of the observation after and the goal, for the target actor and for the target critic.
+    """Encode the next observation and the goal for the target actor and the target critic: [2, B, latent] each.
 
     Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
     """
-    if networks.config.target_encoder:
+    if networks.config.network.target_encoder:
         of_critic = _encode(networks, now.target_critic, inputs, "goal", "after")[::-1]
     else:
         after = latents.after
         after = _encode(networks, now.critic, inputs, "after") if after is None else after[None]
         of_critic = jnp.concatenate([after, latents.pair[1:]])
-    if networks.config.encoders == "shared":
+    if networks.config.network.encoders == "shared":
         return of_critic, of_critic
     of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, "goal", "after")[::-1]
     return of_actor, of_critic
@@ -122,7 +122,7 @@ def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latent
 
 @dataclasses.dataclass(frozen=True)
 class Objectives:
-    """The losses of both networks and their weighted gradients, for one configuration."""
+    """Losses of both networks and their weighted gradients, for one configuration."""
 
     networks: Networks
     config: Config
@@ -143,7 +143,7 @@ class Objectives:
     def critic_gradient(
         self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch
     ) -> Callable[[Params, WeightingState], Weighted]:
-        """Make the function of the critic's losses and their gradient; ``extra`` is (latents, values [B], keep [B])."""
+        """Build the function that computes the critic's losses and gradient; ``extra`` is (latents, values [B], keep [B])."""
         networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
 
         def encode(encoder: Params) -> Latents:
@@ -167,7 +167,7 @@ class Objectives:
         return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
 
     def _kept(self, keep: jax.Array) -> jax.Array | None:
-        """Transitions that count in a part, on average over the parts, by which all divide alike; None: its own."""
+        """Return the mean number of unfiltered transitions per shard, the common divisor of all shards; None: each its own."""
         if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
@@ -190,8 +190,8 @@ class Objectives:
         batch: Batch,
         weights: dict[str, jax.Array],
     ) -> tuple[jax.Array, jax.Array]:
-        """The actor's loss, those of its auxiliary tasks with the critic's weights added, and its actions [B, A]."""
-        has_encoder = self.config.encoders == "separate"
+        """Compute the actor's loss, including its auxiliary losses with the critic's weights, and its actions [B, A]."""
+        has_encoder = self.config.network.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
@@ -201,13 +201,15 @@ class Objectives:
         action = self.networks.act(actor, latents.pair)
         value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
-        loss = losses.actor_loss(value, action, self.config.action_penalty, best, self.shards.whole, self.config.actor_log)
+        loss = losses.actor_loss(
+            value, action, self.config.ddpg.action_penalty, best, self.shards.whole, self.config.ddpg.actor_log
+        )
         return loss + self.auxiliary.weighting.objective(weights, others), action
 
     def _auxiliary(
         self, params: Params, latents: Latents, inputs: Inputs, image: jax.Array | None, batch: Batch
     ) -> dict[str, jax.Array]:
-        """Losses of the auxiliary tasks on a network's latents, by name."""
+        """Compute the auxiliary losses of a network's latents, by name."""
         if not self.auxiliary.tasks:
             return {}
         patches = inputs.observed if self.networks.uses_kernel else None

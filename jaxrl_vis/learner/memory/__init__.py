@@ -1,1 +1,1 @@
-"""Memory: the replay, and what is made of its episodes: batches, goals, rewards."""
+"""Replay buffer, and the batches, goals and rewards made from it."""

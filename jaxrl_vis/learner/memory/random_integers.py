@@ -1,7 +1,7 @@
-"""Random integers from random fractions, so that what belongs together is one draw.
+"""Random integers from random fractions, so that related numbers take a single draw.
 
-Every draw of `jax.random` is a program of its own to XLA, which takes a CPU a quarter of a second to compile, and one of
-integers is three. Drawn one by one, the numbers of a batch took two fifths of the time that gradient steps took to compile.
+XLA compiles every draw of `jax.random` as a separate computation, a quarter of a second on a CPU; integers take three. Drawn
+one by one, the numbers of a batch took two fifths of the time that gradient steps took to compile.
 """
 
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 
 def scaled(fraction: jax.Array, count: int | jax.Array) -> jax.Array:
-    """Integers of 0 to ``count`` - 1, evenly as far as there are fractions: [...] int32.
+    """Scale fractions to integers from 0 to ``count`` - 1, uniform up to the fractions' resolution: [...] int32.
 
     Args:
         fraction: [...] float32 in [0, 1), of which `jax.random.uniform` has 2**23.

@@ -1,4 +1,4 @@
-"""Goal relabelling: which observation of its own episode a transition should have reached (thesis, section 5.1.4).
+"""Goal relabelling: replaces goals by observations of the same episode (thesis, section 5.1.4).
 
 An episode's frames lie in slots 0 ... T, its original goal in slot T+1 (`types.Episodes`), so to relabel is to choose a slot.
 For the transition from slot t to t+1:
@@ -19,7 +19,7 @@ from jaxrl_vis.learner.memory.random_integers import scaled
 def choose_goal_slots(
     key: jax.Array, time: jax.Array, horizon: int, relabel_probability: float, balance_probability: float
 ) -> jax.Array:
-    """A goal slot for every transition: [B] int32 in {t+1, ..., T+1}.
+    """Choose a goal slot for every transition: [B] int32 in {t+1, ..., T+1}.
 
     Args:
         key: [] a typed key.

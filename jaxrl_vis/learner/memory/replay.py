@@ -1,4 +1,4 @@
-"""A ring of whole episodes, byte for byte as they came in, each observation once.
+"""Ring buffer of whole episodes, stored byte for byte, each observation once.
 
     observations  [N, T+2, C, H, W/4] uint32     slots 0 ... T: the episode;  slot T+1: its goal
                    |                |
@@ -31,7 +31,7 @@ def _packs(dtype: Any, width: int) -> bool:
 
 
 def pack(observations: jax.Array) -> jax.Array:
-    """Observations as they are stored: [..., W] uint8 -> [..., W/4] uint32 where four divides W, else unchanged."""
+    """Pack observations for storage: [..., W] uint8 -> [..., W/4] uint32 if four divides W, else unchanged."""
     *shape, width = observations.shape
     if not _packs(observations.dtype, width):
         return observations
@@ -39,7 +39,7 @@ def pack(observations: jax.Array) -> jax.Array:
 
 
 def unpack(observations: jax.Array) -> jax.Array:
-    """Undo `pack`."""
+    """Invert `pack`."""
     if observations.dtype != jnp.uint32:
         return observations
     *shape, words = observations.shape
@@ -47,12 +47,12 @@ def unpack(observations: jax.Array) -> jax.Array:
 
 
 def _pack_steps(array: jax.Array) -> jax.Array:
-    """`pack` of an array [episodes, steps, ...], whose steps stay apart."""
+    """Apply `pack` to each step of an array [episodes, steps, ...]."""
     return pack(array) if array.ndim > 2 else array
 
 
 class Indices(NamedTuple):
-    """Places of B transitions: [B] int32 each.
+    """Positions of B transitions: [B] int32 each.
 
     Attributes:
         episode: In [0, N).
@@ -64,7 +64,7 @@ class Indices(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """A replay's fixed sizes. All its functions are pure.
+    """Fixed sizes of a replay. All methods are pure.
 
     Attributes:
         num_rollouts: Rollouts that the ring holds.
@@ -82,7 +82,7 @@ class Replay(NamedTuple):
 
     @property
     def num_episodes(self) -> int:
-        """N, episodes that the ring holds."""
+        """N, the capacity in episodes."""
         return self.num_rollouts * self.num_envs
 
     def init(
@@ -92,23 +92,23 @@ class Replay(NamedTuple):
         action_size: int,
         stored: Mapping[str, jax.ShapeDtypeStruct] | None = None,
     ) -> ReplayState:
-        """An empty replay.
+        """Create an empty replay.
 
         Args:
             observation: Shape and dtype of one observation (`GoalEnv.observation_spec`).
             goal_state_size: G.
             action_size: A.
-            stored: Shapes and dtypes of what lies beside one episode, by auxiliary task (`Auxiliary.stored_spec`).
+            stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`).
         """
         episodes, horizon = self.num_episodes, self.horizon
         beside = {
             name: _pack_steps(jnp.zeros((episodes, *spec.shape), spec.dtype)) for name, spec in dict(stored or {}).items()
         }
         first, *others = observation.shape
-        kept = (episodes, horizon + 2, first // self.frame_stack, *others)
+        stored_shape = (episodes, horizon + 2, first // self.frame_stack, *others)
         return ReplayState(
             episodes=Episodes(
-                observations=pack(jnp.zeros(kept, observation.dtype)),
+                observations=pack(jnp.zeros(stored_shape, observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
                 stored=beside,
@@ -117,21 +117,21 @@ class Replay(NamedTuple):
         )
 
     def spec(self, *args: Any) -> ReplayState:
-        """Shapes and dtypes of the storage, without allocating it; arguments as of `init`."""
+        """Return shapes and dtypes of the storage, without allocating it; arguments as for `init`."""
         return jax.eval_shape(lambda: self.init(*args))
 
     def _stored(self, rollout: Episodes) -> Episodes:
-        """Episodes as they are stored."""
+        """Convert episodes to their stored form."""
         newest = rollout.observations[:, :, : rollout.observations.shape[2] // self.frame_stack]
         stored = {name: _pack_steps(array) for name, array in rollout.stored.items()}
         return rollout.replace(observations=pack(newest), stored=stored)
 
     def of_rollout(self, rollout: Episodes) -> ReplayState:
-        """A replay of one rollout that holds just these E episodes."""
+        """Create a replay that holds just the E episodes of one rollout."""
         return ReplayState(episodes=self._stored(rollout), size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
-        """Write the E episodes of a rollout, over the oldest ones once the ring is full.
+        """Write the E episodes of a rollout; once the ring is full, they overwrite the oldest ones.
 
         Args:
             state: The replay before.
@@ -147,11 +147,11 @@ class Replay(NamedTuple):
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
     def _latest(self, iteration: jax.Array) -> jax.Array:
-        """Return the place of the last episode of the rollout of ``iteration``."""
+        """Return the position of the last episode of the rollout of ``iteration``."""
         return (iteration % self.num_rollouts + 1) * self.num_envs - 1
 
     def is_stored(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
-        """Return which places hold an episode: [N] bool. Not always the first: a resumed run may begin anywhere in the ring.
+        """Return the mask [N] of occupied positions. A resumed run may begin anywhere in the ring.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -161,7 +161,7 @@ class Replay(NamedTuple):
         return age < state.size
 
     def sample_indices(self, state: ReplayState, key: jax.Array, iteration: jax.Array, batch_size: int) -> Indices:
-        """B transitions of the stored ones: evenly, or newer ones more often than older ones (``mean_age``).
+        """Sample B stored transitions: uniformly, or newer ones more often than older ones (``mean_age``).
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -186,7 +186,7 @@ class Replay(NamedTuple):
         steps: int = 1,
         goal_episode: jax.Array | None = None,
     ) -> Batch:
-        """Read transitions, with what is in a slot of the same episode, or of another one, as their goal.
+        """Read transitions; their goals are slots of the same episode, or of another one.
 
         Args:
             state: The replay.
@@ -211,7 +211,7 @@ class Replay(NamedTuple):
         )
 
     def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, stands_still: jax.Array) -> jax.Array:
-        """Observations [..., C, H, W] in slots [...] of episodes [...]; of what stands still, all images are the newest."""
+        """Read observations [..., C, H, W] from slots [...] of episodes [...]; at rest, all stacked images are the newest."""
         if self.frame_stack == 1:
             return unpack(stored[episodes, slots])
         ago = jnp.where(stands_still[..., None], 0, jnp.arange(self.frame_stack))
@@ -219,18 +219,18 @@ class Replay(NamedTuple):
         return images.reshape(*slots.shape, -1, *images.shape[-2:])
 
     def stacked(self, state: ReplayState) -> jax.Array:
-        """All observations of the episodes as they were collected, [N, T+2, ...]."""
+        """Return all observations of the episodes as they were collected, [N, T+2, ...]."""
         stored = state.episodes.observations
         episodes, slots = jnp.indices(stored.shape[:2])
         return self._read(stored, episodes, slots, slots > self.horizon)
 
     def stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
-        """Return the arrays that auxiliary tasks have stored of transitions, by task: [B, ...]."""
+        """Read the arrays that auxiliary tasks stored for transitions, by task: [B, ...]."""
         return {name: unpack(array[indices.episode, indices.time]) for name, array in state.episodes.stored.items()}
 
 
 def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int = 1, mean_age: int | None = None) -> Replay:
-    """A replay of at least ``transitions`` transitions, rounded up to whole rollouts; nothing is allocated yet.
+    """Plan a replay of at least ``transitions`` transitions, rounded up to whole rollouts; nothing is allocated yet.
 
     Args:
         transitions: Least number of transitions to hold.
@@ -245,5 +245,5 @@ def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int 
 
 
 def num_bytes(spec: ReplayState) -> int:
-    """Bytes that a replay of this spec takes."""
+    """Return the size in bytes of a replay with this spec."""
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(spec))

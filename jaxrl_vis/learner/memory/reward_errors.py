@@ -1,10 +1,10 @@
-"""A state estimator that errs, in the place of the oracle's true states (thesis, equation 5.2).
+"""State estimator with errors, instead of the oracle's true states (thesis, equation 5.2).
 
     estimate      Gaussian noise on the estimated state
     flip          rewards that are false, everywhere or only where the workspace is cluttered
 
-An estimator is a function of what it sees. Its errors are drawn with keys that are made from the true states themselves, so a
-transition is misjudged in the same way every time it is sampled, and errors do not average out.
+An estimator is a deterministic function of its input. Its errors are drawn with keys that are made from the true states
+themselves, so a transition is misjudged in the same way every time it is sampled, and errors do not average out.
 """
 
 import jax
@@ -14,7 +14,7 @@ _NOISE, _FALSE = 0x6E6F69, 0x66616C
 
 
 def _keys(states: jax.Array, purpose: int) -> jax.Array:
-    """Typed keys [B] that follow from states [B, K] float32 alone."""
+    """Derive typed keys [B] from states [B, K] float32 alone."""
     words = jax.lax.bitcast_convert_type(states.astype(jnp.float32), jnp.uint32)
     mixed = jnp.zeros(words.shape[:1], jnp.uint32)
     for column in range(words.shape[1]):  # multiplicative hashing (Knuth); `fold_in` mixes the bits once more
@@ -24,7 +24,7 @@ def _keys(states: jax.Array, purpose: int) -> jax.Array:
 
 
 def estimate(states: jax.Array, noise: float) -> jax.Array:
-    """Return an estimator's estimates of true states: [B, G] float32, in their unit.
+    """Estimate true states with errors: [B, G] float32, in their unit.
 
     Args:
         states: [B, G] float32.
@@ -43,7 +43,7 @@ def flip(
     clutter: float = 1.0,
     clutter_end: jax.Array | None = None,
 ) -> jax.Array:
-    """Return which rewards are positive after some of them were misjudged: [B] bool.
+    """Misjudge some rewards; return which ones are positive afterwards: [B] bool.
 
     Args:
         is_positive: [B] bool, before.
@@ -51,7 +51,7 @@ def flip(
         goal_states: [B, G] float32, those of the goals.
         false_positives: Share of the negatives that become positives.
         false_negatives: Share of the positives that become negatives.
-        clutter: Share of the workspace where this happens, so much more often that the shares above hold for the whole.
+        clutter: Share of the workspace where errors occur, more often there so that the shares above hold overall.
         clutter_end: [] float32, from `find_clutter_end`; None: it happens everywhere.
     """
     number = jax.vmap(jax.random.uniform)(_keys(jnp.concatenate([states, goal_states], axis=1), _FALSE))
@@ -62,7 +62,7 @@ def flip(
 
 
 def find_clutter_end(goal_states: jax.Array, is_stored: jax.Array, clutter: float) -> jax.Array:
-    """The first coordinate below which the share ``clutter`` of all goals lies: [] float32.
+    """Find the first coordinate below which the share ``clutter`` of all goals lies: [] float32.
 
     Args:
         goal_states: [N, G] float32, true states of goals: they are spread over the workspace whatever the policy does.

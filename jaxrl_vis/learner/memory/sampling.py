@@ -1,9 +1,9 @@
-"""From the replay to a batch that a loss can be taken of: sample, relabel, reward.
+"""Batches from the replay: sample, relabel, reward.
 
     choose     which transitions (`replay`), and which slot of its own episode is each one's goal (`relabel`)
-    batch      reads them, makes goals of what was observed in those slots, and rewards what was reached
+    batch      reads them, turns observations in those slots into goals, and computes rewards
 
-Rewards are computed anew from what the replay holds, by the same functions that score the environments. No MuJoCo here.
+Rewards are recomputed from the contents of the replay, by the same functions that score the environments. No MuJoCo here.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from jaxrl_vis.learner.memory.random_integers import scaled
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import Indices, Replay
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
-from jaxrl_vis.resolved import Resolved
+from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
 
@@ -29,7 +29,7 @@ _TRIVIAL, _SHIFT, _TARGETS = 0x747276, 0x736866, 0x617578
 
 
 class Choice(NamedTuple):
-    """Choice of transitions and of their goals; made ahead, for many batches at once.
+    """Chosen transitions and goals, drawn ahead for many batches at once.
 
     Attributes:
         indices: Places of the transitions, [B] each.
@@ -50,14 +50,15 @@ class Choice(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Sampler:
-    """Draws batches; all methods are pure.
+    """Sampler of batches; all methods are pure.
 
     Attributes:
         config: Batch size, method, and p1.
         resolved: p2, R+ and R-.
         replay: Sizes of the replay to read from.
         threshold: Threshold of the oracle's reward, in the unit of the true states.
-        as_goal: [...] -> [...], makes a goal of what was reached (`GoalEnv.as_goal`); None where an observation is one already.
+        as_goal: [...] -> [...], converts an achieved observation to a goal (`GoalEnv.as_goal`); None where an observation is
+            one already.
         auxiliary: Auxiliary tasks, whose targets batches carry.
         shards: Shards of the learner. ``replay`` is one, and so are batches; the configuration's batch size is that of all.
     """
@@ -71,7 +72,7 @@ class Sampler:
     shards: Shards = ONE
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
-        """Draw B transitions and their goals: all of them for every part of a learner, which then keeps its own.
+        """Draw B transitions and their goals; every shard draws those of the whole learner and keeps its own.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -79,18 +80,18 @@ class Sampler:
             iteration: [] int32.
         """
         sample_key, goal_key = jax.random.split(key)
-        indices = self.replay.sample_indices(state, sample_key, iteration, self.config.batch_size)
+        indices = self.replay.sample_indices(state, sample_key, iteration, self.config.run.batch_size)
         goal_slot = self.goal_slots(goal_key, indices.time)
         choice = Choice(indices, goal_slot)
-        if self.config.trivial_goals < 1.0:
+        if self.config.goals.trivial_goals < 1.0:
             is_replaced = self._replaced(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
             # Transitions are drawn at random, so those of the next one's episode are, too.
             choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
-        if self.config.random_shift:
-            most, shape = self.config.random_shift, (self.config.batch_size, 2)
+        if self.config.network.random_shift:
+            most, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
             choice = choice._replace(shift=scaled(fraction, 2 * most + 1) - most)
-        if self.config.reward_clutter < 1.0:
+        if self.config.study.reward_clutter < 1.0:
             choice = choice._replace(clutter_end=self._clutter_end(state, iteration))
         parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))
         choice = parted._replace(clutter_end=choice.clutter_end)
@@ -101,19 +102,19 @@ class Sampler:
     def _clutter_end(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
         goal_states = self.shards.gather(state.episodes.states[:, -1])
         is_stored = self.shards.gather(self.replay.is_stored(state, iteration))
-        return reward_errors.find_clutter_end(goal_states, is_stored, self.config.reward_clutter)
+        return reward_errors.find_clutter_end(goal_states, is_stored, self.config.study.reward_clutter)
 
     @property
     def _has_targets(self) -> bool:
         return self.auxiliary is not None and bool(self.auxiliary.tasks)
 
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
-        """Goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
-        shares = self.config.relabel_probability, self.resolved.balance_probability
+        """Choose goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
+        shares = self.config.goals.relabel_probability, self.resolved.balance_probability
         return choose_goal_slots(key, time, self.replay.horizon, *shares)
 
     def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
-        """Return which relabelled goals [B] bool another episode's replace: most of those that are reached already.
+        """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
 
         Not to the original goals. Where these look different from what episodes show (VisualFingerTurn's finger always hangs
         down in them), all that is seldom reached would look like that, and a critic would tell rewards by it.
@@ -122,10 +123,10 @@ class Sampler:
         states = state.episodes.states
         is_trivial = goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
         is_trivial &= goal_slot <= self.replay.horizon
-        return is_trivial & ~jax.random.bernoulli(key, self.config.trivial_goals, time.shape)
+        return is_trivial & ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
-        """Read what was chosen, with goals that stand still and rewards that belong to them.
+        """Read the chosen transitions, with goals at rest and the matching rewards.
 
         Args:
             state: The replay.
@@ -134,7 +135,7 @@ class Sampler:
         Returns:
             B transitions with rewards.
         """
-        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.n_step, choice.goal_episode)
+        batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.study.n_step, choice.goal_episode)
         batch = batch.replace(shift=choice.shift)
         if choice.target_key is not None:
             assert self.auxiliary is not None
@@ -144,7 +145,7 @@ class Sampler:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.
             reached = jax.vmap(self.as_goal)(batch.observation_tp1)
             batch = batch.replace(reached=reached)
-        if self.config.n_step > 1:
+        if self.config.study.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
         if self.resolved.method.reward == "autoencoder":
@@ -152,25 +153,25 @@ class Sampler:
         return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
     def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
-        """The oracle's rewards of up to ``n_step`` steps, discounted and summed, and the discount of what follows them."""
+        """Replace rewards by discounted sums of the oracle's over up to ``n_step`` steps, and adapt the discounts."""
         episode, time = choice.indices
-        after = time[:, None] + 1 + jnp.arange(self.config.n_step)  # slots that the steps lead to, [B, n]
+        after = time[:, None] + 1 + jnp.arange(self.config.study.n_step)  # slots that the steps lead to, [B, n]
         is_step = after <= self.replay.horizon
         reached = state.episodes.states[episode[:, None], jnp.minimum(after, self.replay.horizon)]
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
         rewards = goals.oracle_reward(reached, batch.goal_state[:, None], self.threshold, **values)
-        weights = is_step * self.resolved.discount ** jnp.arange(self.config.n_step)
+        weights = is_step * self.resolved.discount ** jnp.arange(self.config.study.n_step)
         return batch.replace(
             reward=jnp.sum(weights * rewards, axis=1),
             discount=self.resolved.discount ** jnp.sum(is_step, axis=1).astype(jnp.float32),
         )
 
     def reward(self, batch: Batch, reached: jax.Array, clutter_end: jax.Array | None = None) -> jax.Array:
-        """Rewards [B] float32.
+        """Compute the rewards [B] float32.
 
         Args:
             batch: The transitions, relabelled.
-            reached: [B, ...] what they have reached, as a goal would show it.
+            reached: [B, ...] the achieved observations, converted to goals.
             clutter_end: As of `Choice`.
         """
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
@@ -182,14 +183,16 @@ class Sampler:
         return goals.indicator_reward(reached, batch.goal, num_axes=reached.ndim - 1, **values)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
-        """The oracle's rewards, with the errors of an estimator where the configuration asks for some."""
+        """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""
         config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
-        states = reward_errors.estimate(batch.state_tp1, config.reward_noise) if config.reward_noise else batch.state_tp1
+        states = (
+            reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1
+        )
         reward = goals.oracle_reward(states, batch.goal_state, self.threshold, positive, negative)
-        shares = config.reward_false_positives, config.reward_false_negatives
+        shares = config.study.reward_false_positives, config.study.reward_false_negatives
         if not any(shares):
             return reward
         is_positive = reward_errors.flip(
-            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.reward_clutter, clutter_end
+            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.study.reward_clutter, clutter_end
         )
         return jnp.where(is_positive, positive, negative).astype(jnp.float32)

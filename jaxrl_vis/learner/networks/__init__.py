@@ -1,1 +1,1 @@
-"""Networks, their inputs and their arithmetic. `kernels`: the same on a GPU by hand-written kernels."""
+"""Networks, their inputs and their arithmetic; `kernels` has hand-written versions for GPUs."""

@@ -1,11 +1,11 @@
-"""Images in nested 2x2 blocks: the order in which strided 2x2 convolutions, and transposed ones, are plain matrix products."""
+"""Images in nested 2x2 blocks, which make strided 2x2 convolutions, and transposed ones, plain matrix products."""
 
 import jax
 import jax.numpy as jnp
 
 
 def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
-    """Planar images in nested 2x2 blocks: [..., C, H, W] -> [..., (H / 2^levels) * (W / 2^levels), 4^levels * C], same dtype.
+    """Reorder images into nested blocks: [..., C, H, W] -> [..., (H / 2^levels) * (W / 2^levels), 4^levels * C], same dtype.
 
     The last axis runs over (coarsest block, ..., finest block, channel).
     """
@@ -22,10 +22,10 @@ def to_blocks(frames: jax.Array, levels: int) -> jax.Array:
 
 
 def from_blocks(blocks: jax.Array, height: int, width: int) -> jax.Array:
-    """Undo `to_blocks`: [..., blocks, 4^levels * C] -> [..., C, height, width], same dtype.
+    """Invert `to_blocks`: [..., blocks, 4^levels * C] -> [..., C, height, width], same dtype.
 
     Args:
-        blocks: In nested blocks; the number of blocks and the size say how many levels there are.
+        blocks: In nested blocks; the number of blocks and the size determine the number of levels.
         height, width: Of the images without the border that `to_blocks` crops, pixels.
     """
     *batch, count, size = blocks.shape
@@ -39,7 +39,7 @@ def from_blocks(blocks: jax.Array, height: int, width: int) -> jax.Array:
 
 
 def shifted(images: jax.Array, shift: jax.Array) -> jax.Array:
-    """Planar images [B, C, H, W] moved by [B, 2] int32 pixels, down and to the right; what moves in is 0."""
+    """Shift planar images [B, C, H, W] by [B, 2] int32 pixels, down and to the right; fill with 0."""
     height, width = images.shape[-2:]
 
     def moved(image: jax.Array, shift: jax.Array) -> jax.Array:

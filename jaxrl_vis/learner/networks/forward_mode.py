@@ -1,7 +1,7 @@
-"""Operations with rules of their own for the way back, and how to differentiate forwards through them all the same.
+"""Forward-mode differentiation through operations with custom reverse-mode rules.
 
-`jax.custom_vjp` gives a function a gradient and no tangent. Such functions ask `are_wanted` as they are traced, and inside of
-`with_tangents` are what they compute, in plain JAX, which has both.
+`jax.custom_vjp` gives a function a gradient and no tangent. While traced, such functions call `are_wanted`; inside
+`with_tangents` they use plain JAX, which has both modes.
 """
 
 import contextlib
@@ -15,11 +15,11 @@ _wanted = jax.make_user_context(default_value=False)
 
 @contextlib.contextmanager
 def with_tangents() -> Iterator[None]:
-    """Trace what is inside so that `jax.jvp` can differentiate it."""
+    """Trace the context so that `jax.jvp` can differentiate it."""
     with _wanted(True):
         yield
 
 
 def are_wanted() -> bool:
-    """Return True if what is being traced must have tangents."""
+    """Return True if the current trace needs tangents."""
     return bool(_wanted.value)

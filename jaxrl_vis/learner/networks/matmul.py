@@ -1,4 +1,4 @@
-"""Matrix products whose gradients come out in the order that the optimiser reads."""
+"""Matrix products whose gradients have the memory layout that the optimiser reads."""
 
 import jax
 
@@ -6,7 +6,7 @@ from jaxrl_vis.learner.networks import forward_mode
 
 
 def product(values: jax.Array, kernel: jax.Array) -> jax.Array:
-    """``values @ kernel``, [..., M, K] and [..., K, N]."""
+    """Compute ``values @ kernel`` for [..., M, K] and [..., K, N]."""
     return values @ kernel if forward_mode.are_wanted() else _with_rule(values, kernel)
 
 

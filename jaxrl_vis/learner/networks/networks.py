@@ -36,7 +36,7 @@ _NARROW = 16
 
 
 class _Encoder(nn.Module):
-    """[B, blocks, 4^levels * C] -> [B, latent]; of several such arrays, one after the other."""
+    """Encoder: [B, blocks, 4^levels * C] -> [B, latent]; results of several arrays are concatenated."""
 
     filters: Sequence[int]
     latent_size: int
@@ -65,9 +65,9 @@ class _Encoder(nn.Module):
 
 
 class _Dense(nn.Module):
-    """[B, inputs] -> [B, size], as `flax.linen.Dense`.
+    """Dense layer [B, inputs] -> [B, size], as `flax.linen.Dense`.
 
-    Inputs may come in parts that belong side by side, as arrays [B, part] or [parts, B, part]: nothing is put together first.
+    Inputs may be split into parts to be concatenated, arrays [B, part] or [parts, B, part]: nothing is put together first.
     """
 
     size: int
@@ -93,15 +93,15 @@ class _Dense(nn.Module):
 
 
 def compute_dtype(config: Config) -> Any:
-    """Return the dtype that networks of a configuration compute in."""
-    chosen = config.compute_dtype
+    """Return the compute dtype of a configuration's networks."""
+    chosen = config.network.compute_dtype
     if chosen == "auto":
         chosen = "float32" if jax.default_backend() == "cpu" else "bfloat16"
     return jnp.dtype(chosen)
 
 
 class BatchScaling(NamedTuple):
-    """Scaling of the observations of transitions.
+    """Scaling of observations and goals.
 
     Attributes:
         observations: Before and after the action; goals, too, unless they have their own.
@@ -119,7 +119,7 @@ Piece = tuple[jax.Array, slice]
 
 
 class Inputs(NamedTuple):
-    """The observations of B transitions as encoders read them (`Networks.prepare_batch`).
+    """Observations of B transitions in the form that encoders read (`Networks.prepare_batch`).
 
     Attributes:
         observed: [3 B, ...], those before, the goals, those after.
@@ -135,21 +135,21 @@ class Inputs(NamedTuple):
         return self.observed.shape[0] // len(_OBSERVED)
 
     def pieces(self, *names: str) -> list[Piece]:
-        """Return where observations lie: ``before``, ``goal``, ``after``, or a view, in the order of ``names``."""
-        size, found = self.size, []
+        """Locate observations: ``before``, ``goal``, ``after``, or a view, in the order of ``names``."""
+        size, pieces = self.size, []
         for name in names:
             if name in self.views:
-                found.append((self.views[name], slice(0, size)))
+                pieces.append((self.views[name], slice(0, size)))
                 continue
             start = _OBSERVED.index(name) * size
-            if found and found[-1][0] is self.observed and found[-1][1].stop == start:  # neighbours are one piece
-                start = found.pop()[1].start
-            found.append((self.observed, slice(start, (_OBSERVED.index(name) + 1) * size)))
-        return found
+            if pieces and pieces[-1][0] is self.observed and pieces[-1][1].stop == start:  # neighbours are one piece
+                start = pieces.pop()[1].start
+            pieces.append((self.observed, slice(start, (_OBSERVED.index(name) + 1) * size)))
+        return pieces
 
 
 class _Head(nn.Module):
-    """Inputs as of `_Dense` -> [B, outputs] float32."""
+    """Head: inputs as for `_Dense` -> [B, outputs] float32."""
 
     hidden_sizes: Sequence[int]
     outputs: int
@@ -184,15 +184,17 @@ class Networks:
     critic_output_bias: float
 
     def __post_init__(self) -> None:
-        """Check the image's size, and whether it can be moved as far as it is to be.
+        """Check the image size, and the maximum shift against it.
 
         Raises:
             RequestError: The image is smaller than one block of the encoder, or could be moved out of sight; or there is no
                 image to be moved.
         """
-        shift = self.config.random_shift
+        shift = self.config.network.random_shift
         if shift and not self.sees_images:
-            raise RequestError(f"random_shift {shift} moves images, and {self.config.env} observes states: leave it out")
+            raise RequestError(
+                f"random_shift {shift} moves images, and {self.config.environment.env} observes states: leave it out"
+            )
         if self.sees_images:
             *_, height, width = self.observation_spec.shape
             least = 2**self._levels
@@ -218,29 +220,29 @@ class Networks:
         return (
             self.sees_images
             and self.dtype == jnp.bfloat16
-            and encoder_kernel.supports(self.config.encoder_filters, self.observation_spec.shape)
+            and encoder_kernel.supports(self.config.network.encoder_filters, self.observation_spec.shape)
             and encoder_kernel.is_available()
         )
 
     @property
     def _levels(self) -> int:
-        return len(self.config.encoder_filters)
+        return len(self.config.network.encoder_filters)
 
     @property
     def dtype(self) -> Any:
-        """The dtype that the networks compute in."""
+        """Compute dtype of the networks."""
         return compute_dtype(self.config)
 
     @property
     def _encoder(self) -> Any:
-        return _Encoder(self.config.encoder_filters, self.config.latent_size, self.dtype)
+        return _Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
 
     def _head(self, outputs: int, output_bias: float) -> Any:
-        return _Head(self.config.hidden_sizes, outputs, output_bias, self.dtype)
+        return _Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype)
 
     @property
     def _latent_size(self) -> int:
-        return self.config.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
+        return self.config.network.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
 
     def _init(self, key: jax.Array, head: _Head, head_inputs: int, has_encoder: bool = True) -> Params:
         encoder_key, head_key = jax.random.split(key)
@@ -250,32 +252,32 @@ class Networks:
         return params
 
     def init_encoder(self, key: jax.Array) -> Params:
-        """Fresh parameters of an encoder of images, for ``{"encoder": ...}``."""
+        """Initialise an encoder of images, for ``{"encoder": ...}``."""
         blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
         return self._encoder.init(key, blocks)["params"]
 
     def init_actor(self, key: jax.Array) -> Params:
-        """Fresh actor parameters: without an encoder where it shares the critic's."""
-        has_encoder = self.config.encoders == "separate"
+        """Initialise the actor: without an encoder if it shares the critic's."""
+        has_encoder = self.config.network.encoders == "separate"
         return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size, has_encoder=has_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
-        """Fresh critic parameters."""
+        """Initialise the critic."""
         return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
 
     def init_target(self, online: Params) -> Params:
-        """A copy of online parameters for a target network to start with: the head alone where targets have no encoders."""
-        kept = online if self.config.target_encoder else {"head": online["head"]}
+        """Copy online parameters for a target network: the head alone if targets have no encoders."""
+        kept = online if self.config.network.target_encoder else {"head": online["head"]}
         return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
 
     def with_encoder(self, params: Params, other: Params) -> Params:
-        """``params`` with the encoder of ``other``, unless they have their own or nobody needs one."""
+        """Add the encoder of ``other`` to ``params``, unless they have their own or none is needed."""
         if "encoder" in params or "encoder" not in other:
             return params
         return {**params, "encoder": other["encoder"]}
 
     def compute_copy(self, params: Params) -> Params:
-        """The large kernels in the dtype that the networks compute in; None for all parameters that stay as they are.
+        """Copy the large kernels in the compute dtype; None for all parameters that stay as they are.
 
         With `with_compute_copy`, a learner that makes this copy where it changes the parameters saves the networks a conversion
         at every use.
@@ -288,14 +290,14 @@ class Networks:
         return jax.tree_util.tree_map_with_path(copy, params)
 
     def with_compute_copy(self, params: Params, copy: Params) -> Params:
-        """Parameters that are computed with: the copy where there is one. Every function here takes them like the originals."""
+        """Substitute compute copies for parameters; every function here takes the result like the originals."""
         return jax.tree.map(
             lambda converted, leaf: leaf if converted is None else converted, copy, params, is_leaf=lambda leaf: leaf is None
         )
 
     def scaling(self, statistics: NormalizerState) -> Scaling:
         """Return the scaling that `prepare` and `normalize` take."""
-        return Scaling(statistics.mean, normalizer.scale(statistics, self.config.normalizer_floor))
+        return Scaling(statistics.mean, normalizer.scale(statistics, self.config.network.normalizer_floor))
 
     def batch_scaling(self, statistics: Statistics) -> BatchScaling:
         """Return the scaling that `prepare_batch` takes. It stays the same for all gradient steps of an iteration."""
@@ -303,7 +305,7 @@ class Networks:
         return BatchScaling(self.scaling(statistics.observations), of_goals)
 
     def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
-        """`prepare` of all observations of B transitions."""
+        """Apply `prepare` to all observations of B transitions."""
         of_observations, of_goals = scaling
         views = {name: self.prepare(of_observations, images, batch.shift) for name, images in batch.views.items()}
         if of_goals is None:  # together, and while they are bytes
@@ -311,8 +313,8 @@ class Networks:
             shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
             together = self.prepare(of_observations, batch.observations.reshape(count * size, *shape), shift)
             return Inputs(together, views)
-        each_scaling = (of_observations, of_goals, of_observations)
-        pieces = [self.prepare(each, rows, batch.shift) for each, rows in zip(each_scaling, batch.observations, strict=True)]
+        scalings = (of_observations, of_goals, of_observations)
+        pieces = [self.prepare(own, rows, batch.shift) for own, rows in zip(scalings, batch.observations, strict=True)]
         return Inputs(jnp.concatenate(pieces), views)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
@@ -324,42 +326,42 @@ class Networks:
         if not self.sees_images:
             return self._normalized(observations, mean, scale)
         if self.uses_kernel:
-            limit = self.config.normalizer_clip
+            limit = self.config.network.normalizer_clip
             return encoder_kernel.prepare(observations, mean, scale, self._levels, limit, self.dtype, shift)
         if shift is not None:
             return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
         return self._normalized(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
 
     def normalize(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
-        """As `prepare`, with the observations in their own order: [B, ...] in the dtype that the networks compute in."""
+        """Normalise like `prepare`, without reordering: [B, ...] in the compute dtype."""
         normalized = self._normalized(observations, *scaling)
         return normalized if shift is None else shifted(normalized, shift)
 
     def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
-        limit = self.config.normalizer_clip
+        limit = self.config.network.normalizer_clip
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 
     def encode(self, params: Params, inputs: jax.Array, which: slice = slice(None)) -> jax.Array:
-        """Latents of ``which`` of the prepared observations, [B, latent]; a state vector is its own latent."""
+        """Encode the prepared observations ``which``: [B, latent]; a state vector is its own latent."""
         return self.encode_pieces(params, [(inputs, which)])
 
     def encode_pieces(self, params: Params, pieces: Sequence[Piece]) -> jax.Array:
-        """Latents of some of several arrays of prepared observations, one after the other: [B, latent]."""
+        """Encode slices of several arrays of prepared observations; concatenate the latents: [B, latent]."""
         if not self.sees_images:
             return jnp.concatenate([inputs[which] for inputs, which in pieces])
         if not self.uses_kernel:
             return self._encoder.apply({"params": params["encoder"]}, *(inputs[which] for inputs, which in pieces))
         channels = self.observation_spec.shape[0]
         weights = encoder_kernel.make_weights(params["encoder"], channels)
-        found = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
+        features = [encoder_kernel.encode(inputs, weights, which) for inputs, which in pieces]
         finer = 4 ** (self._levels - encoder_kernel.LEVELS)
-        blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in found]
+        blocks = [part.reshape(part.shape[0], part.shape[1] // finer, finer * part.shape[2]) for part in features]
         return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
-        """Actions [B, A] float32 in (-1, 1) for latents [2, B, latent] of observations and goals."""
+        """Compute actions [B, A] float32 in (-1, 1) from latents [2, B, latent] of observations and goals."""
         return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
     def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        """Values [B] float32 of actions [B, A] for latents [2, B, latent] of observations and goals."""
+        """Compute values [B] float32 of actions [B, A] from latents [2, B, latent] of observations and goals."""
         return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, latents, action)[..., 0]

@@ -13,7 +13,7 @@ from jaxrl_vis.types import NormalizerState
 
 
 class Scaling(NamedTuple):
-    """Mean and scale that observations are normalised with.
+    """Mean and scale for normalising observations.
 
     Attributes:
         mean: [...] float32, in the observation's unit.
@@ -25,7 +25,7 @@ class Scaling(NamedTuple):
 
 
 def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
-    """Statistics of no observations of this shape."""
+    """Initialise the statistics of observations of this shape."""
     zeros = jnp.zeros(observation_spec.shape, jnp.float32)
     return NormalizerState(count=jnp.zeros((), jnp.float32), mean=zeros, sum_of_squares=zeros)
 
@@ -57,6 +57,6 @@ def update(
 
 
 def scale(state: NormalizerState, floor: float) -> jax.Array:
-    """1 / standard deviation [...] float32, the deviation being at least ``floor``."""
+    """Return 1 / max(standard deviation, ``floor``), [...] float32."""
     variance = state.sum_of_squares / jnp.maximum(state.count, 1.0)
     return 1.0 / jnp.maximum(jnp.sqrt(variance), floor)

@@ -1,1 +1,1 @@
-"""Several devices: placement of seeds and shards, and what shards tell each other."""
+"""Several devices: placement of seeds and shards, and communication between shards."""

@@ -4,10 +4,10 @@
     data    the devices share one learner: each plays its part of the environments, keeps these episodes in its part of the
             replay, and takes its part of every batch from there; gradients, statistics and metrics are averaged
 
-Every device runs the whole training iteration on its own part (`jax.shard_map`), so what is communicated is what this module
-averages, and nothing else. Random numbers are drawn for the whole learner, and each device takes its part of them: environment
-number 7 starts and explores alike on however many devices. Batches differ in one respect from those of a single device: part d
-of a batch is drawn from the episodes of the environments of device d, so each environment group contributes equally to it.
+Every device runs the whole training iteration on its own part (`jax.shard_map`), so only the averages of this module are
+communicated. Random numbers are drawn for the whole learner, and each device takes its part of them: environment number 7
+starts and explores alike on however many devices. Batches differ in one respect from those of a single device: part d of a
+batch is drawn from the episodes of the environments of device d, so each environment group contributes equally to it.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 
-from jaxrl_vis.config import Config, data_devices_of
+from jaxrl_vis.config import Config, data_devices
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.parallel.shards import DATA, ONE, Shards
 from jaxrl_vis.types import LoopState, ReplayState
@@ -32,10 +32,10 @@ SEED = "seed"
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Placement of the seeds of a run, and of the shards of each learner, on devices; make it with `make_layout`.
+    """Placement of a run's seeds, and of each learner's shards, on devices; create it with `make_layout`.
 
     Between two iterations, the replay of a learner that is divided is an array [S, rollouts, E, ...] in place of
-    [S, rollouts * E, ...]: the same bytes, so that a run may go on with another number of devices.
+    [S, rollouts * E, ...]: the same bytes, so that a run may continue on another number of devices.
 
     Attributes:
         mesh: The devices, with the axes `SEED` and `DATA`; None: JAX's first device, and plain arrays.
@@ -47,12 +47,12 @@ class Layout:
 
     @property
     def num_devices(self) -> int:
-        """Devices that are used."""
+        """Number of devices used."""
         return 1 if self.mesh is None else self.mesh.size
 
     @property
     def name(self) -> str:
-        """For people, such as ``2 x NVIDIA H200``."""
+        """Human-readable name, such as ``2 x NVIDIA H200``."""
         kind = jax.devices()[0].device_kind
         if self.mesh is None:
             return kind
@@ -61,27 +61,27 @@ class Layout:
 
     @property
     def devices(self) -> list[Any]:
-        """Those of them that belong to this process."""
+        """Devices of this process."""
         return jax.devices()[:1] if self.mesh is None else list(self.mesh.local_devices)
 
     @property
     def by_seed(self) -> Spec:
-        """[S, ...]: each seed on its devices."""
+        """Spec of arrays [S, ...]: each seed on its devices."""
         return Spec(SEED)
 
     @property
     def by_environment(self) -> Spec:
-        """[S, E, ...]: each environment on its device."""
+        """Spec of arrays [S, E, ...]: each environment on its device."""
         return Spec(SEED, DATA)
 
     @property
     def read_by_host(self) -> Spec:
-        """[S, ...], where the host is to read it: where seeds lie on devices of other processes, all devices get all of it."""
+        """Spec of arrays [S, ...] for the host: replicated if other processes have some of the seeds."""
         return Spec() if jax.process_count() > 1 else Spec(SEED)
 
     @property
     def everywhere(self) -> Spec:
-        """The same on all devices."""
+        """Spec of replicated arrays."""
         return Spec()
 
     @property
@@ -96,7 +96,7 @@ class Layout:
         return LoopState(train=Spec(SEED), replay=self.replay, key=Spec(SEED), iteration=Spec())  # type: ignore[arg-type]
 
     def shardings(self, specs: Any) -> Any:
-        """A tree of partition specs as shardings that `jax.jit` and `jax.device_put` take; None on one device."""
+        """Convert a tree of partition specs to shardings for `jax.jit` and `jax.device_put`; None on one device."""
         if self.mesh is None:
             return None
         place = functools.partial(NamedSharding, self.mesh)
@@ -110,9 +110,9 @@ class Layout:
         Args:
             function: Function of one device's parts of its arguments.
             in_specs: A partition spec, or a tree of them, for each argument.
-            out_specs: The same for what it returns.
+            out_specs: The same for its results.
             jit: Such as `jax.jit`.
-            kept_as: Partition specs of what is returned in the end; None: ``out_specs``.
+            kept_as: Partition specs of the final result; None: ``out_specs``.
             **options: Of ``jit``.
         """
         if self.mesh is None:
@@ -123,7 +123,7 @@ class Layout:
         return jit(mapped, **shardings, **options)
 
     def with_shardings(self, shapes: Any, specs: Any) -> Any:
-        """Shapes (as of `jax.eval_shape`) that also say where their arrays lie.
+        """Add shardings to shapes (as of `jax.eval_shape`).
 
         Args:
             shapes: A pytree.
@@ -138,7 +138,7 @@ class Layout:
         return jax.tree.map(placed, self.shardings(specs), shapes)
 
     def put(self, tree: Any, specs: Any) -> Any:
-        """Move arrays to where they belong; a leaf of ``specs`` stands for a part of ``tree``."""
+        """Place arrays by their specs; a leaf of ``specs`` covers a subtree of ``tree``."""
         if self.mesh is None:
             return tree
 
@@ -148,7 +148,7 @@ class Layout:
         return jax.tree.map(placed, self.shardings(specs), tree)
 
     def folded(self, replay: ReplayState, num_envs: int) -> ReplayState:
-        """Return one device's part of a learner's replay as it is between two iterations.
+        """Return one device's part of a learner's replay in its form between two iterations.
 
         Args:
             replay: Replay of one learner, [rollouts * E, ...].
@@ -161,7 +161,7 @@ class Layout:
         return ReplayState(episodes=episodes, size=replay.size * count)
 
     def unfolded(self, replay: ReplayState) -> ReplayState:
-        """Undo `folded`."""
+        """Invert `folded`."""
         count = self.shards.count
         if count == 1:
             return replay
@@ -170,7 +170,7 @@ class Layout:
 
 
 def put_array(array: Any, sharding: Any) -> jax.Array:
-    """Move an array to where it belongs, which may be devices of several processes: all call this with the same array."""
+    """Place an array, possibly on devices of several processes: all of them call this with the same array."""
     if sharding.is_fully_addressable or getattr(array, "sharding", None) == sharding:
         return jax.device_put(array, sharding)
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
@@ -185,7 +185,7 @@ ONE_DEVICE = Layout()
 
 
 def _avoid_shardy() -> None:
-    """Let XLA partition programs by GSPMD where Shardy would end the process.
+    """Let XLA partition programs by GSPMD if Shardy would crash.
 
     In jaxlib 0.11 a pass of Shardy reads past the end of a list, and so dies of a segmentation fault, where constants that a
     `jax.shard_map` closes over turn out to be unused (`ManualComputationUnusedInputsPattern`); physics models are full of them.
@@ -201,20 +201,22 @@ def make_layout(config: Config) -> Layout:
         config: The run; its ``devices`` and ``data_devices``.
 
     Raises:
-        RequestError: There are not so many devices.
+        RequestError: There are too few devices.
     """
-    if config.devices == 1 and jax.process_count() == 1:
+    if config.run.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE
     there = jax.devices()
-    if config.devices > len(there):
+    if config.run.devices > len(there):
         what = "there is 1" if len(there) == 1 else f"there are {len(there)}"
-        raise RequestError(f"devices {config.devices} asks for more than {what} ({there[0].device_kind}): write --devices all")
-    if jax.process_count() > 1 and config.devices < len(there):
         raise RequestError(
-            f"devices {config.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes without "
-            "work: write --devices all, or start fewer processes"
+            f"devices {config.run.devices} asks for more than {what} ({there[0].device_kind}): write --devices all"
+        )
+    if jax.process_count() > 1 and config.run.devices < len(there):
+        raise RequestError(
+            f"devices {config.run.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes "
+            "without work: write --devices all, or start fewer processes"
         )
     _avoid_shardy()
-    along_data = data_devices_of(config)
-    devices = np.asarray(there[: config.devices], dtype=object).reshape(-1, along_data)
+    along_data = data_devices(config)
+    devices = np.asarray(there[: config.run.devices], dtype=object).reshape(-1, along_data)
     return Layout(Mesh(devices, (SEED, DATA)), Shards(along_data))

@@ -1,7 +1,7 @@
-"""The parts that one learner is divided into, seen from within one of them: what is averaged, and what is whose.
+"""Shards of one learner, seen from within one of them: averaging, and each shard's share.
 
 Every function here is called in a mapped axis (of `jax.shard_map` or `jax.vmap`) called `DATA`, unless there is one part only:
-then each returns what it is given, and nothing of it is left in the program.
+then each returns its argument, and leaves nothing in the program.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ DATA = "data"
 
 @dataclasses.dataclass(frozen=True)
 class Shards:
-    """The parts of one learner.
+    """Shards of one learner.
 
     Attributes:
         count: Number of shards.
@@ -26,29 +26,29 @@ class Shards:
     count: int = 1
 
     def mean(self, tree: Any) -> Any:
-        """The mean of a pytree of float32 arrays over the parts, by one all-reduce of one flat buffer."""
+        """Average a pytree of float32 arrays over the shards, by one all-reduce of one flat buffer."""
         if self.count == 1:
             return tree
         flat, restore = ravel_pytree(tree)
         return restore(jax.lax.pmean(flat, DATA))
 
     def total(self, array: jax.Array) -> jax.Array:
-        """The sum over the parts."""
+        """Sum over the shards."""
         return array if self.count == 1 else jax.lax.psum(array, DATA)
 
     def whole(self, mean: jax.Array) -> jax.Array:
-        """The whole learner's mean, of this part's; its gradient is this part's alone, so that `mean` makes that whole, too."""
+        """Average over the shards, with the gradient of this shard alone, which `mean` then averages, too."""
         return mean if self.count == 1 else mean + jax.lax.stop_gradient(self.mean(mean) - mean)
 
     def part(self, array: jax.Array) -> jax.Array:
-        """This part of what the whole learner has, along the first axis."""
+        """Return this shard's part of the whole learner's array, along the first axis."""
         if self.count == 1:
             return array
         size = array.shape[0] // self.count
         return jax.lax.dynamic_slice_in_dim(array, jax.lax.axis_index(DATA) * size, size)
 
     def draw(self, draw: Callable[[tuple[int, ...]], jax.Array], shape: tuple[int, ...]) -> jax.Array:
-        """Random numbers of ``shape`` for this part: its part of those that the whole learner draws.
+        """Draw this shard's part, of ``shape``, of the random numbers of the whole learner.
 
         Args:
             draw: shape -> random numbers, with a key that all parts share.
@@ -57,19 +57,19 @@ class Shards:
         return self.part(draw((shape[0] * self.count, *shape[1:])))
 
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-        """Standard normal numbers for this part's images, of ``shape``; the same ones however a learner is divided."""
+        """Draw standard normal numbers for this shard's images, of ``shape``, independent of the number of shards."""
         return self.draw(lambda whole: jax.random.normal(key, whole), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
-        """Return a key for each of the ``count`` environments of this part."""
+        """Return a key for each of the ``count`` environments of this shard."""
         return self.part(jax.random.split(key, count * self.count))
 
     def gather(self, array: jax.Array, axis: int = 0) -> jax.Array:
-        """All parts of an array, one after the other along ``axis``."""
+        """Concatenate all shards of an array along ``axis``."""
         return array if self.count == 1 else jax.lax.all_gather(array, DATA, axis=axis, tiled=True)
 
     def own_key(self, key: jax.Array) -> jax.Array:
-        """A key for what each part draws by itself."""
+        """Derive a key that differs between shards."""
         return key if self.count == 1 else jax.random.fold_in(key, jax.lax.axis_index(DATA))
 
 

@@ -1,4 +1,4 @@
-"""The interface of a weighting, which decides how much each auxiliary loss counts beside the main one.
+"""Interface of a weighting, which sets the weights of the auxiliary losses relative to the main one.
 
 One gradient step with losses L_i, shared parameters theta and a weighting:
 
@@ -87,11 +87,11 @@ class Weighting(NamedTuple):
     hold: Callable[[Params, WeightingState], WeightingState] | None = None
 
     def slopes(self, losses: Losses) -> dict[str, jax.Array]:
-        """s_i: the derivative of what is learned by the loss itself, [] float32 by name. All 1 without logarithms."""
-        return {name: log_slope(loss, self._eps_of(name)) if self.log else jnp.ones(()) for name, loss in losses.items()}
+        """Compute s_i, the objective's derivative by each loss, [] float32 by name; 1 without logarithms."""
+        return {name: log_slope(loss, self._loss_eps(name)) if self.log else jnp.ones(()) for name, loss in losses.items()}
 
     def coefficients(self, weights: Weights, losses: Losses) -> dict[str, jax.Array]:
-        """c_i = w_i s_i: what gradients of the losses are multiplied with before they are added up, [] float32 by name."""
+        """Compute c_i = w_i s_i, the coefficients of the losses' gradients in the total gradient, [] float32 by name."""
         return {name: weights[name] * slope for name, slope in self.slopes(losses).items()}
 
     def objective(self, weights: Weights, losses: Losses) -> jax.Array:
@@ -100,15 +100,15 @@ class Weighting(NamedTuple):
         Its gradient, weights being constant, is the sum of c_i grad L_i.
         """
         weights = jax.lax.stop_gradient(weights)
-        learned = {name: log_loss(loss, self._eps_of(name)) if self.log else loss for name, loss in losses.items()}
+        learned = {name: log_loss(loss, self._loss_eps(name)) if self.log else loss for name, loss in losses.items()}
         return sum((weights[name] * loss for name, loss in learned.items()), jnp.zeros(()))
 
-    def _eps_of(self, name: str) -> float:
+    def _loss_eps(self, name: str) -> float:
         return self.main_eps if name == MAIN else self.eps
 
 
 def log_loss(loss: jax.Array, eps: float) -> jax.Array:
-    """log(L + eps), continued below L = 0 as a straight line: finite, and increasing everywhere.
+    """Compute log(L + eps), extended linearly below L = 0: finite and increasing everywhere.
 
     Args:
         loss: [] float.
@@ -118,17 +118,17 @@ def log_loss(loss: jax.Array, eps: float) -> jax.Array:
 
 
 def log_slope(loss: jax.Array, eps: float) -> jax.Array:
-    """The derivative of `log_loss`: 1 / (max(L, 0) + eps), without gradient."""
+    """Compute the derivative of `log_loss`: 1 / (max(L, 0) + eps), without gradient."""
     return 1.0 / (jnp.maximum(jax.lax.stop_gradient(loss), 0.0) + eps)
 
 
 def to_float32(leaf: jax.Array) -> jax.Array:
-    """Return an array in float32, or as it is where its dtype is finer."""
+    """Convert an array to float32, unless its dtype is wider."""
     return leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
 
 
 def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
-    """Split the result of a function of losses, or its shapes, into the losses and what is beside them, or None.
+    """Split the result of a loss function, or its shapes, into the losses and the auxiliary output, or None.
 
     Raises:
         RequestError: It is not that, or a loss is not a single number.
@@ -146,7 +146,7 @@ def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
 
 
 def check_names(losses: Losses, state: WeightingState) -> None:
-    """Check that the losses are those that a state began with.
+    """Check that the losses are those that the state was initialised with.
 
     Raises:
         RequestError: They are not.
@@ -157,7 +157,7 @@ def check_names(losses: Losses, state: WeightingState) -> None:
 
 
 def dot(one: Params, other: Params) -> jax.Array:
-    """Inner product of two trees of the same structure: [] float32, computed in it (or in what is finer) whatever theirs is.
+    """Compute the inner product of two trees in float32 or wider, whatever their dtypes: [].
 
     Products are added up one by one instead of in a matrix unit, which on accelerators would round them to 10 bits.
     """
@@ -170,12 +170,12 @@ def dot(one: Params, other: Params) -> jax.Array:
 
 
 def scaled(tree: Params, factor: jax.Array | float) -> Params:
-    """A tree with all leaves multiplied by a number."""
+    """Multiply all leaves of a tree by a number."""
     return jax.tree.map(lambda leaf: factor * leaf, tree)
 
 
 def weighted_sum(gradients: Mapping[str, Params], coefficients: Mapping[str, jax.Array]) -> Params:
-    """Sum over the losses of c_i g_i, float32 (or finer): a tree like each of them.
+    """Sum c_i g_i over the losses, in float32 or wider: a tree like each gradient.
 
     Args:
         gradients: Trees of one structure, by name.
@@ -189,7 +189,7 @@ def weighted_sum(gradients: Mapping[str, Params], coefficients: Mapping[str, jax
 
 
 def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -> tuple[str, ...]:
-    """The names without `MAIN`.
+    """Return the names without `MAIN`.
 
     Args:
         weighting: Its name, for the message.
@@ -211,7 +211,7 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
 
 
 def checked(weighting: Weighting) -> Weighting:
-    """The weighting itself.
+    """Check a weighting, and return it.
 
     Raises:
         RequestError: It adds nothing, or something negative, before it takes logarithms.
@@ -224,7 +224,7 @@ def checked(weighting: Weighting) -> Weighting:
 
 
 def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> WeightingState:
-    """A state at its beginning.
+    """Return an initial state.
 
     Args:
         names: Names of the auxiliary losses.
@@ -236,6 +236,6 @@ def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> We
 
 
 def report(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
-    """Metrics: ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` where there are dots."""
+    """Return metrics: ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if there are dots."""
     shown = {f"weight/{name}": weight for name, weight in weights.items() if name != MAIN}
     return shown | {f"dot/{name}": value for name, value in (dots or {}).items()}

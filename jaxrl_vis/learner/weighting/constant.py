@@ -1,4 +1,4 @@
-"""Weightings without a memory: their weights are given, or follow from the gradients of the step itself."""
+"""Weightings without memory: weights are constant, or follow from the gradients of the current step."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -22,27 +22,27 @@ from jaxrl_vis.types import Metrics, Params
 
 
 def none() -> Weighting:
-    """The main loss alone, as it is (thesis 5.2.3.3, "No Auxiliary Losses")."""
+    """Use the main loss alone (thesis 5.2.3.3, "No Auxiliary Losses")."""
     return _constant("none", 0.0, auxiliary=False)
 
 
 def none_log(main_eps: float = 1e-8) -> Weighting:
-    """The logarithm of the main loss alone: what the logarithm does without auxiliary losses."""
+    """Use the logarithm of the main loss alone, to separate its effect from that of auxiliary losses."""
     return _constant("none_log", 0.0, auxiliary=False, log=True, main_eps=main_eps)
 
 
 def plain_sum() -> Weighting:
-    """All losses as they are, added up."""
+    """Add up all losses."""
     return _constant("sum", 1.0)
 
 
 def balance(eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
-    """The logarithms of all losses, added up (thesis 5.2.3.3, "Gradient Balancing")."""
+    """Add up the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing")."""
     return _constant("balance", 1.0, log=True, eps=eps, main_eps=main_eps)
 
 
 def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
-    """Weights that are chosen by hand and stay.
+    """Use constant weights, chosen by hand.
 
     Args:
         weights: One number for all auxiliary losses, or a number for each by its name.
@@ -59,7 +59,7 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: flo
 
 
 def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
-    """Each auxiliary loss counts once where its gradient does not point against the main one, else not at all.
+    """Use an auxiliary loss, with weight 1, only if its gradient does not oppose the main one's.
 
     Weight 1 where the cosine of the two gradients is at least 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine Similarity"). Only
     the sign matters, so no norm is needed, and logarithms do not change the weights.

@@ -1,4 +1,4 @@
-"""Gradients of several losses, what weightings need to know about them, and their weighted sum.
+"""Gradients of several losses, the statistics that weightings need, and the weighted sum.
 
 `weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of two ways, which
 agree up to rounding:
@@ -71,10 +71,10 @@ def everything(params: Params) -> Params:
 def loss_gradients(
     losses_fn: LossesFunction, params: Params, *args: Any, has_aux: bool = False
 ) -> tuple[dict[str, jax.Array], dict[str, Params], Any]:
-    """Compute each loss, and its gradient by itself.
+    """Compute each loss with its own gradient.
 
     Args:
-        losses_fn: (params, *args) -> [] floats by name; with ``has_aux``, and anything else beside these.
+        losses_fn: (params, *args) -> [] floats by name; with ``has_aux``, followed by any auxiliary output.
         params: The parameters to differentiate by.
         args: More arguments.
         has_aux: See ``losses_fn``.
@@ -120,11 +120,11 @@ def weighted_grad(
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
     encode: Encode | None = None,
 ) -> Callable[..., Weighted]:
-    """Make the function that computes the weighted gradient of a dictionary of losses.
+    """Build the function that computes the weighted gradient of a dictionary of losses.
 
     Args:
-        losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, and anything else
-            beside these. A gradient is taken for each loss as a whole, heads and shared parameters alike. With ``encode``:
+        losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, followed by any
+            auxiliary output. A gradient is taken for each loss as a whole, heads and shared parameters alike. With ``encode``:
             (params, latents, *args).
         weighting: From `make_weighting`.
         shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
@@ -133,7 +133,7 @@ def weighted_grad(
         has_aux: See ``losses_fn``.
         reduce: Applied to losses, gradients and dots before the weighting reads them, where each device has its own part of
             the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
-        forwards: Makes the context in which what is differentiated forwards is traced.
+        forwards: Factory of the context for tracing forward-mode differentiation.
         encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
             through these alone. Way latents needs it; the other takes it, too. Or a dictionary of such functions, where latents
             are a dictionary of the same names: gradients then pass only through those that a loss reads.
@@ -152,7 +152,7 @@ def weighted_grad(
     if way == "latents" and encode is None:
         raise RequestError("way latents needs to know what the latents are: give encode")
 
-    def losses_of(params: Params, *args: Any) -> Any:
+    def encoded_losses(params: Params, *args: Any) -> Any:
         if encode is None:
             return losses_fn(params, *args)
         picked = shared(params)
@@ -161,13 +161,13 @@ def weighted_grad(
         return losses_fn(params, encode(picked, *args), *args)
 
     def find_per_loss(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        losses, gradients, extra = loss_gradients(losses_of, params, *args, has_aux=has_aux)
+        losses, gradients, extra = loss_gradients(encoded_losses, params, *args, has_aux=has_aux)
         check_names(losses, state)
         losses, gradients = reduce((losses, gradients))
         compared_losses, compared = losses, gradients
         if weighting.hold is not None:
             state = weighting.hold(params, state)
-            compared_losses, compared = reduce(loss_gradients(losses_of, state.params, *args, has_aux=has_aux)[:2])
+            compared_losses, compared = reduce(loss_gradients(encoded_losses, state.params, *args, has_aux=has_aux)[:2])
         statistics = measure(weighting, compared_losses, {name: shared(tree) for name, tree in compared.items()})
         weights, state, metrics = weighting.update(compared_losses, statistics, state)
         combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
@@ -178,25 +178,25 @@ def weighted_grad(
         through = latents.encode(encode, shared(params), *args)
         # The losses are traced here, to see which latents and parameters each of them reads.
         program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
-        found = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
-        check_names(found.losses, state)
-        losses = reduce(found.losses)
+        differentiated = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
+        check_names(differentiated.losses, state)
+        losses = reduce(differentiated.losses)
         statistics = of_main = None
         if weighting.needs == "dots":
-            of_main = through.backward(found.at_latents, {MAIN: jnp.ones(())})
+            of_main = through.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
             with forwards():
-                dots = through.dots(reduce(of_main), found.at_latents)
+                dots = through.dots(reduce(of_main), differentiated.at_latents)
             statistics = reduce(dots)
         weights, state, metrics = weighting.update(losses, statistics, state)
         coefficients = weighting.coefficients(weights, losses)
         rest = coefficients
         if of_main is not None:
             rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
-        added = through.backward(found.at_latents, rest)
+        added = through.backward(differentiated.at_latents, rest)
         if of_main is not None:  # the main loss's own is known already, and gradients add up
             added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
-        combined = jax.tree.map(jnp.add, found.combined(params, coefficients), _embed(shared, params, added))
-        return Weighted(reduce(combined), state, losses, metrics, weights, found.extra)
+        combined = jax.tree.map(jnp.add, differentiated.combined(params, coefficients), _embed(shared, params, added))
+        return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
 
     return find_per_loss if way == "per_loss" else find_by_latents
 

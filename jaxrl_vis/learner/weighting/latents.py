@@ -3,7 +3,7 @@
     encode          latents of every group, and the way back through each
     differentiate   each loss down to what it reads of the parameters and of the latents
 
-What a loss reads is found by tracing it, so that nothing is computed for what it does not: a gradient passes only through those
+The inputs of a loss are found by tracing it, so that nothing is computed for others: a gradient passes only through those
 groups of latents that it is not zero in, and a head's gradient is not added to the zeros of all other losses.
 """
 
@@ -25,13 +25,13 @@ AtLatents = Mapping[str, Mapping[str, Any]]
 
 
 def like(tree: Params, other: Params) -> Params:
-    """A tree in the dtypes of another."""
+    """Cast a tree to the dtypes of another."""
     return jax.tree.map(lambda leaf, model: leaf.astype(model.dtype), tree, other)
 
 
 @dataclasses.dataclass(frozen=True)
 class Through:
-    """Latents, and the ways from and to the shared parameters.
+    """Latents, and their linearisations with respect to the shared parameters.
 
     Attributes:
         latents: By group.
@@ -49,11 +49,11 @@ class Through:
 
     @property
     def read(self) -> Any:
-        """Latents as losses take them."""
+        """Latents in the form that losses take."""
         return self.latents if self.has_names else self.latents[_ALL]
 
     def backward(self, at_latents: AtLatents, coefficients: Mapping[str, jax.Array]) -> Params:
-        """The gradient in the shared parameters of a sum of some losses, float32."""
+        """Compute the gradient of a weighted sum of losses in the shared parameters, float32."""
         total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32)), self.picked)
         for group, pullback in self.pullbacks.items():
             readers = {name: at[group] for name, at in at_latents.items() if name in coefficients and group in at}
@@ -63,7 +63,7 @@ class Through:
         return total
 
     def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
-        """The inner products of each auxiliary loss's gradient and a direction in the shared parameters, [] float32 by name."""
+        """Compute the inner product of each auxiliary loss's gradient and a direction in the shared parameters, [] float32."""
         along, others = like(direction, self.picked), {name: at for name, at in at_latents.items() if name != MAIN}
         read = {group for at in others.values() for group in at}
         tangents = {
@@ -76,18 +76,18 @@ class Through:
 
 
 def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], picked: Params, *args: Any) -> Through:
-    """Latents of the shared parameters ``picked``; ``functions`` as of `gradients.weighted_grad`."""
+    """Compute latents of the shared parameters ``picked``; ``functions`` as in `gradients.weighted_grad`."""
     has_names = isinstance(functions, Mapping)
     named = functions if isinstance(functions, Mapping) else {_ALL: functions}
     of_picked = {group: (lambda picked, encode=encode: encode(picked, *args)) for group, encode in named.items()}
     passes = {group: jax.vjp(function, picked) for group, function in of_picked.items()}
-    latents = {group: found for group, (found, _) in passes.items()}
+    latents = {group: values for group, (values, _) in passes.items()}
     return Through(latents, {group: back for group, (_, back) in passes.items()}, of_picked, picked, has_names)
 
 
 @dataclasses.dataclass(frozen=True)
 class Differentiated:
-    """Losses and their gradients, each with respect to what it reads.
+    """Losses, and the gradient of each with respect to its inputs.
 
     Attributes:
         losses: [] float32 by name.
@@ -102,13 +102,13 @@ class Differentiated:
     extra: Any
 
     def combined(self, params: Params, coefficients: Mapping[str, jax.Array]) -> Params:
-        """The weighted sum of all gradients with respect to the parameters, but for what passes through latents: float32."""
+        """Sum the weighted gradients with respect to the parameters, except for the paths through latents: float32."""
         leaves, structure = jax.tree.flatten(params)
 
         def total(place: int, leaf: jax.Array) -> jax.Array:
             zeros = jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32))
-            found = {name: of[place] for name, of in self.of_params.items() if place in of}
-            return sum((coefficients[name] * gradient.astype(zeros.dtype) for name, gradient in found.items()), zeros)
+            gradients = {name: of[place] for name, of in self.of_params.items() if place in of}
+            return sum((coefficients[name] * gradient.astype(zeros.dtype) for name, gradient in gradients.items()), zeros)
 
         return jax.tree.unflatten(structure, [total(place, leaf) for place, leaf in enumerate(leaves)])
 
@@ -116,10 +116,10 @@ class Differentiated:
 def differentiate(
     losses_fn: Callable[..., Any], has_aux: bool, through: Through, traced: tuple[Any, Any], params: Params, *args: Any
 ) -> Differentiated:
-    """Compute each loss, and its gradients with respect to the parameters and the latents that it reads.
+    """Compute each loss, and its gradients with respect to the parameters and latents that it reads.
 
     Args:
-        losses_fn: (params, latents, *args) -> [] floats by name; with ``has_aux``, and anything else beside these.
+        losses_fn: (params, latents, *args) -> [] floats by name; with ``has_aux``, followed by any auxiliary output.
         has_aux: See ``losses_fn``.
         through: From `encode`.
         traced: `jax.make_jaxpr` of ``losses_fn``, with the shapes of what it returns.
@@ -133,10 +133,10 @@ def differentiate(
 
         def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
             now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
-            given = through.latents | latents
-            read = given if through.has_names else given[_ALL]
-            found, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
-            return to_float32(jnp.asarray(found[name])), extra
+            inputs = through.latents | latents
+            read = inputs if through.has_names else inputs[_ALL]
+            by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
+            return to_float32(jnp.asarray(by_name[name])), extra
 
         # Each by itself, so that a compiler finds what the others compute in it to be of no use.
         chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
@@ -147,7 +147,7 @@ def differentiate(
 
 
 def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, through: Through) -> dict[str, Any]:
-    """Find what the gradient of each loss can be other than zero in: places of parameters' leaves, and groups of latents.
+    """Find where each loss can have a nonzero gradient: indices of the parameters' leaves, and groups of latents.
 
     Within a nested program every result counts as reading every argument: so rather too much is found than too little.
     """
@@ -155,12 +155,12 @@ def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, throug
     of_leaf, rest = variables[:num_leaves], iter(variables[num_leaves:])
     # Leaves of a dictionary come in the order of its sorted keys.
     of_group = {group: [next(rest) for _ in jax.tree.leaves(through.latents[group])] for group in sorted(through.latents)}
-    found = {}
+    reads = {}
     for name, result in zip(sorted(losses), program.jaxpr.outvars):  # followed by what comes beside the losses
         needed = set() if isinstance(result, Literal) else {result}
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):
                 needed.update(variable for variable in equation.invars if not isinstance(variable, Literal))
         places = [place for place, variable in enumerate(of_leaf) if variable in needed]
-        found[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
-    return found
+        reads[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
+    return reads

@@ -41,7 +41,7 @@ def ol_aux(
     main_eps: float = 1e-8,
     minimum: float | None = 0.0,
 ) -> Weighting:
-    """OL-AUX-N. Weights begin at 1; a step is taken with those from before its own gradients.
+    """Build OL-AUX-N. Weights start at 1; a step uses the weights from before its own gradients.
 
     Args:
         interval: N, updates from one change of the weights to the next.
@@ -80,12 +80,12 @@ def make_rule(
     minimum: float | None,
     multiplicative: bool = False,
 ) -> Callable[..., WeightingState]:
-    """Make the rule that moves weights by what their losses' gradients have in common with the main one's.
+    """Build the rule that updates weights by the inner products of their losses' gradients with the main one's.
 
     Args:
         label: Name of the weighting, for messages.
         interval, learning_rate, beta, minimum: As of `ol_aux`.
-        multiplicative: Compare w_i g_i in the place of g_i, as the authors' quadratic example does.
+        multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Returns:
         (state; [] float32 by name, the mean of the dots; sums of this interval; further fields) -> the state after this update.

@@ -42,14 +42,14 @@ def ol_aux_window(
     minimum: float | None = 0.0,
     multiplicative: bool = False,
 ) -> Weighting:
-    """OL-AUX-N as in the authors' release, by gradients that are averaged over the latest updates before they are compared.
+    """Build OL-AUX-N as in the authors' release: gradients are averaged over the latest updates before they are compared.
 
     Args:
         interval, learning_rate, beta, log, eps, main_eps, minimum: As of `ol_aux.ol_aux`.
         main_grad: main, the gradient of the main loss (thesis), or total, that of everything that is learned, which adds
             w_i |g_i|^2 to each dot (release).
         window: Latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
-        multiplicative: Compare w_i g_i in the place of g_i, as the authors' quadratic example does.
+        multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Raises:
         RequestError: An argument makes no sense; from ``init``: ``shared`` is not given; from ``update``: the state is another
@@ -69,12 +69,12 @@ def ol_aux_window(
         check_state(label, state)
         latest = _learned(weighting, losses, statistics)
         latest[MAIN] = _direction(main_grad, latest, state.weights)
-        kept = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
+        gradients = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
         count = jnp.minimum(state.updates + 1, window)  # the window begins with zeros
-        mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, kept)
+        mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, gradients)
         dots = {name: dot(mean[MAIN], mean[name]) for name in state.sums}
         sums = jax.tree.map(jnp.add, state.sums, dots)
-        after = move(state, scaled(sums, 1.0 / interval), sums, window=kept)
+        after = move(state, scaled(sums, 1.0 / interval), sums, window=gradients)
         return state.weights, after, report(state.weights, dots)
 
     weighting = checked(
@@ -94,7 +94,7 @@ def ol_aux_ablation(
     window: int = 1,
     minimum: float | None = 0.0,
 ) -> Weighting:
-    """OL-AUX-N (Ablation) of figure 5.7: the one-step rule, every N updates, on as much data as OL-AUX-N reads in them.
+    """Build OL-AUX-N (Ablation) of figure 5.7: the one-step rule every N updates, on as much data as OL-AUX-N uses.
 
     Gradients and losses of N minibatches, all of them taken at the parameters that the interval began with, are averaged as if
     they were one minibatch of N times the size, and compared once. So the weights follow what helps within one step, from
@@ -155,7 +155,7 @@ def _check_main_grad(label: str, main_grad: str) -> None:
 
 
 def _names(label: str, names: Iterable[str], shared: Params) -> tuple[str, ...]:
-    """Names of the auxiliary losses."""
+    """Return the names of the auxiliary losses."""
     others = auxiliary_names(label, names)
     if shared is None:
         raise RequestError(f"weighting {label} keeps gradients: give init the shared parameters, too")
@@ -163,17 +163,17 @@ def _names(label: str, names: Iterable[str], shared: Params) -> tuple[str, ...]:
 
 
 def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
-    """Gradients of the losses as those of what is learned."""
+    """Convert gradients of the losses to those of the learned objective."""
     return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
 
 
 def _direction(main_grad: MainGradient, gradients: Mapping[str, Params], weights: Weights) -> Params:
-    """The gradient that the others are compared with, from gradients of what is learned."""
+    """Return the gradient that the others are compared with."""
     return gradients[MAIN] if main_grad == "main" else weighted_sum(gradients, weights)
 
 
 def _zeros(names: Iterable[str], shared: Params, *leading: int) -> dict[str, Params]:
-    """A tree of zeros for each name, at least float32."""
+    """Return a tree of zeros for each name, at least float32."""
 
     def zeros(leaf: Any) -> jax.Array:
         return jnp.zeros((*leading, *leaf.shape), jnp.promote_types(leaf.dtype, jnp.float32))

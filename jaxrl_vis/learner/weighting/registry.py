@@ -1,4 +1,4 @@
-"""All weightings by name. A new one is a function that makes it, and a row here."""
+"""Weightings by name. A new one is a constructor and a row here."""
 
 import inspect
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _VARIANTS: dict[str, Callable[..., Weighting]] = {"ol_aux": ol_aux_window}
 
 
 def make_weighting(name: str, **options: Any) -> Weighting:
-    """A weighting by its name.
+    """Build a weighting by name.
 
     Args:
         name: One of `WEIGHTINGS`.

@@ -1,1 +1,1 @@
-"""Compiled programs of a run: how they are made, kept, called, and checked against the memory there is."""
+"""Compiled programs of a run: compilation, caching, calls, and memory checks."""

@@ -1,4 +1,4 @@
-"""Memory that a run needs, compared with what a device has before anything is allocated."""
+"""Memory checks of a run, before anything is allocated."""
 
 import math
 import os
@@ -28,7 +28,7 @@ _BATCH_COPIES = 30
 
 
 def tree_bytes(shapes: Any) -> int:
-    """Bytes of all arrays (or their shapes) in a pytree; typed keys count as their words."""
+    """Count the bytes of all arrays (or their shapes) in a pytree; typed keys count as their words."""
 
     def size(leaf: Any) -> int:
         item = 8 if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf.dtype.itemsize
@@ -38,7 +38,7 @@ def tree_bytes(shapes: Any) -> int:
 
 
 def available_bytes(device: Any = None) -> int | None:
-    """Bytes that a device (the first one) can still give, or, for a CPU, that the host can; None where nobody says."""
+    """Return the free memory of a device (by default the first) or, for a CPU, of the host, in bytes; None if unknown."""
     device = jax.local_devices()[0] if device is None else device
     if device.platform != "cpu":
         statistics = device.memory_stats() or {}
@@ -58,7 +58,7 @@ def available_bytes(device: Any = None) -> int | None:
 
 
 def _container_bytes() -> int:
-    """Return the bytes that a container's limit (cgroup version 2) leaves; a very large number where there is none."""
+    """Return the bytes left by a container's limit (cgroup version 2); a very large number if there is none."""
     group = Path("/sys/fs/cgroup")
     try:
         limit = (group / "memory.max").read_text(encoding="ascii").strip()
@@ -71,20 +71,20 @@ def _container_bytes() -> int:
 
 
 def show_bytes(count: float) -> str:
-    """``1.5 GiB`` and the like: always in GiB, so that any two sizes can be compared at a glance."""
+    """Format a size as ``1.5 GiB``: always in GiB, so that any two sizes can be compared at a glance."""
     gib = count / 2**30
     return f"{gib:.1f} GiB" if gib >= 0.1 else f"{gib:.3f} GiB" if gib >= 0.001 else "under 0.001 GiB"
 
 
 def _least_available(layout: Layout) -> int | None:
-    """Bytes that each of the run's devices can give; None where one does not say."""
+    """Return the free memory of the fullest of the run's devices, in bytes; None if one is unknown."""
     if layout.mesh is None:
         return available_bytes()
     if layout.devices[0].platform == "cpu":  # the host's memory is that of all of them
         there = available_bytes()
         return None if there is None else there // len(layout.devices)
-    found = [available_bytes(device) for device in layout.devices]
-    return None if None in found else min(each for each in found if each is not None)
+    available = [available_bytes(device) for device in layout.devices]
+    return None if None in available else min(count for count in available if count is not None)
 
 
 def check_memory(
@@ -95,7 +95,7 @@ def check_memory(
     layout: Layout = ONE_DEVICE,
     frame_stack: int = 1,
 ) -> str:
-    """Compare what a run needs on a device with what there is.
+    """Estimate a run's memory, and compare it with a device's free memory.
 
     Args:
         config: The run.
@@ -111,14 +111,14 @@ def check_memory(
     Raises:
         RequestError: It does not fit. Says what would.
     """
-    capacity = math.ceil(config.replay_transitions / steps_per_iteration) * steps_per_iteration
+    capacity = math.ceil(config.run.replay_transitions / steps_per_iteration) * steps_per_iteration
     parts = layout.shards.count
     share = parts / layout.num_devices  # of the seeds, on each device
-    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.seeds) * share
-    replay = replay_bytes * config.seeds * share / parts
+    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.run.seeds) * share
+    replay = replay_bytes * config.run.seeds * share / parts
     bytes_per_rollout = replay * steps_per_iteration / capacity
     collected = bytes_per_rollout * frame_stack
-    batch = collected / steps_per_iteration * config.batch_size * 4
+    batch = collected / steps_per_iteration * config.run.batch_size * 4
     beside = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
     there, each = _least_available(layout), "" if layout.num_devices == 1 else " a device"
     if there is None:
@@ -129,9 +129,9 @@ def check_memory(
             mend = f"--replay-transitions {fitting} fits"
         else:
             mend = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
-        seeds = "1 seed" if config.seeds == 1 else f"{config.seeds} seeds"
+        seeds = "1 seed" if config.run.seeds == 1 else f"{config.run.seeds} seeds"
         raise RequestError(
-            f"a replay of {config.replay_transitions} transitions for {seeds} needs "
+            f"a replay of {config.run.replay_transitions} transitions for {seeds} needs "
             f"{show_bytes(replay)}{each}, and networks and rollouts {show_bytes(beside)} more; there are "
             f"{show_bytes(there)}{each}: {mend}"
         )
@@ -139,7 +139,7 @@ def check_memory(
 
 
 def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> None:
-    """The same question with the compiler's own figures. Still nothing is allocated.
+    """Compare the compiler's own figures with the free memory. Still nothing is allocated.
 
     Args:
         programs: Compiled programs by name; ``learn`` among them, where a state is to be made.
@@ -162,7 +162,7 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
 
 
 def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> bool:
-    """Return True if all programs have room at once, so that one may be called while another still runs.
+    """Return True if all programs fit into memory at once, so that one may be called while another still runs.
 
     Args:
         programs, already_there, layout: As of `check_compiled`.
@@ -173,7 +173,7 @@ def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout =
 
 
 def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:
-    """Bytes of the state that is trained, and of each program's scratch memory, on one device, as the compiler says."""
+    """Return the compiler's figures for one device, in bytes: the trained state, and each program's scratch memory."""
     analyses = {name: program.memory_analysis() for name, program in programs.items()}
     training = analyses.get("learn")
     scratch = {

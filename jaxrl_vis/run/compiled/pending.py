@@ -1,6 +1,6 @@
-"""Metrics on their way from the devices to the host.
+"""Metrics that are still computed or copied to the host.
 
-Reading an array from a GPU takes some 0.1 ms, and one that lies on several GPUs as many times that. So they all travel as one.
+Reading an array from a GPU takes about 0.1 ms; one on several GPUs takes that for each of them. So they all travel as one.
 """
 
 from collections.abc import Callable
@@ -16,16 +16,16 @@ from jaxrl_vis.types import Metrics
 
 @jax.jit
 def stacked(metrics: Metrics) -> jax.Array:
-    """Metrics of [S] or [], in the order of their names, as [K, S]."""
+    """Stack metrics, [S] or [] each, in the order of their names: [K, S]."""
     return jnp.stack(jnp.broadcast_arrays(*(metrics[name] for name in sorted(metrics))))
 
 
 class Pending:
-    """Metrics that a device may still be working on.
+    """Metrics that a device may still be computing.
 
     Args:
         metrics: [S] or [] float32 each, by name. Those that the host has already are left alone.
-        stack: `stacked`, or what it was compiled to.
+        stack: `stacked`, or its compiled program.
     """
 
     def __init__(self, metrics: Metrics, stack: Callable[[Metrics], jax.Array] = stacked):
@@ -36,10 +36,10 @@ class Pending:
             self._rows.copy_to_host_async()
 
     def read(self) -> dict[str, np.ndarray]:
-        """Wait for them; [S] float32 each, by name."""
+        """Wait for the metrics; return them by name, [S] float32 each."""
         return dict(zip(self._names, np.asarray(self._rows), strict=True))
 
     def read_per_seed(self, seeds: int) -> PerSeed:
-        """Wait for them; of each, one number per seed: the shortest decimal that reads back as the same float32."""
+        """Wait for the metrics; return one number per seed, the shortest decimal that reads back as the same float32."""
         spread = {name: np.broadcast_to(np.asarray(row, np.float32), (seeds,)) for name, row in self.read().items()}
         return {name: [float(str(number)) for number in row] for name, row in spread.items()}

@@ -1,8 +1,8 @@
-"""A configuration and its compiled programs: everything that a run, an evaluation or a notebook executes on the device.
+"""Configuration and its compiled programs: everything that a run, an evaluation or a notebook executes on the device.
 
 All of it is compiled before training starts, so that the end of a run, where signals and full disks come, compiles nothing.
 
-A training iteration is two programs, ``play`` and ``learn`` (`jaxrl_vis.learner.train_step`), which XLA compiles side by side.
+A training iteration is two programs, ``play`` and ``learn`` (`jaxrl_vis.learner.train_step`), which XLA compiles in parallel.
 A CPU evaluates with ``play``, too; other devices have a program for it.
 """
 
@@ -45,7 +45,7 @@ _OBJECTS_WHILE_TRACING = 100_000
 
 @contextlib.contextmanager
 def rarely_collecting_garbage() -> Iterator[None]:
-    """Collect garbage rarely while tracing, which makes millions of objects and next to no garbage: it saves an eighth."""
+    """Collect garbage rarely while tracing, which makes millions of objects and little garbage: saves an eighth of the time."""
     before = gc.get_threshold()
     gc.set_threshold(max(before[0], _OBJECTS_WHILE_TRACING) if before[0] else 0, *before[1:])
     try:
@@ -60,9 +60,8 @@ class Programs:
     Args:
         config: The run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
-        keep: Keep on disk what was traced, and trace nothing that is kept there: `trace_cache` says when that is right. Only
-            where one device computes.
-        cache: Keep on disk what was compiled, too.
+        keep: Cache traced programs on disk: `trace_cache` says when that is right. Only where one device computes.
+        cache: Cache compiled programs on disk, too.
 
     Attributes:
         config: The run.
@@ -75,7 +74,7 @@ class Programs:
     def __init__(self, config: Config, program: Any, keep: bool = False, cache: bool = True):
         self.config, self.program, self.env = config, program, program.env
         self.layout = program.layout
-        self.seeds = range(config.seed, config.seed + config.seeds)
+        self.seeds = range(config.run.seed, config.run.seed + config.run.seeds)
         self._compiled: dict[str, Any] = {}
         self._stacks: dict[frozenset[str], Any] = {}
         self._traces: TraceCache | None = None
@@ -84,31 +83,31 @@ class Programs:
 
     @functools.cached_property
     def run_keys(self) -> jax.Array:
-        """[S] typed keys: seed i of a run starts from ``jax.random.key(config.seed + i)``."""
+        """[S] typed keys: seed i of a run starts from ``jax.random.key(config.run.seed + i)``."""
         return self.layout.put(jnp.stack([jax.random.key(seed) for seed in self.seeds]), self.layout.by_seed)
 
     @functools.cached_property
     def evaluation_key(self) -> jax.Array:
-        """[] the typed key that draws the episodes of every evaluation."""
+        """Typed key that determines the episodes of every evaluation, []."""
         return self.layout.put(jax.random.key(_EVALUATION_SEED), self.layout.everywhere)
 
     @functools.cached_property
     def shapes(self) -> LoopState:
-        """Shapes and types of the loop state, and where it lies; traced, not allocated."""
+        """Shapes, dtypes and shardings of the loop state; traced, not allocated."""
         with tracing_for_default_device(), assume_kernels_compile():  # as it will be compiled, so that it is traced once
             shapes = jax.eval_shape(self.program.init, self.run_keys)
         return self.layout.with_shardings(shapes, self.layout.loop)
 
     @functools.cached_property
     def shows_images(self) -> bool:
-        """True if what the robot sees can be shown in a video."""
+        """True if observations can be shown in a video."""
         replay = jax.eval_shape(jax.vmap(self.layout.unfolded), self.shapes.replay)
         _, episodes, slots, *image = replay.episodes.observations.shape
         return videos.shows_images((episodes, slots, *image))
 
     @property
     def image_seconds(self) -> float:
-        """Time for which an image of the video is shown, s: as long as it lasted, but not too fast to follow."""
+        """Duration of a video frame, s: real time, but slow enough to follow."""
         return max(0.04, float(self.env.control_period))
 
     @property
@@ -122,16 +121,16 @@ class Programs:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the programs that a run needs; first those that take longest to compile, while the others are traced."""
+        """Names of the programs that a run needs; those that compile longest come first and compile while others are traced."""
         return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "broken_leaves", "keys")))
 
     def compile(self, names: Sequence[str] | None = None, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
-        """Compile programs side by side, the small operations of saving and evaluating included.
+        """Compile programs in parallel, including the small operations of saving and evaluating.
 
-        Each function is traced once, here, and what was compiled here is what runs later.
+        Each function is traced once, here, and the programs compiled here are the ones that run later.
 
         Args:
-            names: Names of the programs; None: all that a run needs. What is compiled already is not compiled again.
+            names: Names of the programs; None: all that a run needs. Compiled ones are skipped.
             meanwhile: Called when all is traced, and XLA has the processor to itself.
 
         Returns:
@@ -171,7 +170,7 @@ class Programs:
         return dict(self._compiled)
 
     def _open_traces(self) -> TraceCache | None:
-        """The programs that were traced for this configuration; None where none are to be kept."""
+        """Open the cache of programs traced for this configuration; None if nothing is to be cached."""
         cache = enable_compilation_cache() if self._caches else ""
         identity = fingerprint(self.config, self.env) if cache and self._may_keep else None
         if identity is None:
@@ -186,7 +185,7 @@ class Programs:
         meanwhile()
 
     def _keep(self, compiled: dict[str, Any]) -> None:
-        """Keep compiled programs, and compile what makes one array of their metrics."""
+        """Store compiled programs, and compile the stacking of their metrics."""
         for program in compiled.values():
             if metrics := getattr(program.out_info, "metrics", None):
                 shapes = {name: _without_layout(shape) for name, shape in metrics.items()}
@@ -194,13 +193,13 @@ class Programs:
         self._compiled |= compiled
 
     def lower(self, name: str) -> Any:
-        """Trace and lower a program, as `compile` does where none is kept."""
+        """Trace and lower a program, as `compile` does without a cache."""
         function, arguments = self._call(name)
         with tracing_for_default_device(), rarely_collecting_garbage():
             return function.lower(*arguments)
 
     def _call(self, name: str) -> tuple[Any, tuple]:
-        """A jitted function and shapes of its arguments."""
+        """Return a program's jitted function and the shapes of its arguments."""
         if name == "init":
             return self.program.init, (self.run_keys,)
         shapes, number = self.shapes, jax.ShapeDtypeStruct((), jnp.float32)
@@ -215,36 +214,36 @@ class Programs:
         return calls[name]
 
     def compiled(self, name: str) -> Any:
-        """One compiled program, by its name in `compile`."""
+        """Return a compiled program by its name in `compile`."""
         return self.compile([name])[name]
 
     def init(self, keys: jax.Array) -> LoopState:
-        """A fresh learner with an empty replay, for each of the typed keys [S]."""
+        """Initialise a learner with an empty replay for each of the typed keys [S]."""
         return self.compiled("init")(self.layout.put(keys, self.layout.by_seed))
 
     def of_evaluation(self) -> dict[str, Any]:
-        """The compiled programs that an evaluation needs, by name."""
+        """Return the compiled programs that an evaluation needs, by name."""
         return {name: self.compile(self._evaluation)[name] for name in self._evaluation}
 
     def of_training(self) -> dict[str, Any]:
-        """The compiled programs that an iteration needs, by name."""
+        """Return the compiled programs that an iteration needs, by name."""
         compiled = self.compile(_TRAINING)
         return {name: compiled[name] for name in _TRAINING}
 
     def play(self, train: TrainState, keys: jax.Array) -> list[Any]:
-        """The parts of a rollout of training, in their order (`rollout_parts.Played`), with typed keys [S]."""
-        count, exploration = self.config.num_envs, self.program.exploration
+        """Play a training rollout with typed keys [S]; return its parts in order (`rollout_parts.Played`)."""
+        count, exploration = self.config.run.num_envs, self.program.exploration
         return self._rollout.play(self.compiled("play"), train, keys, count, exploration)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
-        """One iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
+        """Run one iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
         compiled = self.of_training()  # before the first is called, so that they are compiled side by side
         keys = compiled["keys"](loop.key, loop.iteration)
         learned: Learned = compiled["learn"](loop, self.play(loop.train, keys))
         return learned.loop, learned.metrics
 
     def evaluate(self, train: TrainState, key: jax.Array | None = None) -> Evaluation:
-        """Metrics of the policy without noise, [S] float32, and images of the first few episodes of every seed.
+        """Evaluate the policy without noise; return metrics, [S] float32, and images of the first few episodes of every seed.
 
         Args:
             train: The learner, [S, ...].
@@ -254,18 +253,18 @@ class Programs:
         if not self.program.plays_any:
             return self.compiled("evaluate")(train, chosen)
         keys = jnp.stack([chosen] * len(self.seeds))
-        return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.eval_episodes, self.env.frame_stack)
+        return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.run.eval_episodes, self.env.frame_stack)
 
     def pending(self, metrics: Metrics) -> Pending:
-        """Metrics from `train_iteration` or `evaluate`, to be read by the host; nothing is compiled for it."""
+        """Prepare metrics of `train_iteration` or `evaluate` for reading by the host, without compiling anything."""
         return Pending(metrics, self._stacks.get(frozenset(metrics), stacked))
 
     def broken_leaves(self, loop: LoopState) -> list[str]:
-        """Names of the floating-point leaves of the loop state that hold a NaN or an infinity."""
+        """List the floating-point leaves of the loop state that hold a NaN or an infinity."""
         return [name for name, is_broken in jax.device_get(self.compiled("broken_leaves")(loop)).items() if is_broken]
 
     def says_of_cache(self) -> str:
-        """Describe what the next start will find in the cache of what is compiled now."""
+        """Describe which programs compiled now the next start will find in the cache."""
         folder, fault = enable_compilation_cache(), cache_fault()
         if fault is not None:
             return f"as will every start: {fault}"
@@ -273,5 +272,5 @@ class Programs:
 
 
 def _without_layout(shape: Any) -> jax.ShapeDtypeStruct:
-    """The shape of a compiled program's result, without its layout in the device's memory."""
+    """Strip the memory layout from the shape of a compiled program's result."""
     return jax.ShapeDtypeStruct(shape.shape, shape.dtype, sharding=shape.sharding)

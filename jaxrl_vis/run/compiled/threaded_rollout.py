@@ -1,7 +1,7 @@
-"""Rollouts in parts, which the threads of a CPU play side by side, and evaluations by the same program.
+"""Rollouts and evaluations in parts, which the threads of a CPU run in parallel by the same program.
 
-Each thread waits for the end of what it calls. Without, XLA would take one call after the other. A rollout that is one part is
-called and not waited for, so that a GPU's host is ahead of it.
+Each thread waits for the programs that it calls. Without, XLA would take one call after the other. A rollout that is one part
+is called and not waited for, so that a GPU's host is ahead of it.
 """
 
 import concurrent.futures
@@ -19,7 +19,7 @@ from jaxrl_vis_envs.cores import num_cores
 
 
 class ThreadedRollout:
-    """Any number of environments, played in parts of one size.
+    """Rollout of any number of environments, in parts of one size.
 
     Args:
         size: P, environments of a part.
@@ -70,5 +70,5 @@ class ThreadedRollout:
         outcome = {
             name: join_parts([part[name] for _, part in played], count, np, axis=1) for name in ("success", "goal_distance")
         }
-        kept = [episodes.observations for episodes, _ in played if episodes is not None]
-        return summarize(outcome, join_parts(kept, num_kept, np, axis=1), outcome["success"], frame_stack, np)
+        recorded = [episodes.observations for episodes, _ in played if episodes is not None]
+        return summarize(outcome, join_parts(recorded, num_kept, np, axis=1), outcome["success"], frame_stack, np)

@@ -4,16 +4,14 @@ XLA's cache spares compiling a program again. Tracing it, which is Python, goes 
 stored as StableHLO (`jax.export`), next to XLA's cache: reading it runs no code.
 
 A program belongs to one fingerprint: the code of both packages, the versions of the libraries, the configuration, JAX's
-settings and the device. It does not cover what a process has replaced in its own modules (a patched loss, say). So only
-commands use the cache, not scripts and notebooks, and not with parts from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns
-it off.
+settings and the device. It does not cover changes of a process to its modules (a patched loss, say). So only commands use the
+cache, not scripts and notebooks, and not with parts from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns it off.
 
 Whoever writes a stored program decides what a run computes. So folder and files are kept for the user alone, nothing is read
 that another user has written or could have written, and a file's digest covers its name, too.
 """
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import importlib.util
@@ -29,7 +27,7 @@ from jax import export
 from jax.extend.core import jaxpr_as_fun
 
 import jaxrl_vis_envs
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import HOST, Config, marked
 from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to
 from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.host.provenance import device_record, versions
@@ -44,9 +42,6 @@ VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
 MOST_FILES = 300
 """Largest number of files, of half a megabyte each; the oldest are deleted."""
 
-HOST_FIELDS = ("env_steps", "eval_interval", "checkpoint_interval", "full_checkpoint_interval")
-"""Fields of `Config` that only the host reads: no compiled program depends on them."""
-
 _PACKAGES = ("jaxrl_vis", "jaxrl_vis_envs")
 _DIGEST_BYTES = 32
 # Triton's programs may mean something else to another jaxlib, of which JAX warns; a fingerprint has its version.
@@ -59,7 +54,7 @@ _WITHOUT_EFFECT = ("cache", "log", "dump", "dir", "timeout", "traceback")
 
 
 def fingerprint(config: Config, env: GoalEnv) -> str | None:
-    """Return a digest of all that the programs of a run depend on, hexadecimal; None if they are not to be kept."""
+    """Compute a hexadecimal digest of everything that a run's programs depend on; None if they are not to be cached."""
     is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not own_names(config)
     if not is_ours or os.environ.get(VARIABLE) == "0":
         return None
@@ -67,14 +62,14 @@ def fingerprint(config: Config, env: GoalEnv) -> str | None:
     with tracing_for_default_device():
         target = [target_platform(), use_gpu_kernels()]
     # The seed is an argument, in the form of keys.
-    compiled_in = {name: value for name, value in dataclasses.asdict(config).items() if name not in (*HOST_FIELDS, "seed")}
+    compiled_in = {name: value for name, value in config.flat().items() if name not in (*marked(HOST), "seed")}
     depends_on = [compiled_in, versions(), device_record(), target, settings, _code()]
     return hashlib.sha256(json.dumps(depends_on, sort_keys=True, default=repr).encode()).hexdigest()
 
 
 @functools.cache
 def _code() -> str:
-    """A digest of all files of both packages, models and data included."""
+    """Compute a digest of all files of both packages, including models and data."""
     digest = hashlib.sha256()
     for package in _PACKAGES:
         spec = importlib.util.find_spec(package)
@@ -102,7 +97,7 @@ class TraceCache:
         self._nodes = nodes
 
     def lower(self, name: str, function: Any, arguments: tuple) -> Any:
-        """Return what ``function.lower`` returns, from the stored program; trace it now where there is none.
+        """Lower a function like ``function.lower``, from the stored program if there is one.
 
         Args:
             name: Name of the program.
@@ -122,7 +117,7 @@ class TraceCache:
         return jaxrl_vis_envs.jit(program.call, **self._jit_options.get(name, {})).lower(*arguments)
 
     def write(self) -> None:
-        """Store what was traced, after it has been compiled; nothing where the folder cannot be written to."""
+        """Store the traced programs, after their compilation, if the folder can be written."""
         with contextlib.suppress(OSError):
             make_private(self._folder)
             for name, data in self._fresh.items() if self._is_private() else ():
@@ -154,7 +149,7 @@ class TraceCache:
         return hashlib.sha256(self._path(name).name.encode() + b"\0" + data).digest()
 
     def _is_private(self) -> bool:
-        """Return whether the folder is this user's alone; of one that is this user's, others' rights are taken first."""
+        """Return True if the folder is private to this user; the rights of others are removed first if this user owns it."""
         try:
             status = self._folder.stat()
             if stranger_to(status) is not None:
@@ -171,7 +166,7 @@ class TraceCache:
 
 
 def _register(tree: Any) -> None:
-    """Let `jax.export` store programs that take or return nodes like those of a tree, by the names of their classes."""
+    """Register a tree's node types with `jax.export`, by the names of their classes."""
     pending = [jax.tree.structure(tree)]
     while pending:
         structure = pending.pop()

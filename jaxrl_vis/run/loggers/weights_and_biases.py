@@ -52,6 +52,7 @@ class WeightsAndBiases:
         group = folder.resolve().name
         for seed in seeds:
             owner = {} if self._run_id is None else {RUN_ID: self._run_id}
+            options = {name: value for group in record["config"].values() for name, value in group.items()}
             known = self._state.setdefault(str(seed), {"id": uuid.uuid4().hex[:8], "iteration": 0, **owner})
             with shielded_children():  # W&B's own process must outlive a Ctrl-C, to receive the end of the run
                 run = wandb.init(
@@ -62,7 +63,7 @@ class WeightsAndBiases:
                     resume="allow" if mode == "online" else None,
                     reinit="create_new",
                     dir=str(folder),
-                    config={**record["config"], **{name: record[name] for name in ("versions", "device", "git_revision")}},
+                    config={**options, **{name: record[name] for name in ("versions", "device", "git_revision")}},
                     settings=wandb.Settings(console="off", silent=True, init_timeout=_INIT_S),
                 )
             run.config.update({"seed": seed}, allow_val_change=True)

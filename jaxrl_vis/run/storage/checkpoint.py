@@ -11,7 +11,8 @@ is never restored. The newest two of each tier are kept.
 
 A run resumes from the newest valid checkpoint of all tiers; if several are equally new, from the full, the recent or the light
 one, in this order. Nothing newer is ever deleted: a damaged checkpoint is moved to checkpoints/damaged/, and one of another
-run, identified by the run's id in its manifest, to checkpoints/foreign/.
+run, identified by the run's id in its manifest, to checkpoints/foreign/. One that is written again waits in
+checkpoints/replaced/ until the new one is complete.
 """
 
 import contextlib
@@ -39,7 +40,7 @@ LIGHT, FULL, RECENT = "light", "full", "recent"
 _PRECEDENCE = (FULL, RECENT, LIGHT)  # for resuming, among equally new ones
 _KEPT = 2
 _TIMEOUT_S = 10**9
-DAMAGED, FOREIGN = "damaged", "foreign"
+DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
 
 
 class _Damaged(Exception):
@@ -192,7 +193,9 @@ class Checkpoints:
             manager = self._manager(tier)
             self._wait(tier)
             if distributed.any_process(iteration in self.iterations(tier)):  # orbax would silently keep the old one
-                manager.delete(iteration)
+                self._forget(tier)
+                self._put_aside(tier, iteration)
+                manager = self._manager(tier)
             if not manager.save(iteration, args=ocp.args.Composite(**arguments), force=True):
                 raise RuntimeError(f"checkpoint {tier}/{iteration} was not written")
             self._unsummed.add((tier, iteration))
@@ -205,6 +208,37 @@ class Checkpoints:
             if distributed.is_first() and folder.is_dir():
                 sums.write_sums(folder)
             self._unsummed.discard(saved)
+            if distributed.is_first():
+                shutil.rmtree(self._replaced(*saved), ignore_errors=True)
+                with contextlib.suppress(OSError):  # others are in there, or it does not exist
+                    (self._folder / REPLACED).rmdir()
+
+    def _replaced(self, tier: str, iteration: int) -> Path:
+        """Return the place of a checkpoint while a new one of the same iteration is written."""
+        return self._folder / REPLACED / f"{tier}-{iteration}"
+
+    def _put_aside(self, tier: str, iteration: int) -> None:
+        """Move a checkpoint to the place where `_recover` finds it if the process is killed before it is replaced."""
+        distributed.meet("replacing")
+        if distributed.is_first():
+            aside = self._replaced(tier, iteration)
+            aside.parent.mkdir(exist_ok=True)
+            shutil.rmtree(aside, ignore_errors=True)
+            (self._folder / tier / str(iteration)).rename(aside)
+        distributed.meet("replaced")
+
+    def _recover(self) -> None:
+        """Move checkpoints back whose replacement was not completed, and delete those that were replaced."""
+        for aside in (self._folder / REPLACED).glob("*-*") if distributed.is_first() else ():
+            tier, _, iteration = aside.name.rpartition("-")
+            place = self._folder / tier / iteration
+            if tier not in (LIGHT, FULL):
+                continue
+            if place.exists():
+                shutil.rmtree(aside, ignore_errors=True)
+            else:
+                aside.rename(place)
+        distributed.meet("recovered")
 
     @contextlib.contextmanager
     def _writing(self, tier: str) -> Iterator[None]:
@@ -308,6 +342,7 @@ class Checkpoints:
         Raises:
             RequestError: A checkpoint has another structure.
         """
+        self._recover()
         return self._newest_good(template, with_rest=True)
 
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:

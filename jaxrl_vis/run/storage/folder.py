@@ -17,12 +17,12 @@ import json
 import secrets
 import shlex
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import Config, config_from_dict
+from jaxrl_vis.config import RESUMABLE, Config, Mark, config_from_dict, marked, of_weightings
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import check_path, is_temporary, read_json, write_atomically
@@ -30,9 +30,9 @@ from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
 from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 
-SCHEMA = 1
+SCHEMA = 2
 
-CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged")
+CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged", "replaced")
 """Subfolders written by `checkpoint`."""
 
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
@@ -40,29 +40,15 @@ _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is bein
 LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
 """Files and folders that `loggers` write into a run folder."""
 
-MAY_CHANGE = (
-    *("preset", "env_folder", "env_steps"),
-    *("devices", "data_devices"),
-    *("eval_interval", "eval_episodes", "checkpoint_interval", "full_checkpoint_interval"),
-)
-"""Fields that may change when a run is resumed: the location of its task, training length, devices, and the schedule of
-evaluations and checkpoints. All other fields affect learning."""
-
-_OF_WEIGHTINGS = (
-    *(field.name for field in dataclasses.fields(Config) if field.name.startswith("weighting_")),
-    *("aux_form", "actor_log"),
-)
-"""Exceptions, which are unused if losses are neither weighted nor logarithmic."""
-
 
 def default_folder(config: Config) -> Path:
     """Return ``runs/<env>-<method>-<preset>-seed<first>`` or ``...-seeds<first>to<last>``, below the working directory.
 
     The colon of ``module:Name`` becomes a hyphen, because Windows does not allow it in file names.
     """
-    last = config.seed + config.seeds - 1
-    seeds = f"seed{config.seed}" if config.seeds == 1 else f"seeds{config.seed}to{last}"
-    return Path("runs") / f"{config.env.replace(':', '-')}-{config.method}-{config.preset}-{seeds}"
+    last = config.run.seed + config.run.seeds - 1
+    seeds = f"seed{config.run.seed}" if config.run.seeds == 1 else f"seeds{config.run.seed}to{last}"
+    return Path("runs") / f"{config.environment.env.replace(':', '-')}-{config.reward.method}-{config.run.preset}-{seeds}"
 
 
 def check_there(path: Path, resume: bool) -> None:
@@ -278,7 +264,7 @@ class RunFolder:
 
 
 def _is_remainder(checkpoint: Path, run_id: str | None) -> bool:
-    """Return whether a checkpoint without its run's folder is half of one, or of the run ``run_id``."""
+    """Return True if a checkpoint left in a deleted run folder is unfinished, or belongs to the run ``run_id``."""
     manifest = checkpoint / "manifest"
     try:
         is_ours = not manifest.exists() or json.loads((manifest / "metadata").read_bytes()).get(RUN_ID) == run_id
@@ -302,7 +288,7 @@ def _record(config: Config, log: tuple[str, ...], run_id: str | None) -> dict[st
     return {
         "schema": SCHEMA,
         **({} if run_id is None else {RUN_ID: run_id}),
-        "preset": config.preset,
+        "preset": config.run.preset,
         "git_revision": provenance.revision(),
         "versions": provenance.versions(),
         "device": {**provenance.device_record(), "name": provenance.device_name()},
@@ -362,16 +348,17 @@ def read_config(path: Path) -> Config:
         raise RequestError(f"the run in {path} cannot be used: {error}") from error
 
 
-def contradictions(saved: Config, config: Config, but_for: Collection[str] = MAY_CHANGE) -> list[str]:
-    """Describe the fields in which ``config`` would learn differently from ``saved``.
+def contradictions(saved: Config, config: Config, ignored: Mark = RESUMABLE) -> list[str]:
+    """Describe the options in which ``config`` would learn differently from ``saved``.
 
     Args:
         saved: The configuration of a run.
         config: The requested configuration.
-        but_for: Fields to ignore.
+        ignored: Mark of the options that are not compared.
     """
-    before, requested = dataclasses.asdict(saved), dataclasses.asdict(config)
-    unread = _OF_WEIGHTINGS if saved.weighting == config.weighting == "none" else ()
+    before, requested, but_for = saved.flat(), config.flat(), marked(ignored)
+    # Options of weightings are not read if losses are neither weighted nor logarithmic.
+    unread = of_weightings() if saved.auxiliary.weighting == config.auxiliary.weighting == "none" else ()
     return [
         f"{name} (saved {before[name]}, asked {requested[name]})"
         for name in sorted(before)

@@ -52,7 +52,7 @@ class Held:
         self._descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY) if can_open else None
 
     def note_loss(self, _: object) -> None:
-        """Records the loss of the lock; called from the heartbeat thread."""
+        """Record the loss of the lock; called from the heartbeat thread."""
         self.is_lost = True
 
     def watch(self, path: Path) -> None:
@@ -176,7 +176,7 @@ def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) ->
 
 
 def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: contextlib.ExitStack) -> None:
-    """Uses the file itself as the lock until the end of ``stack``.
+    """Use the file itself as the lock until the end of ``stack``.
 
     Raises:
         RequestError: Another process holds it.

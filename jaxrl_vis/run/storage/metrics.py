@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import sync_folder, write_atomically
@@ -28,8 +28,24 @@ Row = Mapping[str, Any]
 RUN_ID = "run_id"
 """Key of the run's id in a row, a checkpoint's manifest or a config.json; missing in those of earlier versions."""
 
-_PLACE = ("seed", "iteration", "env_steps", RUN_ID)  # identify a row; not figures
-_COUNTS = ("seed", "iteration", "updates", "env_steps")  # required in every row
+
+class Place(NamedTuple):
+    """Place of a row in a training run: keys that every row has.
+
+    Attributes:
+        seed: Seed.
+        iteration: Iterations completed.
+        updates: Gradient steps taken.
+        env_steps: Environment steps taken.
+    """
+
+    seed: int
+    iteration: int
+    updates: int
+    env_steps: int
+
+
+_NO_FIGURES = {*Place._fields, RUN_ID} - {"updates"}
 _LARGEST = 2**63  # of a number in a row: the range of integer arrays
 _SHOWN = 8  # line numbers in a message
 
@@ -79,7 +95,7 @@ def make_rows(
 
 def scalars(row: Row) -> dict[str, float]:
     """Return the figures of a row by name, without those that were not finite."""
-    return {name: float(value) for name, value in row.items() if name not in _PLACE and value is not None}
+    return {name: float(value) for name, value in row.items() if name not in _NO_FIGURES and value is not None}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +161,7 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
         row = parse_json(line.decode("utf-8"))
     except ValueError:
         return None
-    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in _COUNTS):
+    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in Place._fields):
         return None
     if not isinstance(row.get(RUN_ID), str | None):
         return None

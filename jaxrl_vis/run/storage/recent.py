@@ -84,7 +84,7 @@ class Recent:
             return True
 
     def set_foreign_aside(self, to: Path) -> bool:
-        """Move all files away if there is a state of another run; return True if there was one."""
+        """Move all files aside if one is a state of another run; return True if so."""
         is_foreign = any(not self._is_ours(iteration) for iteration in _numbers(self._folder, "state"))
         if is_foreign:
             to.parent.mkdir(exist_ok=True)
@@ -228,7 +228,7 @@ class Recent:
                 self._path(number, "rollout").unlink(missing_ok=True)
 
     def _drop_unfinished(self) -> None:
-        """Delete what belongs to no state. The states stay: nothing newer may ever find room."""
+        """Delete files that belong to no state. The states stay: a newer one may never fit."""
         newest = max(self.iterations(), default=0)
         with contextlib.suppress(OSError):
             for file in self._folder.iterdir():
@@ -293,7 +293,7 @@ def _numbers(folder: Path, kind: str) -> list[int]:
 
 @contextlib.contextmanager
 def _appearing(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file that gets its name when it is complete. It is not synced to the disk, see the module."""
+    """Open a file that is renamed into place once complete. It is not synced to the disk, see the module."""
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
         yield file

@@ -42,7 +42,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     videos.check_output(out)
     if out.suffix.lower() == ".png":
         raise RequestError(f"--aux makes a video: use {out.stem}.gif, .mp4 or .html instead of {out.name}")
-    tasks = read_config(Path(run_dir)).aux_tasks
+    tasks = read_config(Path(run_dir)).auxiliary.aux_tasks
     if not tasks:
         raise RequestError(f"the run in {run_dir} has no auxiliary tasks to show: train with --aux-tasks, or leave out --aux")
     if not set(tasks) & set(SHOWN):
@@ -53,10 +53,10 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     trainer = open_run(run_dir, trust=trust, num_envs=episodes, random_action_probability=0.0, action_noise=0.0)
     env, config, networks = trainer.env, trainer.config, trainer.program.networks
     if networks is None:
-        raise RequestError(f"--aux shows what networks of ddpg predict, and the run in {run_dir} has {config.algorithm}")
+        raise RequestError(f"--aux shows what networks of ddpg predict, and the run in {run_dir} has {config.run.algorithm}")
     train = load(trainer, run_dir).train
     enable_compilation_cache()
-    parts = trainer.programs.play(train, jnp.stack([trainer.programs.evaluation_key] * config.seeds))
+    parts = trainer.programs.play(train, jnp.stack([trainer.programs.evaluation_key] * config.run.seeds))
     played, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, episodes, axis=1), *parts)
     auxiliary = trainer.program.auxiliary
 
@@ -65,7 +65,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
 
     first, played = jax.tree.map(lambda leaf: leaf[0], (train, played))
     played = jax.jit(auxiliary.with_stored)(played)
-    keys = jax.random.split(jax.random.key(config.seed), episodes)
+    keys = jax.random.split(jax.random.key(config.run.seed), episodes)
     per_episode = jax.jit(predict)
     predictions = [
         jax.device_get(per_episode(first, jax.tree.map(lambda leaf, index=index: leaf[index], played), keys[index]))
@@ -102,7 +102,7 @@ def _predict(networks: Networks, auxiliary: Auxiliary, train: TrainState, episod
     names = ("before", "after", *batch.views)
     inputs = networks.prepare_batch(networks.batch_scaling(train.statistics), batch)
     latents = networks.encode_pieces(train.agent.critic, inputs.pieces(*names))
-    latent_t, latent_tp1, *view_latents = latents.reshape(len(names), count, networks.config.latent_size)
+    latent_t, latent_tp1, *view_latents = latents.reshape(len(names), count, networks.config.network.latent_size)
     image = networks.normalize(networks.scaling(train.normalizer), before) if auxiliary.needs_image else None
     view = View(latent_t, actions, latent_tp1, image)
     predicted = auxiliary.predictions(
@@ -127,5 +127,5 @@ def _as_image(networks: Networks, train: TrainState, values: jax.Array) -> jax.A
     if values.shape[1] == mean.shape[0]:
         levels = values / scale[:, :height, :width] + mean[:, :height, :width]
     else:  # one normalised grey channel
-        levels = 127.5 * (1.0 + values / networks.config.normalizer_clip)
+        levels = 127.5 * (1.0 + values / networks.config.network.normalizer_clip)
     return jnp.clip(jnp.round(levels), 0, 255).astype(jnp.uint8)

@@ -44,7 +44,7 @@ class Policy:
     @property
     def env_name(self) -> str:
         """Name of the environment, as in `jaxrl_vis_envs.make`."""
-        return self.config.env
+        return self.config.environment.env
 
     @property
     def observation_spec(self) -> jax.ShapeDtypeStruct:
@@ -118,7 +118,7 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | 
             untrusted code.
     """
     trainer = open_run(run_dir, trust=trust)
-    seed = trainer.config.seed if seed is None else seed
+    seed = trainer.config.run.seed if seed is None else seed
     if seed not in trainer.seeds:
         trained = f"seed {trainer.seeds[0]}" if len(trainer.seeds) == 1 else f"seeds {trainer.seeds[0]} to {trainer.seeds[-1]}"
         raise RequestError(f"the run in {run_dir} has trained no seed {seed}, only {trained}")

@@ -109,7 +109,9 @@ def play_run(
     trainer = open_run(run_dir, keep_programs, trust, eval_episodes=num_recorded(max(1, episodes)))
     programs = trainer.programs
     if not (programs.shows_images or three_dimensional):
-        raise RequestError(f"{trainer.config.env} shows the robot no images: play a run on a Visual task, or with --html")
+        raise RequestError(
+            f"{trainer.config.environment.env} shows the robot no images: play a run on a Visual task, or with --html"
+        )
     train = load(trainer, run_dir).train
     if three_dimensional:
         viewer.write_page(programs.program, train, programs.evaluation_key, max(1, episodes), out)

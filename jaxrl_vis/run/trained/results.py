@@ -13,9 +13,13 @@ from jaxrl_vis.run.storage.progress import Progress
 
 
 def describe(config: Config) -> str:
-    """Summarises a configuration in a few words: method, preset and seeds."""
-    seeds = f"seed {config.seed}" if config.seeds == 1 else f"seeds {config.seed} to {config.seed + config.seeds - 1}"
-    return f"{config.method}, preset {config.preset}, {seeds}"
+    """Summarise a configuration in a few words: method, preset and seeds."""
+    seeds = (
+        f"seed {config.run.seed}"
+        if config.run.seeds == 1
+        else f"seeds {config.run.seed} to {config.run.seed + config.run.seeds - 1}"
+    )
+    return f"{config.reward.method}, preset {config.run.preset}, {seeds}"
 
 
 class Results:
@@ -59,9 +63,9 @@ class Results:
         plots.plot_run(
             self._folder.rows(),
             self._folder.curve,
-            title=config.env,
-            subtitle=f"{describe(config)}, {config.eval_episodes} episodes per evaluation"
-            + ("; thick: median, band: middle half" if config.seeds > 1 else ""),
+            title=config.environment.env,
+            subtitle=f"{describe(config)}, {config.run.eval_episodes} episodes per evaluation"
+            + ("; thick: median, band: middle half" if config.run.seeds > 1 else ""),
             unit=env.distance_unit,
             threshold=env.threshold,
         )

@@ -8,18 +8,17 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import OPTIONS, Config
 from jaxrl_vis.run.goodput import read_processes
 from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.folder import LOGGER_FOLDERS, WANDB_STATE, RunFolder
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.storage.metrics import RUN_ID
+from jaxrl_vis.run.storage.metrics import RUN_ID, Place
 from jaxrl_vis.run.storage.recent import names_of_others
 
 LOST = "resume/replay_lost_at"
 """Key of a row: the last iteration at which the run resumed without its replay."""
 
-_PLACE = ("seed", "iteration", "updates", "env_steps")
 _PLAYED = ("play.gif", "play.mp4", "play.html", "play.png", "play_aux.gif")
 _ASIDE = {DAMAGED: "damaged", FOREIGN: "another run's"}
 _SHOWN = 5  # entries of a list that a message quotes
@@ -76,8 +75,8 @@ def _read_line(line: bytes) -> dict[str, Any] | str:
         row = json.loads(line.decode("utf-8"))
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
         return "is damaged"
-    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in _PLACE):
-        return f"is no row: {', '.join(_PLACE)} must be numbers"
+    if not isinstance(row, dict) or not all(_is_count(row.get(name)) for name in Place._fields):
+        return f"is no row: {', '.join(Place._fields)} must be numbers"
     return row
 
 
@@ -88,7 +87,7 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
         path: metrics.jsonl.
         expected: Conditions on every row.
         is_written: Another process may be writing, so that the last line may be incomplete.
-        findings: Is added to.
+        findings: Findings, to which this adds.
     """
     *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
     if rest and not is_written:
@@ -182,22 +181,23 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     Args:
         record: Contents of the file.
         config: The configuration in it.
-        findings: Is added to.
+        findings: Findings, to which this adds.
     """
-    if record.get("preset") != config.preset:
+    if record.get("preset") != config.run.preset:
         findings.problems.append(
-            f"config.json: preset is {record.get('preset')!r} above and {config.preset!r} in the configuration"
+            f"config.json: preset is {record.get('preset')!r} above and {config.run.preset!r} in the configuration"
         )
     device = record.get("device")
     count = device.get("count") if isinstance(device, Mapping) else None
     if count is None:
         findings.problems.append("config.json: does not name the device of the run")
-    elif _is_count(count) and config.devices > count:
-        findings.problems.append(f"config.json: the run is on {config.devices} devices, but only {count} existed")
+    elif _is_count(count) and config.run.devices > count:
+        findings.problems.append(f"config.json: the run is on {config.run.devices} devices, but only {count} existed")
     if not isinstance(record.get("versions"), Mapping):
         findings.problems.append("config.json: does not name the versions of the libraries")
     saved = record.get("config")
-    unset = sorted({field.name for field in dataclasses.fields(Config)} - set(saved if isinstance(saved, Mapping) else ()))
+    groups = saved.values() if isinstance(saved, Mapping) else ()
+    unset = sorted(set(OPTIONS).difference(*(group for group in groups if isinstance(group, Mapping))))
     if unset:
         findings.notes.append(
             f"config.json does not have {listed(unset)}: taken to be the default, or saved under an older name"
@@ -211,7 +211,7 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
         folder: The run folder.
         is_finished: The run is complete.
         shows_images: A complete run has a video.
-        findings: Is added to.
+        findings: Findings, to which this adds.
     """
     files = (folder.config, folder.metrics, folder.processes, folder.curve, folder.video)
     of_run = {file.name for file in files} | {LOCK_NAME, WANDB_STATE, *_PLAYED}

@@ -76,8 +76,8 @@ def verify_run(
     findings = Verification()
     check_record(record, config, findings)
     devices = jax.local_device_count()
-    if config.devices > devices:
-        findings.elsewhere.append(f"the run was on {config.devices} devices, and is repeated on one")
+    if config.run.devices > devices:
+        findings.elsewhere.append(f"the run was on {config.run.devices} devices, and is repeated on one")
         config = config.replace(devices=1, data_devices=None)
     trainer = make_trainer(config, keep_programs=keep_programs)
     return verify(trainer, path, record, iterations, findings, say)
@@ -106,7 +106,7 @@ class _Verifier:
             seeds=list(trainer.seeds),
             updates=program.updates_per_iteration,
             env_steps=program.steps_per_iteration,
-            eval_interval=self._config.eval_interval,
+            eval_interval=self._config.run.eval_interval,
             run_id=record.get(RUN_ID),
         )
         self._total: int = program.num_iterations
@@ -152,7 +152,7 @@ class _Verifier:
         }
         recorded = {"revision": record.get("git_revision"), **versions, **_flat(device)}
         named = f", run {self._expected.run_id}" if self._expected.run_id else ""
-        self._say(f"{self._folder.path}: {self._config.env}, {describe(self._config)}{named}")
+        self._say(f"{self._folder.path}: {self._config.environment.env}, {describe(self._config)}{named}")
         libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
         self._say(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
@@ -232,7 +232,7 @@ class _Verifier:
     def _check_presence(self, is_written: bool) -> None:
         """Report a lack of checkpoints although the run is far enough to have one."""
         last = max((row["iteration"] for row in self._rows), default=0)
-        interval = self._config.checkpoint_interval
+        interval = self._config.run.checkpoint_interval
         # An evaluation's rows are written before the checkpoint of the same iteration.
         wanted = last >= self._total or (interval > 0 and last > interval)
         if wanted and not is_written and not self._names() and not self._checkpoints.recent.iterations():

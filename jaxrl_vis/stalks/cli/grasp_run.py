@@ -43,10 +43,9 @@ def run(options: Run) -> int:
     check_masks(options.masks, options.weights)
     check_extra("grasping")
     check_writable(options.out, "--out", folder=True)
-    from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 
-    runs = find_plots(options.folder)
-    calibrations = {folder.name: options.read_calibration(folder.folder) for folder in runs}
+    runs = options.find_plots(options.folder, options.out)
+    calibrations = {folder.name: options.read_calibration(folder) for folder in runs}
     for name, calibration in calibrations.items():
         if calibration is None:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")

@@ -13,6 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
 
 if TYPE_CHECKING:
+    from jaxrl_vis.stalks.phenotyping.io.folders import Patterns, PlotFolder
     from jaxrl_vis_envs.plants import Calibration, Family
 
 # Module -> package, for the packages of an extra.
@@ -185,15 +186,50 @@ class CameraOptions:
     """Options of a command that reads folders of stereo pairs."""
 
     calibration: Path | None = None
-    """Calibration of all folders (OpenCV, or ROS left.yaml and right.yaml); calibration.yaml of each folder if not given.
-    Without one there are no metric lengths."""
+    """Calibration of all folders: a file of OpenCV, RealSense, Middlebury or KITTI, or a folder with left.yaml and right.yaml
+    of ROS. If not given, the one that lies in each folder: calibration.yaml, extrinsics.yml, calib.txt, left.yaml and
+    right.yaml. Without one there are no metric lengths."""
     calibration_unit: str | None = None
     """Unit of the calibration's baseline, where the file does not say it: m, cm or mm, or the side of a square of the
     chessboard, as 24mm, where it was counted in squares."""
     speed: float | None = None
     """Speed of the robot in m/s, for an odometry.csv that holds times only."""
 
-    def read_calibration(self, folder: Path) -> Calibration | None:
+    left: str | None = None
+    """Pattern of the left images within each plot's folder, as 'image_02/*.png', with --right; what the stars stand for is the
+    same for both images of a pair, or the times that are nearest. If not given, names say left and right, L and R, cam0 and
+    cam1, ... Of a recording of ROS (.bag, .mcap, .db3): its topic."""
+    right: str | None = None
+    """Pattern of the right images, with --left."""
+
+    def patterns(self) -> Patterns | None:
+        """Return the patterns of the images' names; None where names say it themselves.
+
+        Raises:
+            RequestError: Only one side is given.
+        """
+        from jaxrl_vis.stalks.phenotyping.io.folders import Patterns
+
+        if (self.left is None) != (self.right is None):
+            raise RequestError("--left and --right go together: give a pattern for each side")
+        return None if self.left is None or self.right is None else Patterns(self.left, self.right)
+
+    def find_plots(self, folder: Path, out: Path) -> list[PlotFolder]:
+        """Return the plots of a folder, or of a recording, which is taken apart into the folder ``recording`` in ``out``.
+
+        Raises:
+            RequestError: There are none.
+        """
+        from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
+        from jaxrl_vis.stalks.phenotyping.io.recording import Topics, is_recording, take_apart
+
+        patterns = self.patterns()
+        if not is_recording(folder):
+            return find_plots(folder, patterns)
+        topics = None if patterns is None else Topics(patterns.left, patterns.right)
+        return find_plots(take_apart(folder, out / "recording", topics))
+
+    def read_calibration(self, plot: PlotFolder) -> Calibration | None:
         """Return the calibration of one folder of pairs; None where there is none.
 
         Raises:
@@ -201,7 +237,6 @@ class CameraOptions:
         """
         from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 
-        if self.calibration is not None:
-            return read_calibration(self.calibration, self.calibration_unit)
-        path = find_calibration(folder)
-        return None if path is None else read_calibration(path, self.calibration_unit)
+        path = self.calibration or find_calibration(plot.folder)
+        image = next((pair.left for pair in plot.pairs if pair.left is not None), None)
+        return None if path is None else read_calibration(path, self.calibration_unit, image)

@@ -24,8 +24,8 @@ class Run(CameraOptions):
     """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
 
     folder: Annotated[Path | None, AlsoPositional()] = None
-    """A plot's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders; the short synthetic row that
-    comes with the package if not given."""
+    """A plot's folder of pairs (left_000.png, right_000.png, ...), a folder of such folders, or a recording of ROS (.bag,
+    .mcap, .db3; needs the extra `bags`); the short synthetic row that comes with the package if not given."""
     out: Path = Path("phenotype_results")
     """Folder for the results; a command that was stopped continues where it was."""
     weights: Path | None = None
@@ -39,6 +39,14 @@ class Run(CameraOptions):
     disparity_scale: float = 256.0
     """Divisor that makes pixels of disparities in files of 16 bits (disparity_000.png beside the images): 256 as KITTI writes
     them, 64 as `phenotype synth` does."""
+    field: Path | None = None
+    """Plan of the field: a CSV, or an export of Field Book, whose column plot_id (or plot; or range and row) says which row is
+    of which folder. Its other columns (range, genotype, replicate, ...) are joined to the results in --format."""
+    format: Literal["plain", "brapi", "miappe", "plantcv"] = "plain"
+    """Form in which results of plots are written beside plots.csv, with units and terms of ontologies: traits.csv, or as BrAPI,
+    MIAPPE or PlantCV have them."""
+    term: tuple[str, ...] = ()
+    """Terms of an ontology for columns of plots.csv, as `stalks=CO_324:0000001`, in place of those that --format knows."""
     workers: int = 1
     """Number of processes that look at pairs side by side; they share the GPUs and cores, and take 1 to 2 GB each."""
 
@@ -54,12 +62,19 @@ def run(options: Run) -> int:
     check_counts(workers=options.workers)
     check_extra("phenotyping")
     check_writable(options.out, "--out", folder=True)
-    from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE, find_plots
+    from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
+    from jaxrl_vis.stalks.phenotyping.io.tables.field_plan import missing_plots, read_field_plan
+    from jaxrl_vis.stalks.phenotyping.report.exchange import with_terms, write_exchange
 
-    plots = find_plots(options.folder or SAMPLE)
+    traits = with_terms(options.term)
+    plots = options.find_plots(options.folder or SAMPLE, options.out)
     if options.folder is None:
         print("no folder given: this is the short synthetic row that comes with jaxrl-vis")
-    calibrations = {plot.name: options.read_calibration(plot.folder) for plot in plots}
+    calibrations = {plot.name: options.read_calibration(plot) for plot in plots}
+    columns, plan = ([], {}) if options.field is None else read_field_plan(options.field, [plot.name for plot in plots])
+    said = None if options.field is None else missing_plots(plan, [plot.name for plot in plots])
+    if said is not None:
+        print(f"{options.field}: {said}", file=sys.stderr)
     if options.workers > 1:
         share_accelerator()
     check_devices()
@@ -88,6 +103,7 @@ def run(options: Run) -> int:
     try:
         with progress("pairs") as done:
             rows, skipped = run(plots, find, request, done, options.workers, uncounted.__setitem__)
+        written = write_exchange(options.out, options.format, rows, columns, plan, traits)
     except OSError as error:
         raise StorageError(
             f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"
@@ -106,5 +122,6 @@ def run(options: Run) -> int:
             )
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
-    print(f"{options.out}: stalks.csv, plots.csv, qc.html and overlays (plots: {len(plots)}, pairs skipped: {len(skipped)})")
+    counts = f"plots: {len(plots)}, pairs skipped: {len(skipped)}"
+    print(f"{options.out}: stalks.csv, plots.csv, {written}, qc.html and overlays ({counts})")
     return SKIPPED if skipped else 0

@@ -27,8 +27,11 @@ class Train(TrainingOptions):
     """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
 
     data: Path | None = None
-    """A folder of annotated images (annotations.json of COCO, or .xml of Pascal VOC or .json of LabelMe beside each image), in
-    place of synthetic plots."""
+    """A folder of annotated images, in place of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal VOC,
+    LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in folders below."""
+    label: tuple[str, ...] = ()
+    """Names of what counts as a stalk in --data, as `stem`; what is called otherwise is background. If not given, what is
+    called a stalk, or everything where nothing has a name."""
     start: str | None = None
     """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`; if not given,
     `shipped` where the boxes of --data are about as tall as those that these weights find, as a few images are too few to learn
@@ -49,6 +52,8 @@ def train(options: Train) -> int:
             "--data takes images of your own: leave out --spec and --width, --family, --shift and --frames, which describe "
             "synthetic ones"
         )
+    if options.label and options.data is None:
+        raise RequestError("--label goes with --data: synthetic plots say themselves what is a stalk")
     check_extra("phenotyping")
     check_writable(options.out, "OUT")
     if options.workers > 1:
@@ -61,18 +66,21 @@ def train(options: Train) -> int:
 def _train(options: Train) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
+    from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
     from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
     from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, any_outlined, synthetic_examples
 
+    if options.data is not None:
+        print(f"{options.data}: {read_annotations(options.data, options.label)['summary']}")
     before, settings, origin_before = _start(options)
     left_alone = {}
-    if options.data is not None and before is not None and not any_outlined(options.data):
+    if options.data is not None and before is not None and not any_outlined(options.data, options.label):
         # A box is no outline: what the weights know of masks is better.
         left_alone = {"segmenter": before["segmenter"]}
         print("masks stay as they are: no annotation has an outline, only boxes")
     sources: list[Iterator[Example]]
     if options.data is not None:
-        sources = [annotated_examples(options.data, settings)]
+        sources = [annotated_examples(options.data, settings, options.label)]
         origin = "annotated images"
     else:
         family = options.read_family("phenotyping")
@@ -112,7 +120,7 @@ def _start(options: Train) -> tuple[Any, "Settings", str]:
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.training.examples import settings_for
 
-    fitting = None if options.data is None else settings_for(options.data, Settings())
+    fitting = None if options.data is None else settings_for(options.data, Settings(), options.label)
     start = options.start or ("random" if fitting is None else "shipped")
     if start == "random":
         return None, fitting or Settings(), ""

@@ -21,10 +21,11 @@ import numpy as np
 import jaxrl_vis
 from jaxrl_vis.stalks.grasping.perception.cloud import Mount
 from jaxrl_vis.stalks.grasping.perception.perceive import Perception, Variant, View, perceive
-from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, read_pair
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries
 from jaxrl_vis.stalks.phenotyping.report.tables import Row, write_rows
 from jaxrl_vis.stalks.results_folder import claim, file_state, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json

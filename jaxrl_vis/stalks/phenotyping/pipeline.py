@@ -25,10 +25,11 @@ from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.worker_pool import UnorderedMap, worker_pool
 from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder, read_odometries, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, known_disparity, read_pair, read_side
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries, why_no_odometry
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
 from jaxrl_vis.stalks.phenotyping.report.qc import Page, PlotResult

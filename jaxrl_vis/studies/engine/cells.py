@@ -14,12 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import Config
+from jaxrl_vis.config import UNMEASURED, Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.storage.folder import RunFolder, contradictions, read_config
-
-# Fields in which a longer run may differ from the cell; evaluations must be the same.
-_MAY_DIFFER = ("preset", "env_folder", "env_steps", "checkpoint_interval", "full_checkpoint_interval")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +34,12 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of the cell and of its folder."""
-        return f"{self.family}-{show_budget(self.config.env_steps)}"
+        return f"{self.family}-{show_budget(self.config.run.env_steps)}"
 
     @property
     def seeds(self) -> range:
         """Seeds that are trained in parallel."""
-        return range(self.config.seed, self.config.seed + self.config.seeds)
+        return range(self.config.run.seed, self.config.run.seed + self.config.run.seeds)
 
 
 def show_budget(steps: int) -> str:
@@ -59,8 +56,8 @@ def split_seeds(cell: Cell, count: int) -> list[Cell]:
     Their families end in the seeds.
     """
     config = cell.config
-    first = [config.seed + offset for offset in range(0, config.seeds, count)]
-    last = [min(seed + count, config.seed + config.seeds) - 1 for seed in first]
+    first = [config.run.seed + offset for offset in range(0, config.run.seeds, count)]
+    last = [min(seed + count, config.run.seed + config.run.seeds) - 1 for seed in first]
     return [
         Cell(
             f"{cell.family}-seed{low}" if low == high else f"{cell.family}-seeds{low}to{high}",
@@ -80,7 +77,7 @@ def find_folder(cell: Cell, runs: Path) -> Path:
             config = read_config(folder)
         except RequestError:
             continue
-        if contradictions(config, cell.config, _MAY_DIFFER) or config.env_steps < cell.config.env_steps:
+        if contradictions(config, cell.config, UNMEASURED) or config.run.env_steps < cell.config.run.env_steps:
             continue
         if _reached(folder, cell) is not None:
             return folder
@@ -91,7 +88,7 @@ def _reached(folder: Path, cell: Cell) -> int | None:
     """Return the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one."""
     steps: dict[int, set[int]] = {}
     for row in RunFolder(folder).rows():
-        if row["env_steps"] >= cell.config.env_steps and "eval/success" in row:
+        if row["env_steps"] >= cell.config.run.env_steps and "eval/success" in row:
             steps.setdefault(row["env_steps"], set()).add(row["seed"])
     return min((count for count, seeds in steps.items() if seeds >= set(cell.seeds)), default=None)
 
@@ -144,7 +141,7 @@ def describe_progress(cell: Cell, runs: Path) -> str:
     latest = latest_rows(find_folder(cell, runs))
     if not latest:
         return "not begun" if not find_folder(cell, runs).exists() else "not evaluated yet"
-    return f"{show_budget(latest[0]['env_steps'])} of {show_budget(cell.config.env_steps)} steps"
+    return f"{show_budget(latest[0]['env_steps'])} of {show_budget(cell.config.run.env_steps)} steps"
 
 
 def latest_rows(folder: Path) -> Sequence[dict[str, Any]]:

@@ -145,7 +145,7 @@ class Cluster:
             raise RequestError(f"--executor {executor} cannot be used: {' '.join(str(error).split())}") from error
 
     def start(self, words: Sequence[str], log: Path, environment: Mapping[str, str]) -> Job:
-        """Submits a command; see `grid.start_process`."""
+        """Submit a command; see `grid.start_process`."""
         own = {name: value for name, value in child_environment().items() if name == "PYTHONPATH"}
         return Job(self._executor.submit(Training(words, log, {**own, **environment})), self._is_local)
 

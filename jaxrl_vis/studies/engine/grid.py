@@ -1,4 +1,4 @@
-"""Engine of all studies: trains a grid of cells, each in a process, with one process per device.
+"""Engine of all studies, which trains a grid of cells, each in a process of its own, one per device.
 
     unfinished cells -> `python -m jaxrl_vis train ... [--resume]`, a free device each -> run folders (`cells`)
 
@@ -99,7 +99,7 @@ def run_cells(
     say: Callable[[str], None] = streams.say,
     start: Start = start_process,
 ) -> list[str]:
-    """Train unfinished cells; resumes those already started.
+    """Train unfinished cells; resume those already started.
 
     Args:
         cells: Cells to train: longest first, so that devices finish at about the same time, otherwise in this order.
@@ -144,7 +144,7 @@ def run_cells(
 
 def _work(cell: Cell) -> float:
     """Estimate the relative duration of a cell: a gradient step with auxiliary losses takes about three times as long."""
-    return cell.config.env_steps * cell.config.seeds * (3.0 if cell.config.aux_tasks else 1.0)
+    return cell.config.run.env_steps * cell.config.run.seeds * (3.0 if cell.config.auxiliary.aux_tasks else 1.0)
 
 
 class _Grid:
@@ -213,7 +213,7 @@ class _Grid:
     def _describe(self, running: _Running) -> str:
         latest = latest_rows(self._runs / running.cell.name)
         steps = show_budget(latest[0]["env_steps"]) if latest else "0"
-        budget = show_budget(running.cell.config.env_steps)
+        budget = show_budget(running.cell.config.run.env_steps)
         return f"{running.cell.name}: {steps} of {budget} steps{_success(self._runs / running.cell.name)}"
 
     def _stop(self, reason: str) -> None:

@@ -5,10 +5,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxrl_vis.config import Config, preset
+from jaxrl_vis.config import Config, preset, validate
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.studies.engine.cells import Cell, split_seeds
-from jaxrl_vis.validation import validate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +121,7 @@ def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
     config = config.replace(**_OF_PRESET.get(scope.preset, {}), **study.family.of_task.get((scope.preset, task), {}))
     config = config.replace(env_steps=_budget(study, task, variant, scope, config))
     changed = config.replace(**study.family.variants[variant].changes).replace(**scope.changes)
-    options = (re.sub(r"[^\w=.-]", "_", option) for option in changed.env_options)  # for a folder's name
+    options = (re.sub(r"[^\w=.-]", "_", option) for option in changed.environment.env_options)  # for a folder's name
     family = "-".join((task, variant, scope.preset, *options))
     return split_seeds(Cell(family, validate(changed)), scope.seeds_per_run or scope.seeds)
 
@@ -133,4 +132,4 @@ def _budget(study: Study, task: str, variant: str, scope: Scope, config: Config)
     steps = study.shorter.get((task, variant), {**study.others, **study.steps}.get(task, _LONGEST))
     if scope.preset == study.family.preset:
         return steps
-    return min(steps, study.family.longest.get(scope.preset, {}).get(task, config.env_steps))
+    return min(steps, study.family.longest.get(scope.preset, {}).get(task, config.run.env_steps))

@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import preset
+from jaxrl_vis.config import changes, preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import streams
 from jaxrl_vis.host.devices import Device, list_devices
 from jaxrl_vis.studies.engine.cells import Cell, describe_progress, finished_rows, show_budget, split_seeds
 from jaxrl_vis.studies.engine.cluster import Cluster, ExecutorName
 from jaxrl_vis.studies.engine.grid import run_cells, start_process
-from jaxrl_vis.validation import validate
 
 SUBMITTED = "submitit"
 """Folder of submitit's own files, inside the folder of runs."""
@@ -57,16 +56,16 @@ def make_cells(request: Request) -> list[Cell]:
     cells: list[Cell] = []
     for task in request.tasks:
         for method in request.methods:
-            config = validate(preset(request.preset, **{**request.changes, "env": task, "method": method}))
-            if config.devices > 1 and request.executor != "slurm":
+            config = validate(preset(request.preset, **{**request.changes, **changes(env=task, method=method)}))
+            if config.run.devices > 1 and request.executor != "slurm":
                 raise RequestError("a sweep has one device for each run: leave out --devices, or use --executor slurm")
             name = f"{task.replace(':', '-')}-{method}-{request.preset}"
-            cells += split_seeds(Cell(name, config), request.seeds_per_run or config.seeds)
+            cells += split_seeds(Cell(name, config), request.seeds_per_run or config.run.seeds)
     return cells
 
 
 def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> bool:
-    """Train missing cells, resumes unfinished ones, and print a table.
+    """Train missing cells, resume unfinished ones, and print a table.
 
     Returns:
         True if everything is finished.
@@ -100,10 +99,10 @@ def _table(cells: Sequence[Cell], runs: Path) -> tuple[list[str], list[str]]:
             continue
         last = max(row["env_steps"] for row in rows)
         reached = {row["seed"]: row["eval/success"] for row in rows if row["env_steps"] == last}
-        results.setdefault((cell.config.env, cell.config.method), {}).update(reached)
+        results.setdefault((cell.config.environment.env, cell.config.reward.method), {}).update(reached)
     lines = [f"{'task':28}{'method':28}{'steps':>8}{'seeds':>7}{'success: median':>17}{'least':>8}{'most':>8}"]
     for (task, method), success in results.items():
-        steps = show_budget(cells[0].config.env_steps)
+        steps = show_budget(cells[0].config.run.env_steps)
         values = [value for value in success.values() if value is not None]
         figures = (statistics.median(values), min(values), max(values)) if values else (float("nan"),) * 3
         lines.append(f"{task:28}{method:28}{steps:>8}{len(success):7}{figures[0]:17.3f}{figures[1]:8.3f}{figures[2]:8.3f}")

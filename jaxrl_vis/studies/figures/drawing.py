@@ -127,7 +127,7 @@ def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figur
 
 
 def _break_lines(text: str, letters: int) -> list[str]:
-    """Breaks a text after semicolons, into lines of at most a number of characters if its clauses allow."""
+    """Break a text after semicolons, into lines of at most a number of characters if its clauses allow."""
     lines = [""]
     for clause in text.split("; "):
         longer = f"{lines[-1]}; {clause}" if lines[-1] else clause

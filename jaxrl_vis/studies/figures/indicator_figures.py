@@ -76,7 +76,7 @@ def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tupl
                 figures = _figures(line)
                 text.append(table_row([VARIANTS[variant].label, *_cells(figures)]))
                 names = {f"{name}{end}": value for name, values in figures.items() for end, value in _csv(values)}
-                rows.append({"task": task, "method": variant, "seeds": len(line.seeds), "env_steps": line.end, **names})
+                rows.append(dict(task=task, method=variant, seeds=len(line.seeds), env_steps=line.end, **names))
         text.append("")
     return text, rows
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.run.storage.metrics import Place
 from jaxrl_vis.studies.engine.results import SUCCESS, Line, read_lines
 from jaxrl_vis.studies.engine.study import make_cells
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
@@ -63,7 +64,9 @@ def _steps_table(lines: Lines, tasks: Sequence[str]):
         points = released[task, variant]
         known = [(steps, value) for steps, value in points if steps <= ends.get(task, 0)]
         if known:
-            rows = [{"seed": 0, "env_steps": steps, "updates": 0, SUCCESS: value} for steps, value in known]
+            rows = [
+                Place(seed=0, iteration=0, updates=0, env_steps=steps)._asdict() | {SUCCESS: value} for steps, value in known
+            ]
             named[task].append(Named(VARIANTS[variant].label, Line(task, variant, rows), _AUTHORS))
     return steps_table(named, LEVELS)
 

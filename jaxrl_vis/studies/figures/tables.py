@@ -74,21 +74,21 @@ def _csv_rows(named: Named, base: Line | None, levels: Sequence[float], common: 
     for level in levels:
         result = reached(named.line, level)
         rows.append(
-            {
-                "task": named.line.task,
-                "method": named.line.variant,
-                "source": named.source,
-                "seeds": len(named.line.seeds),
-                "level": level,
-                "steps": result.steps,
-                "steps_25": result.low,
-                "steps_75": result.high,
-                "budget": result.budget,
-                "speed_up": "" if base is None or named.line.variant == BASELINE else result.ratio(reached(base, level)),
-                "mean_success": round(mean_success(named.line, common), 4),
-                "mean_success_to": common,
-                "final_success": round(final(named.line)[1], 4),
-            }
+            dict(
+                task=named.line.task,
+                method=named.line.variant,
+                source=named.source,
+                seeds=len(named.line.seeds),
+                level=level,
+                steps=result.steps,
+                steps_25=result.low,
+                steps_75=result.high,
+                budget=result.budget,
+                speed_up="" if base is None or named.line.variant == BASELINE else result.ratio(reached(base, level)),
+                mean_success=round(mean_success(named.line, common), 4),
+                mean_success_to=common,
+                final_success=round(final(named.line)[1], 4),
+            )
         )
     return rows
 

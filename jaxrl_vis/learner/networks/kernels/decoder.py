@@ -1,4 +1,4 @@
-"""The finest two layers of a decoder and its squared error as one GPU kernel (Pallas, by Triton), gradients included.
+"""Finest two layers of a decoder and its squared error in one GPU kernel (Pallas, by Triton), including gradients.
 
 A decoder's layers (`auxtasks.heads`) double its image's sides, so nearly all numbers that it makes are those of the last two:
 for an image of 64x64 pixels with four channels 16,384 each, beside an observation of as many. As separate products they would
@@ -10,7 +10,7 @@ be written and read a dozen times on the way there and back. Here a tile of *cel
     error    of these pixels, and the way back at once: the gradient of a squared error is known as soon as the error is
 
 Pixels have the order of the encoder's patches (`kernels.patches`): channel, row, column within a cell, and cells in
-nested blocks. So what an autoencoder is to reconstruct is what the encoder read, byte for byte.
+nested blocks. So an autoencoder's targets are the encoder's inputs, byte for byte.
 
 The gradient of the cells is written in the networks' dtype, those of the weights are added up in float32 as in
 `kernels.passes`; both are multiplied by the gradient that comes in.
@@ -46,7 +46,7 @@ _CELLS, _TILES, _PARAMS = 64, 32, plgpu.CompilerParams(num_warps=4, num_stages=1
 
 
 class Weights(NamedTuple):
-    """The layers as the kernel multiplies them, float32.
+    """Layers in the form that the kernel multiplies, float32.
 
     Attributes:
         bias_in: [F], added to cells before their rectifier.
@@ -96,12 +96,12 @@ def make_weights(bias_in: jax.Array, finer: dict[str, jax.Array], finest: dict[s
 
 
 def _cast(weights: Weights, dtype: Any) -> Weights:
-    """Kernels in the dtype of the products; biases are added in float32."""
+    """Cast kernels to the dtype of the products; biases stay float32."""
     return weights._replace(kernel_1=weights.kernel_1.astype(dtype), kernel_2=weights.kernel_2.astype(dtype))
 
 
 def _forward(cells: jax.Array, weights: Weights) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Rectified cells, the layer above them, both in the dtype of ``cells``, and pixels in float32."""
+    """Compute the rectified cells and the layer above them, in the dtype of ``cells``, and the pixels in float32."""
     dtype = cells.dtype
     hidden = rectified(cells.astype(jnp.float32) + weights.bias_in[None, :]).astype(dtype)
     finer = layer(hidden, weights.kernel_1, weights.bias_1)
@@ -148,7 +148,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
 def _on_gpu(
     cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array, Weights]:
-    """The scaled sum of squared errors, and its gradients with respect to the cells and the weights."""
+    """Compute the scaled sum of squared errors, and its gradients with respect to cells and weights."""
     count, features = cells.shape
     tile = divisor(count, _CELLS)
     block = tile * tiles_of_program(count // tile, count // tile, _TILES)
@@ -170,8 +170,8 @@ def _on_gpu(
     )(cells, target, *cast)
     ends = list(itertools.accumulate(array.size for array in weights))
     *sums, squares = jnp.split(jnp.sum(partial_sums, axis=0), ends)
-    found = Weights(*(part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True)))
-    return scale * jnp.sum(squares), gradient, found
+    weight_gradients = Weights(*(part.reshape(like.shape).astype(like.dtype) for part, like in zip(sums, weights, strict=True)))
+    return scale * jnp.sum(squares), gradient, weight_gradients
 
 
 def _plainly(cells: jax.Array, target: jax.Array, weights: Weights, scale: float) -> jax.Array:
@@ -208,13 +208,13 @@ _squared_error.defvjp(_squared_error_forward, _squared_error_backward)
 
 
 def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False) -> jax.Array:
-    """The sum over pixels of squared errors, times ``scale``: [] float32; differentiable with respect to cells and weights.
+    """Sum the squared errors over pixels, times ``scale``: [] float32; differentiable with respect to cells and weights.
 
     Args:
-        cells: [M, F], M a multiple of 16: what the layer before makes, without its bias.
-        target: [at least M, 16 C'], of which the first M rows count; what is padding must be 0.
+        cells: [M, F], M a multiple of 16: output of the previous layer, without its bias.
+        target: [at least M, 16 C'], of which the first M rows count; padding must be 0.
         weights: From `make_weights`.
-        scale: A number, so that where nothing else is multiplied, the gradient is written as it is wanted.
+        scale: A number, so that the kernel writes the scaled gradient directly.
         interpret: Run the kernel without a GPU, slowly.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The encoder's first three layers as one GPU kernel each way (Pallas, by Triton).
+"""First three layers of the encoder in one GPU kernel per direction (Pallas, by Triton).
 
 Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else. A
 tile of R patches (`kernels.patches` makes them, in an order that has windows side by side) passes through all three
@@ -15,7 +15,7 @@ see four patches at a time, so that a tile has too few rows of it: in here, it m
 The backward kernel computes all layers but the last again, keeps the gradients of the weights in registers over several tiles,
 and writes a partial sum for each program; those are added up in a fixed order, so a resumed run repeats itself exactly.
 
-`networks` has the same function as plain matrix products: that is the reference, and what a process without such a GPU runs.
+`networks` has the same function as plain matrix products: these are the reference, and run in processes without such a GPU.
 Where there is one, images are put into patches whatever a program is compiled for, and a program for another platform computes
 the layers here, from the same patches, in plain JAX.
 """
@@ -44,7 +44,7 @@ def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
 
 
 def make_weights(params: dict[str, Any], channels: int) -> Weights:
-    """The first layers of an encoder (`networks`) for images of ``channels`` channels."""
+    """Extract the first layers of an encoder (`networks`) for images of ``channels`` channels."""
     window = params["kernel_0"].reshape(2, 2, channels, -1)  # row, column, channel, filter
     window = jnp.pad(window, [(0, 0), (0, 0), (0, padded_channels(channels) - channels), (0, 0)])
     # From (channel, window's row, row, window's column, column) to (window's row, window's column, filter), where a window only
@@ -92,7 +92,7 @@ def prepare(
 
 
 def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), interpret: bool = False) -> jax.Array:
-    """`apply` to ``which`` of the images: [B, patches, 64 C'] -> [images, patches, F], same dtype.
+    """Encode the images ``which`` by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype.
 
     Images are chosen here rather than by slicing before, because a slice that a kernel reads is a copy.
     """

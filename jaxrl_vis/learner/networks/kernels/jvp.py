@@ -1,6 +1,6 @@
-"""The kernel of the encoder's first layers that also makes their tangents: forward along a direction of the weights.
+"""Kernel of the encoder's first layers with tangents along a direction of the weights.
 
-And the same in plain JAX, as in `kernels.passes`. Weightings that need dot products of gradients ask for it
+And the same in plain JAX, as in `kernels.passes`. Used by weightings that need dot products of gradients
 (`learner.tangents`).
 """
 
@@ -24,10 +24,10 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     dot,
     joined,
     layer,
-    quarters_of,
     read,
     rows,
-    rows_of,
+    tile_quarters,
+    tile_rows,
     whole,
 )
 from jaxrl_vis.learner.networks.kernels.patches import divisor
@@ -39,12 +39,12 @@ def _tangent_kernel(x_ref, *refs):
     weights, along = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
 
     def one_tile(tile, _):
-        values, tangents = x_ref[quarters_of(tile), :], None
+        values, tangents = x_ref[tile_quarters(tile), :], None
         for level, parameters in enumerate(zip(*weights, *along, strict=True)):
             tangents = None if tangents is None else joined(tangents, level)
             values, tangents = _layer_along(joined(values, level), tangents, *parameters)
         assert tangents is not None  # there is a layer
-        out_ref[rows_of(tile), :], tangent_ref[rows_of(tile), :] = values, tangents
+        out_ref[tile_rows(tile), :], tangent_ref[tile_rows(tile), :] = values, tangents
 
     jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
@@ -57,7 +57,7 @@ def _layer_along(
     kernel_along: jax.Array,
     bias_along: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """`layer` and its tangent, for tangents of the values (None: they have none), of the kernel and of the bias."""
+    """Compute `layer` and its tangent, given tangents of the values (None for zero), kernel and bias."""
     out, change = layer(values, kernel, bias), dot(values, kernel_along) + bias_along[None, :]
     if tangents is not None:
         change += dot(tangents, kernel)
@@ -66,7 +66,7 @@ def _layer_along(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
 def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    """`apply`, differentiable forwards instead, with respect to the weights."""
+    """Compute `apply`, differentiable in forward mode with respect to the weights."""
     return apply(patches, weights, first, count, interpret)
 
 
@@ -86,7 +86,7 @@ def _along_on_gpu(
     outputs = weights.biases[-1].shape[0]
     block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
     data, data_spec = as_quarters(patches, first, block)
-    cast = jax.tree.leaves([cast_kernels(each, patches.dtype) for each in (weights, along)])
+    cast = jax.tree.leaves([cast_kernels(tree, patches.dtype) for tree in (weights, along)])
     out = jax.ShapeDtypeStruct((count, outputs), patches.dtype)
     return kernel_call(
         _tangent_kernel,

@@ -1,6 +1,6 @@
-"""The kernels of the encoder's first layers: forward and backward (`kernels.encoder`; `kernels.jvp` has a third).
+"""Forward and backward kernels of the encoder's first layers (`kernels.encoder`; `kernels.jvp` has a third).
 
-Each with the same in plain JAX, for processes without such a GPU and as the kernels' reference.
+Each has an equivalent in plain JAX, as reference and for processes without such a GPU.
 """
 
 import functools
@@ -30,7 +30,7 @@ _LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors
 
 
 class Weights(NamedTuple):
-    """Layers as the kernels multiply them, float32.
+    """Layers in the form that the kernels multiply, float32.
 
     Attributes:
         kernels: [16 C', 4 F1] for a quarter, where C' is C padded to a power of two; [4 F1, F2]; [4 F2, F3].
@@ -45,7 +45,7 @@ class Weights(NamedTuple):
 
 
 def is_available() -> bool:
-    """Return True if this process has a GPU that the kernels run on, see `jaxrl_vis_envs.compiling.compilation`."""
+    """Return True if this process has a GPU that runs the kernels, see `jaxrl_vis_envs.compiling.compilation`."""
     if accelerator() != "cuda":
         return False
     with tracing_for("cuda"):
@@ -53,12 +53,12 @@ def is_available() -> bool:
 
 
 def probe() -> None:
-    """Compile small instances of all three kernels for the device that is the default; raise what that raises."""
+    """Compile small instances of all three kernels for the default device; raise any error of the compilation."""
     probe_program().lower().compile()
 
 
 def probe_program() -> Any:
-    """Small instances of all three kernels in one program, traced (`jax.stages.Traced`)."""
+    """Trace small instances of all three kernels in one program (`jax.stages.Traced`)."""
     shape, levels = (4, 16, 16), LEVELS + 1
     images, of_pixels = jnp.zeros((LEAST_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
     sizes = (64, 64), (64, 16), (64, 16)
@@ -74,7 +74,7 @@ def probe_program() -> Any:
 
 
 def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
-    """The kernel where a program is compiled for a GPU that runs it, and the same in plain JAX for every other platform."""
+    """Call the kernel if the program is compiled for a GPU that runs it, else its equivalent in plain JAX."""
     if interpret:
         return on_gpu(*arguments)
     return dispatch_by_platform(lambda *given: (on_gpu if use_gpu_kernels(probe) else plain)(*given), *arguments)
@@ -84,42 +84,42 @@ def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
 
 
 def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -> jax.Array:
-    """A product in float32, over axis ``contract[0]`` of the left side and ``contract[1]`` of the right one."""
+    """Multiply matrices in float32, contracting axis ``contract[0]`` of the left with ``contract[1]`` of the right."""
     dimensions = (((contract[0],), (contract[1],)), ((), ()))
     return jax.lax.dot_general(left, right, dimensions, preferred_element_type=jnp.float32)
 
 
 def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """A product with bias and rectifier, in the dtype of ``values``."""
+    """Apply a dense layer with rectifier, in the dtype of ``values``."""
     return rectified(dot(values, kernel) + bias[None, :]).astype(values.dtype)
 
 
 def rectified(values: jax.Array) -> jax.Array:
-    """A rectifier with gradient 0 at 0, as `jax.nn.relu` has and `jnp.maximum` has not: blank parts of images lie there."""
+    """Rectify, with gradient 0 at 0 like `jax.nn.relu` and unlike `jnp.maximum`: blank parts of images lie there."""
     return jnp.where(values > 0.0, values, 0.0)
 
 
 def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
-    """The gradient before a rectifier whose output is ``after``, in its dtype."""
+    """Propagate a gradient back through a rectifier with output ``after``, in its dtype."""
     return jnp.where(after > 0.0, gradient, 0.0).astype(after.dtype)
 
 
 def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
     """Return the output of each layer for [4 R, 16 C'] quarters of patches; `joined` says in which rows."""
-    found, values = [], quarters
+    outputs, values = [], quarters
     for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
         values = layer(joined(values, level), kernel, bias)
-        found.append(values)
-    return found
+        outputs.append(values)
+    return outputs
 
 
 def joined(values: jax.Array, level: int) -> jax.Array:
-    """Return the rows that a layer multiplies: the third one four quarters side by side, others those of the layer before."""
+    """Return the rows that a layer multiplies: four quarters side by side for the third layer, else the previous output."""
     return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
 def read(refs: Any) -> Weights:
-    """Return the weights as arguments of a kernel: kernels, then biases."""
+    """Load the weights from a kernel's arguments: kernels, then biases."""
     values = tuple(ref[...] for ref in refs)
     return Weights(values[: len(values) // 2], values[len(values) // 2 :])
 
@@ -128,18 +128,18 @@ def _forward_kernel(x_ref, *refs):
     weights, out_ref = read(refs[:-1]), refs[-1]
 
     def one_tile(tile, _):
-        *_, out_ref[rows_of(tile), :] = _layers(x_ref[quarters_of(tile), :], weights)
+        *_, out_ref[tile_rows(tile), :] = _layers(x_ref[tile_quarters(tile), :], weights)
 
     jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
 
-def rows_of(tile: Any) -> Any:
-    """Rows of a tile in the result."""
+def tile_rows(tile: Any) -> Any:
+    """Return the slice of a tile's rows in the result."""
     return pl.ds(tile * TILE, TILE)
 
 
-def quarters_of(tile: Any) -> Any:
-    """Quarters of patches of a tile."""
+def tile_quarters(tile: Any) -> Any:
+    """Return the slice of a tile's quarters of patches."""
     return pl.ds(4 * tile * TILE, 4 * TILE)
 
 
@@ -148,13 +148,13 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
     hidden_layers = Weights(weights.kernels[:-1], weights.biases[:-1])
 
     def add_rows(values):
-        """The sum over rows, in each of the result's rows: as a product, it costs half of what a reduction does."""
+        """Sum over rows, in every row of the result: as a matrix product, it costs half as much as a reduction."""
         return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(tile, sums):
-        values = [x_ref[quarters_of(tile), :]]
-        values += [*_layers(values[0], hidden_layers), out_ref[rows_of(tile), :]]
-        gradient, of_kernels, of_biases = gradient_ref[rows_of(tile), :], list(sums.kernels), list(sums.biases)
+        values = [x_ref[tile_quarters(tile), :]]
+        values += [*_layers(values[0], hidden_layers), out_ref[tile_rows(tile), :]]
+        gradient, of_kernels, of_biases = gradient_ref[tile_rows(tile), :], list(sums.kernels), list(sums.biases)
         for level in reversed(range(LEVELS)):
             gradient = before(values[level + 1], gradient)
             of_kernels[level] += dot(joined(values[level], level), gradient, (0, 0))
@@ -175,22 +175,22 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
 
 
 def whole(array: jax.Array) -> pl.BlockSpec:
-    """All of an array for each program."""
+    """Return a block that gives every program the whole array."""
     return pl.BlockSpec(array.shape, lambda program: (0,) * array.ndim)
 
 
 def rows(count: int, columns: int, skipped: int = 0) -> pl.BlockSpec:
-    """``count`` rows of a matrix for each program, after the first ``skipped`` blocks of as many rows."""
+    """Return blocks of ``count`` rows of a matrix, one per program, skipping the first ``skipped`` blocks."""
     return pl.BlockSpec((count, columns), lambda program: (program + skipped, 0))
 
 
 def tiles_of_program(tiles: int, total: int, limit: int) -> int:
-    """Return the number of tiles per program where it leaves a sum: many, for few sums, as long as all processors are busy.
+    """Return the number of tiles per program: as many as keep all processors busy, for few partial sums.
 
     Args:
         tiles: What the number must divide.
         total: Tiles of all programs.
-        limit: At most so many.
+        limit: Upper bound.
     """
     most = divisor(tiles, limit)
     while most > 1 and total < most * _LEAST_PROGRAMS:
@@ -199,13 +199,13 @@ def tiles_of_program(tiles: int, total: int, limit: int) -> int:
 
 
 def cast_kernels(weights: Weights, dtype: Any) -> Weights:
-    """Kernels in the dtype of the products; biases are added in float32."""
+    """Cast kernels to the dtype of the products; biases stay float32."""
     return weights._replace(kernels=tuple(kernel.astype(dtype) for kernel in weights.kernels))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
 def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    """Layers of 2x2 stride-2 convolutions with rectifiers, for some patches: [M, 64 C'] -> [count, F], same dtype.
+    """Apply 2x2 stride-2 convolutions with rectifiers to some patches: [M, 64 C'] -> [count, F], same dtype.
 
     Differentiable with respect to the weights only: patches are data.
 
@@ -221,7 +221,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
 
 
 def as_quarters(patches: jax.Array, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
-    """Patches as the kernels read them, and a program's ``block`` of them."""
+    """Return patches as the kernels read them, and the specification of a program's ``block`` of them."""
     size = patches.shape[1] // 4
     return patches.reshape(-1, size), rows(4 * block, size, first // block)
 
@@ -244,7 +244,7 @@ def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, 
 
 
 def apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
-    """`apply` in plain JAX."""
+    """Compute `apply` in plain JAX."""
     chosen = patches[first : first + count].reshape(-1, patches.shape[1] // 4)
     return _layers(chosen, cast_kernels(weights, patches.dtype))[-1]
 
@@ -265,7 +265,7 @@ def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gra
 def _backward_on_gpu(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int, interpret: bool = False
 ) -> Weights:
-    """Gradients of the weights, float32."""
+    """Compute the gradients of the weights, float32."""
     outputs = out.shape[1]
     block = TILE * tiles_of_program(math.gcd(first, count) // TILE, count // TILE, _BACKWARD_TILES)
     programs = count // block

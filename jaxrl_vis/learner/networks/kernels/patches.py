@@ -24,17 +24,17 @@ _PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 4096, 16, plgpu.CompilerParams(num
 
 
 def padded_channels(channels: int) -> int:
-    """C': the next power of two."""
+    """Return C', the next power of two."""
     return pl.next_power_of_2(channels)
 
 
 def divisor(number: int, limit: int) -> int:
-    """The largest power of two that divides ``number``, at most ``limit``."""
+    """Return the largest power of two that divides ``number``, at most ``limit``."""
     return math.gcd(number, limit)
 
 
 def _prepare_kernel(images_ref, mean_ref, scale_ref, *refs, shape, levels, limit):
-    """Some blocks, side by side, of several images; read as they lie in the image, and put into patches on the chip.
+    """Rearrange adjacent blocks of several images into patches on the chip, reading them in the order of the image.
 
     The last of ``refs`` is the result; before it is how far each image moves, if they do.
     """
@@ -85,7 +85,7 @@ def prepare_on_gpu(
     dtype: Any,
     interpret: bool = False,
 ) -> jax.Array:
-    """`kernels.encoder.prepare` as a kernel; ``interpret`` runs it without a GPU."""
+    """Compute `kernels.encoder.prepare` by a kernel; ``interpret`` runs it without a GPU."""
     batch, *shape = images.shape
     channels, height, width = shape
     rows, columns, of_block = height >> levels, width >> levels, 4 ** (levels - LEVELS)
@@ -113,7 +113,7 @@ def prepare_on_gpu(
 def prepare_plainly(
     images: jax.Array, mean: jax.Array, scale: jax.Array, shift: jax.Array | None, levels: int, limit: float, dtype: Any
 ) -> jax.Array:
-    """`kernels.encoder.prepare` in plain JAX."""
+    """Compute `kernels.encoder.prepare` in plain JAX."""
     if shift is not None:
         values = jnp.clip((images.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
         return to_patches(shifted(values, shift), levels)
@@ -122,7 +122,7 @@ def prepare_plainly(
 
 
 def to_patches(images: jax.Array, levels: int) -> jax.Array:
-    """[..., C, H, W] -> [..., patches, 64 C']; channels that are padding hold zeros.
+    """Rearrange [..., C, H, W] to [..., patches, 64 C']; padding channels are zeros.
 
     Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
     `blocks.to_blocks`), so that the next layers find their windows side by side. Pixels of a patch run over (quarter's row,

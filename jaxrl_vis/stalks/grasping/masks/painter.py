@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis import fields
+from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.weights_file import check_range, read_parameters, write_parameters
 from jaxrl_vis.stalks.grasping.masks.mask_networks import Generator

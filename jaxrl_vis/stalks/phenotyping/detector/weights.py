@@ -9,7 +9,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis import fields
+from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.weights_file import check_range, read_parameters, write_parameters
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial

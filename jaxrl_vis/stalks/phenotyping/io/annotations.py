@@ -1,28 +1,25 @@
-"""Annotations: boxes, and masks as runs of pixels. Written in COCO's format, read in that of COCO, Pascal VOC or LabelMe.
+"""Annotations: boxes, and masks as runs of pixels. Written in COCO's format, read in those of many programs.
 
 Columns and lines of boxes and outlines are continuous: the first pixel spans from 0 to 1, with its middle at 0.5.
 """
 
 import reprlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.gather import gather
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.labels import choose
 from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
 from jaxrl_vis.stalks.phenotyping.io.masks import box_around_runs, covering, decode_counts
 from jaxrl_vis.stalks.phenotyping.io.names import readable
-from jaxrl_vis_envs.documents import parse_xml, read_bytes, read_json
 
 STALK = 1
 """Category of stalks."""
-_MAX_BYTES = 10_000_000  # of a file of one image
 _FARTHEST = 1e7  # pixels
-_WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError)
-"""Errors that reading a file of another form raises."""
 
 
 def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
@@ -41,134 +38,58 @@ def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about:
     return {"info": about, "images": images, "annotations": numbered, "categories": categories}
 
 
-def read_annotations(folder: Path) -> dict[str, Any]:
+def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]:
     """The annotations of a folder, in COCO's form whatever form they are in.
 
-    ``annotations.json`` of COCO; or one file for each image: ``*.xml`` of Pascal VOC, with boxes, or ``*.json`` of LabelMe,
-    with polygons or rectangles. Where something is called a stalk, what is called otherwise is left out.
+    ``annotations.json`` of COCO, or all of the files that are there: COCO's under any name, images in any folder below;
+    XML of Pascal VOC, roLabelImg or CVAT; JSON of LabelMe or Label Studio; texts of YOLO.
+
+    Args:
+        folder: The folder.
+        labels: Names that stalks have, see `labels.choose`. What is called otherwise is left out.
 
     Returns:
         ``images``, each with id, file_name, width and height; and ``annotations``, each with the image_id of one of them and a
         bbox [4] (left, top, width, height in pixels) that shows in it, and, where there is a ``segmentation``, polygons (lists
-        of at least 3 corners) or runs of pixels that cover the image.
+        of at least 3 corners) or runs of pixels that cover the image. Where ``iscrowd`` is 1, it is a region with stalks that
+        nobody told apart. ``summary`` says in one line what counts as a stalk.
 
     Raises:
         RequestError: There are none, they cannot be read, or one of them is not as above; the message says which.
     """
-    path = folder / "annotations.json"
-    if path.exists():
-        return _checked_annotations(_read_coco(path), path)
-    for pattern, read in (("*.xml", _voc), ("*.json", _labelme)):
-        files = sorted(folder.glob(pattern)) if folder.is_dir() else []
-        if files:
-            return _checked_annotations(_together(files, read), folder)
-    raise RequestError(
-        f"there are no annotations in {folder}: put annotations.json of COCO there, or .xml of Pascal VOC or .json of LabelMe "
-        "beside each image"
-    )
-
-
-def _read_coco(path: Path) -> dict[str, Any]:
-    try:
-        data = read_json(path)
-        names = {category["id"]: str(category["name"]) for category in data.get("categories", [])}
-        annotations = []
-        for place, annotation in enumerate(data["annotations"]):
-            source = f"{path}: annotation {str(annotation.get('id', place + 1))[:60]}"
-            annotations.append({**annotation, "name": names.get(annotation.get("category_id"), ""), "source": source})
-        return {"images": [{**image, "source": str(path)} for image in data["images"]], "annotations": annotations}
-    except OSError as error:
-        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
-    except _WRONG as error:
-        raise RequestError(f"{path} is not COCO: it needs images and annotations{_reason(error)}") from error
-
-
-_Read = Callable[[Path], tuple[str, int, int, list[dict[str, Any]]]]
-"""From a file to the name of its image, width, height and annotations."""
-
-
-def _together(files: list[Path], read: _Read) -> dict[str, Any]:
-    """Files of one image each as one data set."""
     images, annotations = [], []
-    for number, file in enumerate(files):
-        try:
-            name, width, height, shapes = read(file)
-        except OSError as error:
-            raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
-        except _WRONG as error:
-            kind = "Pascal VOC" if file.suffix == ".xml" else "LabelMe"
-            raise RequestError(f"{file} is no annotation of {kind}{_reason(error)}") from error
-        images.append({"id": number, "file_name": name, "width": width, "height": height, "source": str(file)})
-        annotations += [
-            {"image_id": number, "source": f"{file}: annotation {place + 1}", **shape} for place, shape in enumerate(shapes)
-        ]
-    return {"images": images, "annotations": annotations}
+    found = gather(folder)
+    for number, image in found:
+        key = "/".join(map(str, number)) if isinstance(number, tuple) else number
+        source = str(image.source)
+        images.append({"id": key, "file_name": image.name, "width": image.width, "height": image.height, "source": source})
+        for annotation in image.annotations:
+            annotations.append({**annotation, "image_id": annotation["image_id"] if annotation.get("orphan") else key})
+    path = folder / "annotations.json" if (folder / "annotations.json").exists() else folder
+    return _checked_annotations({"images": images, "annotations": annotations}, path, labels)
 
 
-def _reason(error: Exception) -> str:
-    """Message of a reader's error, where it has one in words."""
-    words = " ".join(str(error).split()) if isinstance(error, ValueError) else ""
-    return f" ({words[:200]})" if words else ""
-
-
-def _voc(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
-    root = parse_xml(read_bytes(path, _MAX_BYTES))
-
-    def text(node: ElementTree.Element, name: str) -> str:
-        value = node.findtext(name)
-        if value is None:
-            raise ValueError(name)
-        return value
-
-    annotations = []
-    for element in root.iter("object"):
-        # Pixels count from 1, and the last ones belong to the box.
-        left, top, right, bottom = (float(text(element, f"bndbox/{name}")) for name in ("xmin", "ymin", "xmax", "ymax"))
-        box = [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0]
-        annotations.append({"name": text(element, "name"), "bbox": box})
-    return text(root, "filename"), int(text(root, "size/width")), int(text(root, "size/height")), annotations
-
-
-def _labelme(path: Path) -> tuple[str, int, int, list[dict[str, Any]]]:
-    data = read_json(path, _MAX_BYTES)
-    annotations = []
-    for shape in data["shapes"]:
-        points = np.asarray(shape["points"], float).reshape(-1, 2)
-        kind = shape.get("shape_type", "polygon")
-        if kind not in ("polygon", "rectangle") or len(points) < (2 if kind == "rectangle" else 3):
-            continue
-        low, high = points.min(axis=0), points.max(axis=0)
-        outline = points if kind == "polygon" else np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-        with np.errstate(over="ignore", invalid="ignore"):
-            box = [*map(float, low), *map(float, high - low)]
-        annotations.append({"name": str(shape["label"]), "bbox": box, "segmentation": [outline.ravel().tolist()]})
-    # The path is as its writer's machine spelled it.
-    return (
-        str(data["imagePath"]).replace("\\", "/").rpartition("/")[2],
-        int(data["imageWidth"]),
-        int(data["imageHeight"]),
-        annotations,
-    )
-
-
-def _checked_annotations(data: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the annotations that are called a stalk, or all if none is; checked."""
-    named = [annotation for annotation in data["annotations"] if "stalk" in annotation.get("name", "").lower()]
-    data = {**data, "annotations": named or data["annotations"]}
+def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]) -> dict[str, Any]:
+    """Return the annotations that are stalks; checked."""
     if not data["images"] or not data["annotations"]:
         raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
+    stalks, summary = choose(data["annotations"], labels, str(path))
     images = [_checked_image(image, place) for place, image in enumerate(data["images"])]
     twice = len(images) - len({image["id"] for image in images})
     if twice:
         raise RequestError(f"{path}: {twice} images have the id of another one, so nobody can tell whose annotations are whose")
     sizes = {image["id"]: (image["height"], image["width"]) for image in images}
     annotations = []
-    for annotation in data["annotations"]:
+    for annotation in stalks:
         try:
+            if annotation.get("problem"):
+                raise ValueError(annotation["problem"])
             annotations.append(_checked_annotation(annotation, sizes))
         except ValueError as error:
             raise RequestError(f"{annotation['source']} {error}: mend it, or delete it") from error
-    return {"images": images, "annotations": annotations}
+    if all(annotation.get("iscrowd") for annotation in annotations):
+        raise RequestError(f"{path} annotates no single stalk, but regions of many (iscrowd): annotate some one by one")
+    return {"images": images, "annotations": annotations, "summary": summary}
 
 
 def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:

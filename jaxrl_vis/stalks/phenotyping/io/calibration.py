@@ -1,7 +1,9 @@
-"""Calibrations of a pair of rectified cameras, read from the files of OpenCV and ROS, and written for OpenCV.
+"""Calibrations of a pair of rectified cameras, read from the files of many programs, and written for OpenCV.
 
-    OpenCV YAML or XML      P1 and P2 as cv2.stereoRectify returns them; image_width and image_height
-    ROS camera_info YAML    a folder with left.yaml and right.yaml, or either of them beside the other
+    OpenCV       P1 and P2 as cv2.stereoRectify returns them, in YAML, XML or JSON; extrinsics.yml of its sample stereo_calib
+    ROS 1 and 2  one file for each camera (left.yaml and right.yaml, cam0.yaml and cam1.yaml), from the calibrators or as
+                 camera_info is printed
+    others       RealSense's table, calib.txt of Middlebury and of KITTI; kalibr and ZED where the cameras stand rectified
 
 Millimetres of stalk come from the focal length and the baseline, so a file without them is refused rather than guessed. The one
 thing that files do not say is the unit of the baseline: metres in ROS, and in OpenCV whatever the chessboard was measured in.
@@ -9,63 +11,77 @@ thing that files do not say is the unit of the baseline: metres in ROS, and in O
 
 import dataclasses
 import math
-import reprlib
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
-from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
-from jaxrl_vis.stalks.phenotyping.io.units import METRES, baseline_in_metres
-from jaxrl_vis_envs.documents import read_text
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Size
+from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import both_sides, files_in, named_pair, read_cameras
+from jaxrl_vis.stalks.phenotyping.io.images import image_size
+from jaxrl_vis.stalks.phenotyping.io.names import readable
+from jaxrl_vis.stalks.phenotyping.io.units import baseline_in_metres
 from jaxrl_vis_envs.plants import Calibration
 
-_SIDES = ("left", "right")
-_NO_STORAGE = "it is neither YAML nor XML as OpenCV and ROS write it"
-_MAX_BYTES = 2_000_000  # of a file
-_MAX_PIXELS = 100_000  # along a side of an image
+_OFF_CENTRE = 0.25  # of an image's side: the principal point lies no further from its middle
 
 
-def read_calibration(path: Path, unit: str | None = None) -> Calibration:
+def read_calibration(path: Path, unit: str | None = None, image: Path | None = None) -> Calibration:
     """Read a calibration.
 
     Args:
-        path: A file of OpenCV or of ROS, or a folder that holds left.yaml and right.yaml.
-        unit: Unit of the baseline, see `in_metres`; None for what the file says (its key ``unit``), and else metres.
+        path: A file of any of these programs, or a folder that holds one for both cameras or one for each.
+        unit: Unit of the baseline, see `in_metres`; None for what the file says, or its program uses, and else metres.
+        image: A left image that was taken with the cameras: where a file is for several sizes or does not say for which, this
+            one's is taken.
 
     Raises:
         RequestError: There is no such file, it does not describe a pair of rectified cameras, or its baseline cannot be in that
             unit.
     """
-    if path.is_dir():
-        files = [_beside(path / "left.yaml", side) for side in _SIDES]
-    elif _storage(path).get("P2") is None:
-        files = [_beside(path, side) for side in _SIDES]
-    else:
-        files = [path]
-    stores = [_storage(file) for file in files]
-    matrices, sizes = [], []
-    for place, side in enumerate(_SIDES):
-        store = stores[min(place, len(stores) - 1)]
-        names = (f"P{place + 1}",) if len(stores) == 1 else ("projection_matrix", "P", "p")
-        matrices.append(_matrix(store, names, files[min(place, len(files) - 1)], side))
-        sizes.append(_size(store, files[min(place, len(files) - 1)]))
-    if sizes[0] != sizes[1]:
-        raise RequestError(f"{path}: the left image has {_times(sizes[0])} pixels and the right one {_times(sizes[1])}")
-    said = stores[0].get("unit")
-    if said is not None and (not isinstance(said, str) or said not in METRES):
-        unit_read = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
-        raise RequestError(f"{path}: unit must be m, cm or mm, not {unit_read}")
-    return _checked(path, matrices[0], matrices[1], sizes[0], unit or said or "m")
+    cameras = read_cameras(path, image)
+    pair = cameras.if_rectified() if isinstance(cameras, RawPair) else cameras
+    if pair is None:
+        raise RequestError(
+            f"{path} is of {cameras.program} and says how the cameras were built, not how their images were rectified: rectify "
+            "them with cv2.stereoRectify, and name the P1 and P2 that it returns"
+        )
+    size = pair.size or _size_by_image(path, pair.left, image)
+    return _checked(path, pair.left, pair.right, size, unit or pair.unit or "m")
+
+
+def _size_by_image(path: Path, left: np.ndarray, image: Path | None) -> Size:
+    """Width and height of an image, for a calibration that does not say for which images it is.
+
+    Raises:
+        RequestError: There is no image, or its middle is not where the calibration has it: it was cropped or resized.
+    """
+    if image is None:
+        raise RequestError(f"{path} does not say for which images it is: add image_width and image_height")
+    try:
+        height, width = image_size(image)
+    except OSError as error:
+        raise RequestError(
+            f"{path} does not say for which images it is, and {error}: add image_width and image_height"
+        ) from error
+    if max(abs(left[0, 2] / width - 0.5), abs(left[1, 2] / height - 0.5)) > _OFF_CENTRE:
+        raise RequestError(
+            f"{path} does not say for which images it is, and its principal point ({left[0, 2]:g}, {left[1, 2]:g}) is far from "
+            f"the middle of {readable(image.name)}, {width} x {height}: add image_width and image_height, as it was calibrated"
+        )
+    return width, height
 
 
 def find_calibration(folder: Path) -> Path | None:
-    """Return the file of the calibration in a folder of images; None where there is none."""
-    own = [folder / name for name in ("calibration.yaml", "calibration.yml", "calibration.xml")]
-    return next((path for path in own if path.exists()), None)
+    """Return the file of the calibration in a folder of images, or that of its left camera; None where there is none."""
+    files = files_in(folder)
+    named = named_pair(files)
+    if named is not None:
+        return named
+    sides = (both_sides(file) for file in files if file.suffix.lower() in (".yaml", ".yml", ".ini"))
+    return next((left for left, _ in filter(None, sides)), None)
 
 
 def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:
@@ -96,74 +112,6 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     for name, matrix in (("P1", left), ("P2", right), ("Q", q)):
         store.write(name, matrix)
     write_atomically(path, store.releaseAndGetString())
-
-
-def _beside(path: Path, side: str) -> Path:
-    """The file of one side: ``path``, with the other side's name in it replaced."""
-    other = _SIDES[1 - _SIDES.index(side)]
-    if side in path.stem:
-        file = path
-    elif other in path.stem:
-        file = path.with_stem(path.stem.replace(other, side))
-    else:
-        raise RequestError(
-            f"{path} holds neither P1 and P2 of OpenCV nor one side of a ROS camera_info (left.yaml and right.yaml): "
-            "calibrate the pair, and rectify its images"
-        )
-    if not file.is_file():
-        raise RequestError(f"there is no calibration {file}: name a file of OpenCV, or a folder with left.yaml and right.yaml")
-    return file
-
-
-def _storage(path: Path) -> dict[str, Any]:
-    """Contents of the file, by name."""
-    try:
-        store = parse_storage(read_text(path, _MAX_BYTES))
-    except OSError as error:
-        raise RequestError(f"there is no calibration {path}: {error.strerror or error}") from error
-    except ValueError as error:
-        why = " ".join(str(error).split())
-        raise RequestError(
-            f"{path} is not a calibration: it is neither YAML nor XML as OpenCV and ROS write it ({why})"
-        ) from error
-    if isinstance(store, list):
-        raise RequestError(f"{path} is not a calibration: it holds a list, not names with values such as P1 and P2")
-    if not isinstance(store, dict):
-        raise RequestError(f"{path} is not a calibration: {_NO_STORAGE}")
-    return store
-
-
-def _matrix(store: dict[str, Any], names: tuple[str, ...], path: Path, side: str) -> np.ndarray:
-    """The projection matrix [3, 4] under the first of the names that is there."""
-    value = next((store[name] for name in names if store.get(name) is not None), None)
-    if value is None:
-        raise RequestError(
-            f"{path} has no projection matrix of the {side} camera ({' or '.join(names)}): rectify the pair first"
-        )
-    data = value.get("data") if isinstance(value, dict) else value
-    rows = data if isinstance(data, list) else []
-    numbers = [number for row in rows for number in row] if rows and all(isinstance(row, list) for row in rows) else rows
-    if len(numbers) != 12 or not all(isinstance(number, float) and math.isfinite(number) for number in numbers):
-        raise RequestError(f"{path}: {names[0]} of the {side} camera must be 3 x 4 numbers")
-    return np.array(numbers).reshape(3, 4)
-
-
-def _size(store: dict[str, Any], path: Path) -> tuple[int, int]:
-    """Width and height of the images that were calibrated, pixels."""
-    both = store.get("image_size")
-    for names in (("image_width", "image_height"), ("width", "height")):
-        values = [store.get(name) for name in names]
-        if None not in values:
-            return _whole(values, path, " and ".join(names))
-    if isinstance(both, list) and len(both) == 2:
-        return _whole(both, path, "image_size")
-    raise RequestError(f"{path} does not say for which images it is: add image_width and image_height")
-
-
-def _whole(values: list[Any], path: Path, names: str) -> tuple[int, int]:
-    if not all(isinstance(value, float) and 1 <= value <= _MAX_PIXELS and value.is_integer() for value in values):
-        raise RequestError(f"{path}: {names} must be numbers of pixels, without quotation marks")
-    return int(values[0]), int(values[1])
 
 
 def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, int], unit: str) -> Calibration:

@@ -1,28 +1,28 @@
-"""Folders of stereo pairs: which images belong together, and how far the robot had driven.
+"""Folders of stereo pairs: which images belong together.
 
 left_000.png  right_000.png          or  anything with left and right, or L and R, as a word of its name
-left/000.png  right/000.png          or  the same in two folders, which may also be called L and R
+left/000.png  right/000.png          or  the same in two folders, also called L and R, cam0 and cam1, image_02 and image_03, ...
 disparity_000.pfm, disparity/000.png optional: disparities of the left images, in place of our own
-odometry.csv                         distance_m, or time_s, with the name of the left image (left) or in order
+
+Names that are times need not be the same on both sides: the nearest ones belong together.
 """
 
-import csv
 import dataclasses
-import io
-import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.spreadsheets import unescape_cell
+from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import check_length, readable
-from jaxrl_vis_envs.documents import read_text
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import nearest, seconds_in
 
-_IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
+_IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 SAMPLE = Path(__file__).parents[1] / "sample_row"
 """A short synthetic row that comes with the package."""
-_MAX_ODOMETRY = 8_000_000  # bytes
+_DEPTH = 6  # folders in folders that may hold plots
+_MAX_FOLDERS = 20_000
+_LATEST = 0.005  # s between the two images of a pair: a robot at 0.3 m/s drives 1.5 mm
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
@@ -60,42 +60,103 @@ class PlotFolder:
     pairs: tuple[PairFiles, ...]
 
 
-def find_plots(folder: Path) -> list[PlotFolder]:
-    """The plots in a folder: the folder itself if it holds pairs, else its subfolders that do.
+@dataclasses.dataclass(frozen=True)
+class Patterns:
+    """Patterns of the names of left and right images within the folder of a plot, as ``image_02/*.png``.
+
+    Attributes:
+        left, right: Patterns as of a shell; what the stars stand for is the same for both images of a pair.
+    """
+
+    left: str
+    right: str
+
+
+def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolder]:
+    """The plots in a folder: the folder itself if it holds pairs, else the folders below that do, with the way to them as name.
+
+    Args:
+        folder: The folder.
+        patterns: Patterns of the images' names; None to tell by what the names say.
 
     Raises:
         RequestError: There is no such folder, there are no pairs in it, or two files could be meant.
     """
     if not folder.is_dir():
         raise RequestError(f"there is no folder {folder}: name one with stereo pairs")
-    own = _pairs(folder)
-    folders = {folder.resolve(): own} if own else {}
-    if not own:
-        folders = {path: _pairs(path) for path in sorted(path for path in folder.iterdir() if path.is_dir())}
+    for pattern in () if patterns is None else (patterns.left, patterns.right):
+        if not pattern or PureWindowsPath(pattern).anchor or ".." in PureWindowsPath(pattern).parts:
+            raise RequestError(f"--left and --right are patterns within each plot's folder, as 'left/*.png', not {pattern!r}")
+    own = _pairs(folder, patterns)
+    folders = {folder: own} if own else _below(folder, patterns)
     plots: dict[str, PlotFolder] = {}
     for path, pairs in folders.items():
-        if pairs:
-            check_length(path)
-            name = readable(path.name) or "plot"
-            if name in plots:
-                raise RequestError(f"{readable(str(folder))} holds two plots called {name}: rename one of them")
-            plots[name] = PlotFolder(name, folder if own else path, pairs)
+        check_length(path)
+        way = path.resolve().name if own else path.relative_to(folder).as_posix()
+        name = "/".join(readable(part) for part in way.split("/")) or "plot"
+        if name in plots:
+            raise RequestError(f"{readable(str(folder))} holds two plots called {name}: rename one of them")
+        plots[name] = PlotFolder(name, path, pairs)
     if not plots:
-        raise RequestError(
-            f"{folder} holds no stereo pairs: name images left_000.png and right_000.png, or put them into left/ and right/"
-        )
+        raise RequestError(_no_pairs(folder, patterns))
     return list(plots.values())
+
+
+def _below(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
+    """Pairs of all folders in a folder that hold some; what lies in those is theirs."""
+    found: dict[Path, tuple[PairFiles, ...]] = {}
+    waiting, count = [(path, 1) for path in _folders(folder)], 0
+    while waiting:
+        path, depth = waiting.pop(0)
+        count += 1
+        if count > _MAX_FOLDERS:
+            raise RequestError(f"{readable(str(folder))} holds more than {_MAX_FOLDERS} folders: name one with plots")
+        pairs = _pairs(path, patterns)
+        if pairs:
+            found[path] = pairs
+        elif depth < _DEPTH:
+            waiting = [(inside, depth + 1) for inside in _folders(path)] + waiting
+    return found
+
+
+def _folders(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+
+
+def _no_pairs(folder: Path, patterns: Patterns | None) -> str:
+    """Message that a folder holds no pairs, with what may be the reason."""
+    if patterns is not None:
+        return f"{folder} holds no images for --left {patterns.left!r} and --right {patterns.right!r}, nor do folders in it"
+    for path in _images(folder)[:1]:
+        try:
+            height, width = image_size(path)
+        except OSError:
+            break
+        if width >= 1.95 * height:
+            return (
+                f"{folder} holds no stereo pairs, but {readable(path.name)} is {width} x {height}: if it shows both sides, "
+                "cut it into left_000.png and right_000.png"
+            )
+    return (
+        f"{folder} holds no stereo pairs: name images left_000.png and right_000.png, put them into left/ and right/, or say "
+        "--left 'PATTERN' --right 'PATTERN'"
+    )
 
 
 _Sides = dict[str, dict[str, Path]]
 """Files by the name of their pair and what they are of it: left, right or disparity."""
 
 
-def _pairs(folder: Path) -> tuple[PairFiles, ...]:
-    sides = _by_folder(folder) or {}
-    for name, files in _by_name(folder).items():
-        for side, path in files.items():
-            _put(sides, name, side, path)
+def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
+    if patterns is not None:
+        sides = _by_patterns(folder, patterns)
+    else:
+        sides = _by_folder(folder) or {}
+        for name, files in _by_name(folder).items():
+            for side, path in files.items():
+                _put(sides, name, side, path)
+        _check_rectified(folder, sides)
+    sides = _by_times(folder, sides)
     stored = _find_folder(folder, ("disparity",))
     inside = [] if stored is None else _images(stored, _DISPARITIES)
     for path in [*inside, *_images(folder, _DISPARITIES)]:
@@ -124,19 +185,98 @@ def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
         raise RequestError(f"{both} are both the {what} of pair {name}: rename one of them, or move it elsewhere")
 
 
-def _by_folder(folder: Path) -> _Sides:
-    """Images in two folders, one for each side, by the name of their pair and their side."""
-    nested = {side: _find_folder(folder, (side, side[0])) for side in ("left", "right")}
+def _by_patterns(folder: Path, patterns: Patterns) -> _Sides:
+    """Images whose names match two patterns, by what the stars of the patterns stand for."""
     sides: _Sides = {}
-    if all(nested.values()):
-        for side, path in nested.items():
-            assert path is not None
-            # A folder L that holds whole pairs is a plot of that name, and no side.
-            if any(len(by_side) == 2 for by_side in _by_name(path).values()):
-                return {}
-            for image in _images(path):
-                _put(sides, readable(image.stem), side, image)
+    for side, pattern in (("left", patterns.left), ("right", patterns.right)):
+        stars = _stars(pattern)
+        for path in sorted(folder.glob(pattern)):
+            match = stars.fullmatch(path.relative_to(folder).as_posix())
+            if path.is_file() and not path.name.startswith(".") and match is not None:
+                name = "_".join(part.replace("/", "_").strip("_") for part in match.groups() if part) or "pair"
+                _put(sides, readable(name), side, path)
+    return sides if any("left" in files for files in sides.values()) else {}
+
+
+def _stars(pattern: str) -> re.Pattern[str]:
+    """An expression whose groups are what the stars and question marks of a pattern stand for."""
+    parts = {"**/": r"((?:.*/)?)", "*": r"([^/]*)", "?": r"([^/])"}
+    words = re.split(r"(\*\*/|\*|\?|\[[^\]]*\])", pattern)
+    return re.compile("".join(parts.get(word) or (f"({word})" if word.startswith("[") else re.escape(word)) for word in words))
+
+
+def _check_rectified(folder: Path, sides: _Sides) -> None:
+    """Raise a `RequestError` where names say of some images that they are raw and of others that they are rectified."""
+    kinds = {kind: [name for name in sides if kind in re.split(r"[^a-z]+", name.lower())] for kind in ("raw", "rect")}
+    if all(kinds.values()):
+        raise RequestError(
+            f"{readable(str(folder))} holds raw images ({kinds['raw'][0]}) and rectified ones ({kinds['rect'][0]}): name the "
+            "rectified ones, as --left '*left*rect*' --right '*right*rect*'"
+        )
+
+
+def _by_times(folder: Path, sides: _Sides) -> _Sides:
+    """Images by their pairs where the names of a side's are times: the nearest ones belong together.
+
+    Raises:
+        RequestError: They are so far apart that the robot has moved in between.
+    """
+    alone = {side: [name for name, files in sides.items() if set(files) == {side}] for side in ("left", "right")}
+    times = {side: {name: seconds_in(sides[name][side].stem) for name in names} for side, names in alone.items()}
+    if not all(times.values()) or any(time is None for by_name in times.values() for time in by_name.values()):
+        return sides
+    left, right = ({name: time or 0.0 for name, time in times[side].items()} for side in ("left", "right"))
+    partner = nearest(left, right)
+    apart = sorted(abs(left[name] - right[other]) for name, other in partner.items())
+    if apart and apart[len(apart) // 2] > _LATEST:
+        raise RequestError(
+            f"{readable(str(folder))}: left and right images are {1000 * apart[len(apart) // 2]:.0f} ms apart by their names, "
+            "in which a robot moves on: cameras of a pair must take their images at the same time"
+        )
+    for name, other in partner.items():
+        sides[name] = {**sides[name], **sides.pop(other)}
     return sides
+
+
+def _by_folder(folder: Path) -> _Sides:
+    """Images in two folders, one for each side, by the name of their pair and their side.
+
+    Raises:
+        RequestError: There are several pairs of such folders.
+    """
+    nested = {path: _side_images(path) for path in _folders(folder)}
+    names = {path.name.lower(): path for path, images in nested.items() if images}
+    pairs = [tuple(names[name] for name in both) for both in (("left", "right"), ("l", "r")) if set(both) <= set(names)][:1]
+    if not pairs:
+        found = {
+            (path, names[other.lower()]) if side == "left" else (names[other.lower()], path)
+            for path in names.values()
+            for side, other in partners(path.name)
+            if other.lower() in names
+        }
+        # A folder that holds whole pairs is a plot, and no side.
+        pairs = sorted(pair for pair in found if not any(_whole_pairs(path) for path in pair))
+    if len(pairs) > 1:
+        both = " and of ".join(f"{readable(left.name)} and {readable(right.name)}" for left, right in pairs[:2])
+        raise RequestError(f"{readable(str(folder))} holds pairs of {both}: say which with --left 'PATTERN' --right 'PATTERN'")
+    sides: _Sides = {}
+    for side, path in zip(("left", "right"), pairs[0] if pairs else ()):
+        # A folder L that holds whole pairs is a plot of that name, and no side.
+        if _whole_pairs(path):
+            return {}
+        for image in nested[path]:
+            _put(sides, readable(image.stem), side, image)
+    return sides
+
+
+def _side_images(folder: Path) -> list[Path]:
+    """Images of one camera: those of a folder, or of its folder ``data`` as KITTI has it."""
+    images, inside = _images(folder), folder / "data"
+    return images or (_images(inside) if inside.is_dir() else [])
+
+
+def _whole_pairs(folder: Path) -> bool:
+    return any(len(by_side) == 2 for by_side in _by_name(folder).values())
 
 
 def _by_name(folder: Path) -> _Sides:
@@ -150,7 +290,24 @@ def _by_name(folder: Path) -> _Sides:
         if word is not None:
             name = (stem[: word.start()] + stem[word.end() :]).strip("_-. ") or "pair"
             _put(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
+        else:
+            for side, other in _counted(stem, stems):
+                # What both names share, which is neither the number nor the letter.
+                same = "".join(one for one, two in zip(stem, other) if one == two)
+                _put(sides, same.strip("_-. ") or "pair", side, image)
     return sides
+
+
+def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
+    """The side that an image's name says by a last letter or a camera's number, with its partner's; none if that is not sure.
+
+    im0 and im1 are a pair, and im0 to im7 the images of one camera.
+    """
+    found = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
+    if len(found) != 1:
+        return []
+    back = [other for _, other in partners(found[0][1], files=True) if other.lower() in stems]
+    return found if len(back) == 1 else []
 
 
 def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
@@ -184,103 +341,3 @@ def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
 def _natural(name: str) -> list[tuple[int, int, str]]:
     """Sort 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
-
-
-def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[str, dict[str, float] | None]:
-    """Read the odometry of each plot with `read_odometry`: a dictionary by the plot's name.
-
-    Raises:
-        RequestError: A file cannot be used, or none of them needs the speed.
-    """
-    driven = {plot.name: read_odometry(plot, speed) for plot in plots}
-    if speed is not None and not any(_holds_times_only(plot) for plot in plots):
-        raise RequestError("--speed goes with an odometry.csv that holds times (time_s) and no distance_m: leave it out")
-    return driven
-
-
-def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
-    """Read the distance that the robot had driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
-
-    Args:
-        plot: With ``odometry.csv``.
-        speed: Speed of the robot, m/s: for files that hold times only.
-
-    Raises:
-        RequestError: The file cannot be read, states neither distances nor times, or its rows cannot be matched with the pairs.
-    """
-    path = plot.folder / "odometry.csv"
-    if not path.exists():
-        return None
-    columns, rows = _read_table(path)
-    if "distance_m" not in columns and "time_s" not in columns:
-        raise RequestError(f"{path} needs a column distance_m, or time_s and --speed")
-    if "distance_m" not in columns and speed is None:
-        return None
-    wanted = {readable(pair.left.name): pair.name for pair in plot.pairs if pair.left}
-    where = columns.index("distance_m" if "distance_m" in columns else "time_s")
-    named = columns.index("left") if "left" in columns else None
-    driven: dict[str, float] = {}
-    values: list[float] = []
-    count = 0
-    try:
-        for row in rows:
-            value = float(row[where]) * (1.0 if "distance_m" in columns else speed or 0.0)
-            if not math.isfinite(value):
-                raise ValueError
-            count += 1
-            if named is not None:
-                name = re.split(r"[/\\]", unescape_cell(row[named].strip()) if named < len(row) else "")[-1]
-                if name in wanted:
-                    driven[wanted[name]] = value
-            elif count <= len(plot.pairs):
-                values.append(value)
-    except csv.Error as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error
-    except (ValueError, IndexError) as error:
-        raise RequestError(f"{path} holds something that is no number: distances and times must be finite numbers") from error
-    if named is None and count != len(plot.pairs):
-        raise RequestError(
-            f"{path} has {count} rows for {len(plot.pairs)} pairs, so nobody can tell which is which: "
-            "add a column left with the names of the left images"
-        )
-    return driven if named is not None else {pair.name: value for pair, value in zip(plot.pairs, values)}
-
-
-def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
-    """Say in words what is missing to know the distance that the robot had driven; None if nothing is.
-
-    Args:
-        plot: The plot.
-        driven: Its odometry, from `read_odometry`.
-        pairs: Those of its pairs for which it must be known.
-    """
-    path = plot.folder / "odometry.csv"
-    if driven is None:
-        return f"{path} holds times only: give the robot's speed with --speed" if path.exists() else f"there is no {path}"
-    unknown = [pair.name if pair.left is None else readable(pair.left.name) for pair in pairs if pair.name not in driven]
-    if not unknown:
-        return None
-    others = f" and {len(unknown) - 3} others" if len(unknown) > 3 else ""
-    return f"{path} has no row for {', '.join(unknown[:3])}{others}: its column left must name them"
-
-
-def _holds_times_only(plot: PlotFolder) -> bool:
-    path = plot.folder / "odometry.csv"
-    columns = _read_table(path)[0] if path.exists() else []
-    return "time_s" in columns and "distance_m" not in columns
-
-
-def _read_table(path: Path) -> tuple[list[str], Iterator[list[str]]]:
-    """The columns of a CSV file, and its rows, which raise a `csv.Error` where they are none.
-
-    Raises:
-        RequestError: It cannot be read.
-    """
-    try:
-        # Spreadsheets write a mark of the byte order before the first column's name.
-        reader = csv.reader(io.StringIO(read_text(path, _MAX_ODOMETRY), newline=""), skipinitialspace=True)
-        return [unescape_cell(name.strip()) for name in next(reader, [])], (row for row in reader if row)
-    except OSError as error:
-        raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
-    except (csv.Error, ValueError) as error:
-        raise RequestError(f"{path} is no table: save it as CSV in UTF-8 ({error})") from error

@@ -8,6 +8,8 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _PFM = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
+_PNM = re.compile(rb"P[56](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s")
+_BITMAPS = (40, 52, 56, 64, 108, 124)  # bytes of a bitmap's second header
 _FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of JPEG after which the size stands
 _ALONE = {0x01, *range(0xD0, 0xD9)}  # those without a length
 _WIDTH, _HEIGHT, _TILE_WIDTH, _TILE_HEIGHT = 256, 257, 322, 323  # tags of TIFF
@@ -15,7 +17,7 @@ _FINEST_TILES = 1024  # pixels along the sides of tiles that are larger than the
 
 
 def size_in(file: BinaryIO) -> tuple[int, int] | None:
-    """Height and width of the image in a file of PNG, JPEG, TIFF or PFM; None where it is none of these, or damaged.
+    """Height and width of the image in a file of PNG, JPEG, TIFF, BMP, PGM, PPM or PFM; None where it is none, or damaged.
 
     Args:
         file: At its beginning, able to seek.
@@ -29,7 +31,10 @@ def size_in(file: BinaryIO) -> tuple[int, int] | None:
         return _jpeg(file.read())
     if begin[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         return _tiff(file)
-    match = _PFM.match(begin)
+    if begin.startswith(b"BM") and len(begin) >= 26 and int.from_bytes(begin[14:18], "little") in _BITMAPS:
+        width, height = (int.from_bytes(begin[place : place + 4], "little", signed=True) for place in (18, 22))
+        return (abs(height), width) if width > 0 and height else None  # lines may go upwards
+    match = _PFM.match(begin) or _PNM.match(begin)
     return (int(match[2]), int(match[1])) if match and int(match[1]) and int(match[2]) else None
 
 

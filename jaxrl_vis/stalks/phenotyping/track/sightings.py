@@ -9,7 +9,7 @@ from typing import Any, get_args, get_origin
 import cv2
 import numpy as np
 
-from jaxrl_vis import fields
+from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground

@@ -159,13 +159,13 @@ def _example(
     return Example(np.asarray(reduced), padded, padded_kinds, snips, masks)
 
 
-def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
+def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Iterator[Example]:
     """Examples of a folder of annotated images; see `read_annotations`. Its calibration, if it has one, gives their scale.
 
     Raises:
         RequestError: There are no annotations, or one is wrong; or an image is missing, or of another size than they say.
     """
-    data = read_annotations(folder)
+    data = read_annotations(folder, labels)
     density_of = _densities(folder, data["images"])
     of_image: dict[int, list[dict[str, Any]]] = {}
     for annotation in data["annotations"]:
@@ -183,13 +183,32 @@ def annotated_examples(folder: Path, settings: Settings) -> Iterator[Example]:
                 f"{path} has {there[1]} x {there[0]} pixels, but {about['source']} is for "
                 f"{size[1]} x {size[0]}: save the image at the size at which it was annotated"
             )
-        annotations = of_image.get(about["id"], [])
+        every = of_image.get(about["id"], [])
+        annotations = [annotation for annotation in every if not annotation.get("iscrowd")]
         stalks = np.array([_annotated_stalk(annotation, size) for annotation in annotations], np.float32).reshape(-1, 6)
-        kinds = np.full(len(annotations), STALK, np.int32)
+        strips = _strips([annotation for annotation in every if annotation.get("iscrowd")], stalks)
+        kinds = np.array([STALK] * len(stalks) + [UNCLEAR] * len(strips), np.int32)
+        stalks = np.concatenate([stalks, strips])
         rng = np.random.default_rng([number, 18])
         yield _example(
             image, density_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
         )
+
+
+def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
+    """Strips [N, 6] float32, as wide as the image's stalks, that cover regions of stalks that nobody told apart.
+
+    Boxes are compared with strips, so that one of a region as a whole would keep no box in it from counting as a mistake.
+    """
+    strips = []
+    for crowd in crowds:
+        left, top, wide, tall = crowd["bbox"]
+        typical = float(np.median(stalks[:, 2] - stalks[:, 0])) if len(stalks) else tall / 8
+        count = int(np.clip(round(2 * wide / max(typical, 1.0)) - 1, 1, MAX_STALKS // 2))
+        narrow = 2 * wide / (count + 1)  # each overlaps the next by half
+        begins = left + np.arange(count) * narrow / 2
+        strips += [[begin, top, begin + narrow, top + tall, begin + narrow / 2, begin + narrow / 2] for begin in begins]
+    return np.array(strips, np.float32).reshape(-1, 6)
 
 
 def _own_masks(
@@ -222,7 +241,7 @@ def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | 
     return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
 
 
-def settings_for(folder: Path, settings: Settings) -> Settings:
+def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
     """Settings whose anchors are as large as the boxes of a folder's annotations.
 
     What was learned from images of unknown cameras is looked for in images that are reduced as those were.
@@ -230,11 +249,15 @@ def settings_for(folder: Path, settings: Settings) -> Settings:
     Raises:
         RequestError: The annotations or the calibration of the folder cannot be read.
     """
-    data = read_annotations(folder)
+    data = read_annotations(folder, labels)
     densities = _densities(folder, data["images"])
     factors = {image["id"]: resize_factor(image["width"], settings, densities[image["id"]]) for image in data["images"]}
     sizes = np.array(
-        [np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]] for annotation in data["annotations"]]
+        [
+            np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]]
+            for annotation in data["annotations"]
+            if not annotation.get("iscrowd")
+        ]
     )
     return dataclasses.replace(
         settings,
@@ -244,9 +267,10 @@ def settings_for(folder: Path, settings: Settings) -> Settings:
     )
 
 
-def any_outlined(folder: Path) -> bool:
-    """Return True if any annotation of a folder has more than a box."""
-    return any(annotation["segmentation"] for annotation in read_annotations(folder)["annotations"])
+def any_outlined(folder: Path, labels: tuple[str, ...] = ()) -> bool:
+    """Return True if any stalk that a folder annotates has more than a box."""
+    annotations = read_annotations(folder, labels)["annotations"]
+    return any(annotation["segmentation"] and not annotation.get("iscrowd") for annotation in annotations)
 
 
 def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:

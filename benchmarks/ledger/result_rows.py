@@ -1,4 +1,4 @@
-"""Rows of the README's tables: the records that they show and their wording. `readme_tables` writes them."""
+"""Rows of the tables of docs/lab/results.md: the records that they show and their wording. `result_tables` writes them."""
 
 import dataclasses
 from typing import Any
@@ -103,7 +103,7 @@ SPEED = (
     _environment("VisualFingerTurn", ", 21 physics steps of 10 ms each, 3 stacked images"),
     _environment("VisualSawyerReach", gpu="H200"),
     Speed(
-        "`bench render --scene fetch_reach`: images of new poses ([more](docs/renderer.md))",
+        "`bench render --scene fetch_reach`: images of new poses ([more](renderer_speed.md))",
         {
             "H200": (_scene(64, "rgbd"), _scene(64, "depth"), _peer("render/peer_warp", "MuJoCo Warp", 64)),
             "2 CPU cores": (_scene(32, "rgbd"), _scene(64, "rgbd"), _peer("render/peer_mujoco", "`mujoco.Renderer`", 64)),
@@ -139,7 +139,7 @@ SPEED = (
     ),
     Speed(
         "`python -m benchmarks.peers.torch`: the same gradient steps in PyTorch, compiled with max-autotune "
-        "([more](docs/lab/gradient_step.md))",
+        "([more](gradient_step.md))",
         {
             "H100": (
                 _peer_update("paper", "{ours_over_peer} times PyTorch's {value} updates/s (`paper`)"),

@@ -1,9 +1,8 @@
-"""Tables of the README, written from the records: the rows are declared in `readme_rows`, the figures are not.
+"""Tables of docs/lab/results.md, written from the records: the rows are declared in `result_rows`, the figures are not.
 
 A figure without a record reads `MISSING`, and `make stale` lists it.
 """
 
-import dataclasses
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,13 +10,14 @@ from typing import Any
 
 from benchmarks.ledger import evidence
 from benchmarks.ledger.evidence import Evidence
-from benchmarks.ledger.readme_rows import DEVICES, LEARNING, SPEED, Figure, Learning
 from benchmarks.ledger.records import read_all
+from benchmarks.ledger.result_rows import DEVICES, LEARNING, SPEED, Figure, Learning
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.run.command import training_command
 
+PAGE = "docs/lab/results.md"
 MISSING = "not measured yet"
 
 
@@ -95,13 +95,12 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
         if run is None:
             return []
         made_with = config_from_dict(run.record["config"])
-        no_matter = (*_NEUTRAL, *_LOGARITHMIC) if config.weighting in ("none", "sum") else _NEUTRAL
-        made_with = made_with.replace(**{field: getattr(config, field) for field in no_matter})
+        no_matter = (*_NEUTRAL, *_LOGARITHMIC) if config.auxiliary.weighting in ("none", "sum") else _NEUTRAL
+        made_with = made_with.replace(**{name: config.value(name) for name in no_matter})
         if made_with != config:
-            names = [field.name for field in dataclasses.fields(config)]
-            differing = [field for field in names if getattr(made_with, field) != getattr(config, field)]
+            differing = [name for name, value in config.flat().items() if made_with.value(name) != value]
             raise RequestError(
-                f"evidence {name} was made by `{run.record['command']}`, and the README says `{training_command(config)}`, "
+                f"evidence {name} was made by `{run.record['command']}`, and the table says `{training_command(config)}`, "
                 f"which has other {', '.join(differing)}: train again, then python -m benchmarks.ledger keep"
             )
         runs.append(run)

@@ -1,12 +1,15 @@
 """Validation of dataclass fields against their annotations, for values read from JSON or from a command line.
 
 Annotations may be bool, int, float, str, Path, a Literal of words, a word that is annotated with `Names`, an optional one of
-these, or a tuple of any length.
+these, or a tuple of any length. Numbers may be annotated with `Bounds`.
 """
 
 import dataclasses
+import functools
+import itertools
 import math
 import numbers
+import operator
 import types
 import typing
 from collections.abc import Sequence
@@ -31,9 +34,84 @@ class Names:
     known: tuple[str, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """Range of a number, or of every number of a tuple.
+
+    Attributes:
+        low: Smallest value.
+        high: Largest value; None: unbounded.
+        exclusive: Exclude ``low`` itself.
+    """
+
+    low: float
+    high: float | None = None
+    exclusive: bool = False
+
+    def check(self, label: str, value: Any) -> None:
+        """Check a value; None is in range.
+
+        Raises:
+            RequestError: The value is out of range. The message begins with ``label``.
+        """
+        if isinstance(value, tuple):
+            if any(self._refuses(item) for item in value):
+                raise RequestError(f"{label} must all {self._rule(min(value))}, not {' '.join(map(str, value))}")
+        elif value is not None and self._refuses(value):
+            raise RequestError(f"{label} {self._must(value)}, not {value}")
+
+    def _refuses(self, value: float) -> bool:
+        is_low = value <= self.low if self.exclusive else value < self.low
+        return is_low or (self.high is not None and value > self.high)
+
+    def _must(self, value: float) -> str:
+        if (self.low, self.high) == (0.0, 1.0):
+            return "is a share and must lie in [0, 1]"
+        return f"must {self._rule(value)}"
+
+    def _rule(self, value: float) -> str:
+        if self.high is not None and value > self.high:
+            return f"be at most {self.high:g}" if isinstance(self.high, float) else f"be at most {self.high}"
+        return "be positive" if self.exclusive and self.low == 0.0 else f"be at least {self.low:g}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """Field of a dataclass, or of a group of fields in it.
+
+    Attributes:
+        name: Name of the field.
+        hint: Plain annotation, as `check` and `read` take it.
+        extras: Metadata of `typing.Annotated`.
+        default: Default value; `dataclasses.MISSING` without one.
+        record: Dataclass in which it is declared.
+        group: Field of the outer dataclass that holds ``record``; empty for a field of the outer dataclass itself.
+    """
+
+    name: str
+    hint: Any
+    extras: tuple[Any, ...]
+    default: Any
+    record: type
+    group: str = ""
+
+
+def describe(record: type, group: str = "") -> list[Field]:
+    """List the fields of a dataclass. A field that is a dataclass itself is a group: its fields stand for it."""
+    annotated = typing.get_type_hints(record, include_extras=True)
+    described = []
+    for field in dataclasses.fields(record):
+        hint = annotated[field.name]
+        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+            described += describe(hint, field.name)
+        else:
+            described.append(Field(field.name, _plain(hint), _extras(hint), field.default, record, group))
+    return described
+
+
 def hints(record: type) -> dict[str, Any]:
-    """Field name -> annotation, without what `typing.Annotated` adds, but for `Names`."""
-    return {name: _plain(hint) for name, hint in typing.get_type_hints(record, include_extras=True).items()}
+    """Field name -> annotation, without what `typing.Annotated` adds, but for `Names`; groups of fields are flattened."""
+    return {field.name: field.hint for field in describe(record)}
 
 
 def _plain(hint: Any) -> Any:
@@ -42,7 +120,29 @@ def _plain(hint: Any) -> Any:
         return Annotated[str, names] if names else _plain(typing.get_args(hint)[0])
     if typing.get_origin(hint) is tuple and typing.get_args(hint)[1:] == (...,):
         return tuple[_plain(typing.get_args(hint)[0]), ...]
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return functools.reduce(operator.or_, map(_plain, typing.get_args(hint)))
     return hint
+
+
+def _extras(hint: Any) -> tuple[Any, ...]:
+    """Collect the metadata of an annotation, of an optional value and of a tuple's items, too."""
+    inner = typing.get_args(hint)[:1] if typing.get_origin(hint) is Annotated else typing.get_args(hint)
+    if typing.get_origin(hint) is Literal:
+        return ()
+    nested = itertools.chain.from_iterable(_extras(part) for part in inner)
+    return (*getattr(hint, "__metadata__", ()), *nested)
+
+
+def check_bounds(field: Field, value: Any) -> None:
+    """Check a value of the right type against its field's `Bounds`.
+
+    Raises:
+        RequestError: It is out of range. The message names the field.
+    """
+    for extra in field.extras:
+        if isinstance(extra, Bounds):
+            extra.check(field.name, value)
 
 
 def _names(hint: Any) -> Names | None:

@@ -3,10 +3,10 @@
 import dataclasses
 import math
 
-from jaxrl_vis.config import Config
+from jaxrl_vis.config.groups import Config
+from jaxrl_vis.config.methods import METHODS, Method
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.plugins import call, find
-from jaxrl_vis.methods import METHODS, Method
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,21 +46,21 @@ def resolve(config: Config, horizon: int) -> Resolved:
     Raises:
         RequestError: The discount or the filter threshold lies outside its range, or there is no such method.
     """
-    method = find("method", config.method, METHODS, config.env_folder)
-    method = call("method", config.method, method, of=Method)
-    discount = 1.0 - 1.0 / horizon if config.discount is None else config.discount
+    method = find("method", config.reward.method, METHODS, config.environment.env_folder)
+    method = call("method", config.reward.method, method, of=Method)
+    discount = 1.0 - 1.0 / horizon if config.ddpg.discount is None else config.ddpg.discount
     if not 0.0 <= discount < 1.0:
         raise RequestError(f"discount must lie in [0, 1), not {discount}; leave it out for 1 - 1/horizon")
-    positive = method.reward_positive if config.reward_positive is None else config.reward_positive
-    negative = method.reward_negative if config.reward_negative is None else config.reward_negative
+    positive = method.reward_positive if config.reward.reward_positive is None else config.reward.reward_positive
+    negative = method.reward_negative if config.reward.reward_negative is None else config.reward.reward_negative
     if positive <= negative:
         raise RequestError(f"reward_positive ({positive}) must be larger than reward_negative ({negative})")
     best, worst = positive / (1.0 - discount), negative / (1.0 - discount)
     low = negative + discount * best
     threshold = math.inf
     if method.filter:
-        threshold = (low + best) / 2 if config.filter_threshold is None else config.filter_threshold
-    if config.filter_threshold is not None:
+        threshold = (low + best) / 2 if config.goals.filter_threshold is None else config.goals.filter_threshold
+    if config.goals.filter_threshold is not None:
         if not method.filter:
             filtering = " or ".join(name for name, other in METHODS.items() if other.filter)
             raise RequestError(f"filter_threshold needs --method {filtering}")
@@ -72,9 +72,11 @@ def resolve(config: Config, horizon: int) -> Resolved:
         discount=discount,
         reward_positive=positive,
         reward_negative=negative,
-        balance_probability=method.balance_probability if config.balance_probability is None else config.balance_probability,
+        balance_probability=method.balance_probability
+        if config.goals.balance_probability is None
+        else config.goals.balance_probability,
         filter_threshold=threshold,
         critic_output_bias=worst if threshold <= 0.0 else 0.0,
         target_minimum=worst,
-        target_maximum=best if config.clip_targets_above else math.inf,
+        target_maximum=best if config.ddpg.clip_targets_above else math.inf,
     )

@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from jaxrl_vis.fields import Names
+from jaxrl_vis.config.fields import Names
 
 RewardName = Literal["oracle", "autoencoder", "indicator"]
 RewardFunction = Callable[..., Any]

@@ -1,0 +1,114 @@
+"""Five figures of the README beside what one would use instead, written from the records."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.claims import ol_aux
+from benchmarks.ledger import evidence
+from benchmarks.ledger.records import RESULTS, read_all
+from benchmarks.ledger.result_rows import DEVICES, Figure
+from benchmarks.ledger.result_tables import MISSING, find, short
+from jaxrl_vis.report.learning import curve, steps_to
+from jaxrl_vis.studies.figures.authors import released_curves
+
+_LEARNT = 0.9  # success whose environment steps are compared
+
+
+@dataclasses.dataclass(frozen=True)
+class Rate:
+    """A row: our rate and a peer's in one call.
+
+    Attributes:
+        label: Text of the first column.
+        ours: Name of our record.
+        peer: Name of the peer's record. Of several variants, the one that is hardest for us counts.
+        config: Entries that the configurations of both must have.
+        device: Column of the speed table.
+        unit: Unit of the rate, without the second.
+        other: Name of the peer.
+    """
+
+    label: str
+    ours: str
+    peer: str
+    config: dict[str, Any]
+    device: str
+    unit: str
+    other: str
+
+
+_IMAGE = {"image_size": 64, "pixels": "rgbd"}
+
+RATES = (
+    Rate(
+        "Images of VisualFetchReach, 64x64 RGB-D, on an H200",
+        *("render/scene", "render/peer_warp", {"scene": "fetch_reach", **_IMAGE}, "H200", "images", "MuJoCo Warp"),
+    ),
+    Rate(
+        "Images of MuJoCo Warp's own scene of 127 geoms, likewise",
+        *("render/scene", "render/peer_warp", {"scene": "primitives", **_IMAGE}, "H200", "images", "MuJoCo Warp"),
+    ),
+    Rate(
+        "Images of VisualFetchReach on two CPU cores",
+        *("render/scene", "render/peer_mujoco", {"scene": "fetch_reach", **_IMAGE}, "2 CPU cores", "images"),
+        "`mujoco.Renderer`",
+    ),
+    Rate(
+        "DDPG on batches of 512 such images, `paper`, on an H100",
+        *("update/gradient_steps", "update/peer_torch", {"preset": "paper", **_IMAGE}, "H100", "updates"),
+        "PyTorch, compiled",
+    ),
+)
+
+
+def _rate_cells(row: Rate, records: list[dict[str, Any]]) -> tuple[str, str, str] | None:
+    """Format our rate, the peer's and their ratio; None without records."""
+    device = DEVICES[row.device]
+    theirs = find(Figure(row.peer, row.config, "", least="ours_over_peer"), device, records)
+    if theirs is None:
+        return None
+    same = {name: value for name, value in theirs["config"].items() if name != "images"}  # batches may differ
+    ours = find(Figure(row.ours, same, ""), device, records)
+    if ours is None:
+        return None
+    rates = [f"{short(record['value'])} {row.unit}/s" for record in (ours, theirs)]
+    return rates[0], f"{row.other}: {rates[1]}", f"{theirs['details']['ours_over_peer']:.3g} times"
+
+
+def _learning_cells(results: Path) -> tuple[str, str, str] | None:
+    """Format environment steps to a success: ours, those of the authors' release and their ratio; None without records."""
+    run = evidence.load("fetch_reach_oracle", results)
+    if run is None:
+        return None
+    ours = steps_to(curve(run.rows, "eval/success"), _LEARNT)
+    repetition = ol_aux.run(ol_aux.FETCH, "ol_aux_5")
+    repeated = repetition.steps_to(_LEARNT)
+    theirs = steps_to(released_curves()[ol_aux.FETCH, "ol_aux_5"], _LEARNT)
+    if ours is None or repeated is None or theirs is None:
+        return None
+    fast, paper = (_steps_per_update(rows) for rows in (run.rows, repetition.rows))
+    here = f"{short(ours)} steps with `fast`, {fast} an update; {short(repeated)} with the authors' settings, {paper} an update"
+    return here, f"the authors' release, OL-AUX-5: {short(theirs)} steps", f"{theirs / ours:.3g} times fewer"
+
+
+def _steps_per_update(rows: Sequence[dict[str, Any]]) -> int:
+    last = max(rows, key=lambda row: row["env_steps"])
+    return round(last["env_steps"] / last["updates"])
+
+
+def comparison_table(results: Path = RESULTS) -> str:
+    """Write the table, as Markdown."""
+    return "\n".join(_lines(results))
+
+
+def _lines(results: Path) -> Iterator[str]:
+    records = [record for _, record in read_all(results) if record["name"] != evidence.NAME]
+    rows = {row.label: _rate_cells(row, records) for row in RATES}
+    label = f"VisualFetchReach learnt from images to {100 * _LEARNT:.0f} % success"
+    rows[label] = _learning_cells(results)
+    yield "| what | here | instead | ratio |"
+    yield "|---|---|---|---|"
+    for label, cells in rows.items():
+        yield f"| {label} | {' | '.join(cells or (MISSING, '', ''))} |"

@@ -1,0 +1,47 @@
+"""Configuration of a training run: options in groups, presets and checks.
+
+    fields       annotations of options: types, bounds, names
+    methods      reward methods, and names of the parts of a learner
+    groups       the options, with their defaults and help: `Config`
+    presets      values of each preset, and of tasks in it
+    validation   checks of a whole configuration
+
+Imports no JAX.
+"""
+
+from jaxrl_vis.config.groups import (
+    HOST,
+    OPTIONS,
+    RESUMABLE,
+    UNMEASURED,
+    Config,
+    Mark,
+    Pixels,
+    changes,
+    config_from_dict,
+    data_devices,
+    marked,
+    of_weightings,
+)
+from jaxrl_vis.config.presets import PRESETS, TASKS, general_values, preset
+from jaxrl_vis.config.validation import validate
+
+__all__ = [
+    "HOST",
+    "OPTIONS",
+    "PRESETS",
+    "RESUMABLE",
+    "TASKS",
+    "UNMEASURED",
+    "Config",
+    "Mark",
+    "Pixels",
+    "changes",
+    "config_from_dict",
+    "data_devices",
+    "general_values",
+    "marked",
+    "of_weightings",
+    "preset",
+    "validate",
+]

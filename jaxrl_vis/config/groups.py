@@ -1,0 +1,362 @@
+"""Configuration of a training run: frozen dataclasses in groups. Names of fields are unique across groups, and are the options
+of the command line; bounds and scope of a field stand in its annotation, its help in the docstring below it.
+
+Imports no JAX, so that the command line can print its help at once.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from jaxrl_vis.config import fields
+from jaxrl_vis.config.fields import Bounds
+from jaxrl_vis.config.methods import AlgorithmName, AuxTaskName, MethodName, WeightingName
+from jaxrl_vis.errors import RequestError, nearest
+
+# Values that a field allows, for checks, the command line and its help.
+Pixels = Literal["rgbd", "rgb", "depth"]
+Randomized = Literal["camera", "lights", "colours", "dynamics"]
+ComputeDtype = Literal["auto", "float32", "bfloat16"]
+
+LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without bound
+Count = Annotated[int, Bounds(1, LARGEST_COUNT)]
+Share = Annotated[float, Bounds(0.0, 1.0)]
+Positive = Annotated[float, Bounds(0.0, exclusive=True)]
+NotNegative = Annotated[float, Bounds(0.0)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Mark:
+    """Property of a field, for its annotation; `marked` lists the fields that have it.
+
+    Attributes:
+        meaning: Its meaning.
+    """
+
+    meaning: str
+
+
+HOST = Mark("only the host reads it: no compiled program depends on it")
+RESUMABLE = Mark("may change when a run is resumed: it has no effect on learning")
+UNMEASURED = Mark("has no effect on the metrics up to the same number of environment steps")
+DIVIDED = Mark("must be divisible by the number of devices that share a learner")
+NEEDS_STATES = Mark("if changed, rewards must be computed from true states, as the oracle's are")
+FALSE_REWARD = Mark("fraction of rewards that are false")
+
+
+@dataclasses.dataclass(frozen=True)
+class OfWeighting:
+    """Property of a field that is read only if losses are weighted, or have logarithms.
+
+    Attributes:
+        names: Weightings that the field is an option of; empty for any.
+    """
+
+    names: tuple[str, ...] = ()
+
+
+OL_AUX = OfWeighting(("ol_aux", "ol_aux_ablation"))
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """Seeds, devices and schedule. Counts are per seed; durations are in control steps unless a unit is given."""
+
+    preset: Annotated[str, RESUMABLE, UNMEASURED] = "fast"
+    """Preset that this configuration was derived from; for the record only."""
+    algorithm: AlgorithmName = "ddpg"
+    """Learning algorithm; module:Name for your own."""
+    seed: Annotated[int, Bounds(0, None)] = 0
+    """First seed."""
+    seeds: Count = 1
+    """Number of seeds trained in parallel in one program: seed, seed + 1, ..."""
+    devices: Annotated[Count, RESUMABLE] = 1
+    """Number of devices. Multiple seeds are spread over them; with a single seed, its batches and environments are."""
+    data_devices: Annotated[Count | None, RESUMABLE] = None
+    """Number of devices that share one learner: its environments, replay and batches. None: 1 with several seeds, all devices
+    with a single seed."""
+    num_envs: Annotated[Count, DIVIDED] = 100
+    """Environments in a rollout; each plays one episode per iteration."""
+    env_steps: Annotated[int, Bounds(1, None), HOST, RESUMABLE, UNMEASURED] = 200_000
+    """Environment steps to train for; rounded up to whole iterations of num_envs * horizon."""
+    updates_per_iteration: Count = 200
+    """Gradient steps after each rollout."""
+    batch_size: Annotated[Count, DIVIDED] = 512
+    """Transitions in a gradient step."""
+    replay_transitions: Count = 200_000
+    """Replay capacity in transitions; rounded up to whole rollouts."""
+    eval_interval: Annotated[Count, HOST, RESUMABLE] = 2
+    """Iterations between evaluations; a last one runs at the end of training."""
+    eval_episodes: Annotated[Count, RESUMABLE, DIVIDED] = 1000
+    """Number of episodes of an evaluation, always the same ones."""
+    checkpoint_interval: Annotated[Count, HOST, RESUMABLE, UNMEASURED] = 5
+    """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
+    full_checkpoint_interval: Annotated[int, Bounds(0, LARGEST_COUNT), HOST, RESUMABLE, UNMEASURED] = 0
+    """Iterations between full checkpoints (with the replay, for an exact resume). 0: only when a run is interrupted."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvironmentOptions:
+    """Task, its observations, and properties that vary between episodes."""
+
+    env: str = "VisualFetchReach"
+    """Environment: a name that `jaxrl-vis envs` lists, or module:Name for your own."""
+    env_folder: Annotated[str | None, RESUMABLE, UNMEASURED] = None
+    """Folder from which module:Name is imported; stored with the run. None: the current folder, or Python's module search
+    path."""
+    env_options: tuple[str, ...] = ()
+    """Further options of the environment, as name=value; docs/tasks.md lists those that restore a release's behaviour."""
+    pixels: Pixels = "rgbd"
+    """Channels of the image."""
+    image_size: Count = 64
+    """Height and width of the image, in pixels."""
+    frame_stack: Count | None = None
+    """Number of latest images stacked in an observation. None: the environment's own number."""
+    randomize: tuple[Randomized, ...] = ()
+    """Properties randomised between episodes, in training and in evaluation."""
+    randomize_strength: Positive = 1.0
+    """Strength of the randomisation, in multiples of the typical ranges (`jaxrl_vis_envs.randomization.KINDS`)."""
+    observation_noise: NotNegative = 0.0
+    """Standard deviation of the camera noise, in the observation's unit (grey levels for images); drawn anew for every
+    frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GoalOptions:
+    """Goal relabelling, balancing and filtering (thesis, section 5.1.4)."""
+
+    relabel_probability: Share = 0.9
+    """p1: fraction of samples whose goal is replaced by an observation from the same episode."""
+    balance_probability: Share | None = None
+    """p2: fraction of those whose goal is the next observation, a certain positive. None: 0.5 for balancing methods, else 0."""
+    filter_threshold: float | None = None
+    """q0: negatives with Q above it are dropped as false. None: the middle of its valid range, for filtering methods."""
+    trivial_goals: Annotated[Share, NEEDS_STATES] = 1.0
+    """Fraction kept of relabelled goals that are already reached before the action; the rest are replaced by observations from
+    other episodes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardOptions:
+    """Source and values of rewards."""
+
+    method: MethodName = "oracle"
+    """Source of the rewards: the true state (oracle), similarity in the latent space of an autoencoder trained alongside, or
+    equality of observations (indicator), without or with balancing and filtering; module:Name for your own."""
+    reward_positive: float | None = None
+    """R+. None: 0 for the oracle, 1 for other methods."""
+    reward_negative: float | None = None
+    """R-. None: 0 for the autoencoder, -1 for other methods."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DDPGOptions:
+    """Losses, targets and exploration of DDPG."""
+
+    discount: float | None = None
+    """gamma. None: 1 - 1/horizon."""
+    actor_learning_rate: Positive = 1e-3
+    """Adam step size of the actor."""
+    critic_learning_rate: Positive = 1e-3
+    """Adam step size of the critic."""
+    target_decay: Share = 0.99
+    """Decay of a target network: the fraction of its parameters kept at each of its updates."""
+    target_update_interval: Count = 1
+    """Gradient steps between target updates."""
+    actor_interval: Count = 1
+    """Critic gradient steps per actor gradient step; divides updates_per_iteration."""
+    action_penalty: NotNegative = 1.0
+    """Weight of the mean squared action in the actor's loss."""
+    actor_log: Annotated[Literal["value", "loss"], OfWeighting()] = "value"
+    """Quantity whose logarithm the actor minimises, with log weightings. value: log(Q_max - Q) plus the action penalty, as in
+    the authors' release, so the penalty's relative weight grows with Q_max - Q. loss: log(Q_max - Q + penalty), which keeps
+    their ratio."""
+    clip_targets_above: bool = True
+    """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
+    random_action_probability: Share = 0.3
+    """Exploration: fraction of actions drawn uniformly."""
+    action_noise: NotNegative = 0.2
+    """Exploration: standard deviation of the Gaussian noise added to the other actions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AuxiliaryOptions:
+    """Auxiliary losses and their weighting (thesis, section 5.2; docs/auxiliary_losses.md)."""
+
+    aux_tasks: tuple[AuxTaskName, ...] = ()
+    """Auxiliary tasks that the encoders are also trained on; module:Name for your own."""
+    weighting: WeightingName = "none"
+    """Weighting of the auxiliary losses; module:Name for your own."""
+    weighting_interval: Annotated[Count, OL_AUX] = 5
+    """N of OL-AUX: gradient steps between updates of the weights; divides updates_per_iteration."""
+    weighting_beta: Annotated[NotNegative | None, OL_AUX] = None
+    """beta of OL-AUX: step size of the weights, in multiples of critic_learning_rate. None: 5 N."""
+    weighting_fixed: Annotated[float, OfWeighting(("fixed",))] = 1.0
+    """Weight of every auxiliary loss, for weighting fixed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkOptions:
+    """Sizes, encoders and precision of the networks, and normalisation of their inputs."""
+
+    encoder_filters: tuple[Count, ...] = (16, 32, 64, 64)
+    """Output channels of the 2x2 stride-2 convolutions."""
+    latent_size: Count = 512
+    """Size of an encoded image."""
+    hidden_sizes: tuple[Count, ...] = (256, 256, 256)
+    """Hidden layers of the actor's and the critic's heads."""
+    encoders: Literal["separate", "shared"] = "separate"
+    """Give the actor a separate encoder, or let it act on the latents of the critic's encoder, which it cannot change."""
+    target_encoder: bool = True
+    """Give target networks slowly updated encoders of their own; if false, the target heads read the latents of the online
+    encoders."""
+    random_shift: Annotated[int, Bounds(0, LARGEST_COUNT)] = 0
+    """Random shift augmentation: largest shift in pixels per axis, the same for the three images of a transition (Kostrikov et
+    al., 2020)."""
+    compute_dtype: ComputeDtype = "auto"
+    """Precision of the networks' arithmetic; parameters and losses are float32. auto: bfloat16 on accelerators."""
+    normalizer_floor: Positive = 0.01
+    """Smallest standard deviation that an observation is divided by, in the observation's unit (grey levels for images)."""
+    normalizer_clip: Positive = 5.0
+    """Bound to which normalised observations are clipped: plus and minus this."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyOptions:
+    """Departures that only studies make: of the authors' release, in replay and targets, and errors of rewards on purpose."""
+
+    replay_mean_age: Count | None = None
+    """Mean age of sampled transitions, in transitions: older ones become rarer, as if new episodes replaced random ones. None:
+    uniform sampling."""
+    n_step: Annotated[Count, NEEDS_STATES] = 1
+    """Number of rewards summed in a target before it bootstraps. More than 1 needs true states and a method without a
+    filter."""
+    reward_noise: Annotated[NotNegative, NEEDS_STATES] = 0.0
+    """Standard deviation of the noise on the state from which the oracle's reward is computed, in the unit of the state."""
+    reward_false_positives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
+    """Fraction of the oracle's negatives that are rewarded as positives."""
+    reward_false_negatives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
+    """Fraction of the oracle's positives that are rewarded as negatives."""
+    reward_clutter: Share = 1.0
+    """Fraction of the workspace, from the low end of the state's first coordinate, to which these false rewards are
+    confined."""
+    normalizers: Literal["shared", "separate"] = "shared"
+    """Statistics that normalise goals: those of all observations (shared), or, as in the authors' release, their own
+    (separate)."""
+    normalizer_source: Literal["rollouts", "relabelled"] = "rollouts"
+    """Source of the normalisation statistics: all observations of a rollout, or, as in the authors' release, relabelled
+    transitions."""
+    weighting_main_grad: Annotated[Literal["main", "total"], OL_AUX] = "main"
+    """Gradient with which OL-AUX compares those of the auxiliary losses: that of the main loss, or, as in the authors' release,
+    that of the total loss."""
+    weighting_window: Annotated[Count, OL_AUX] = 1
+    """Gradient steps over which OL-AUX averages gradients before it compares them; 4 in the authors' release."""
+    weighting_log: Annotated[bool, OfWeighting(("cosine",))] = False
+    """Minimise the logarithms of the losses, with weighting cosine."""
+    aux_form: Annotated[Literal["thesis", "release"], OfWeighting()] = "thesis"
+    """Form of the auxiliary tasks' targets, where the thesis and the authors' release differ (`auxtasks.Options`)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One training run. The defaults are those of the preset ``fast``; `preset` also applies its task-specific values."""
+
+    run: RunOptions = RunOptions()
+    environment: EnvironmentOptions = EnvironmentOptions()
+    goals: GoalOptions = GoalOptions()
+    reward: RewardOptions = RewardOptions()
+    ddpg: DDPGOptions = DDPGOptions()
+    auxiliary: AuxiliaryOptions = AuxiliaryOptions()
+    network: NetworkOptions = NetworkOptions()
+    study: StudyOptions = StudyOptions()
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some options changed.
+
+        Args:
+            **changes: Values by name of a field, whatever its group.
+
+        Raises:
+            RequestError: A name is no field of a group.
+        """
+        by_group: dict[str, dict[str, Any]] = {}
+        for name, value in check_names(changes).items():
+            by_group.setdefault(OPTIONS[name].group, {})[name] = value
+        groups = {group: dataclasses.replace(getattr(self, group), **values) for group, values in by_group.items()}
+        return dataclasses.replace(self, **groups)
+
+    def flat(self) -> dict[str, Any]:
+        """Return the values of all groups, by the names of their fields."""
+        return {name: self.value(name) for name in OPTIONS}
+
+    def value(self, name: str) -> Any:
+        """Return the value of the field ``name``, whatever its group."""
+        return getattr(getattr(self, OPTIONS[name].group), name)
+
+
+OPTIONS: Mapping[str, fields.Field] = {field.name: field for field in fields.describe(Config)}
+"""Fields of all groups, by name."""
+
+
+def marked(mark: Mark) -> tuple[str, ...]:
+    """Return the names of the fields with a property."""
+    return tuple(name for name, field in OPTIONS.items() if mark in field.extras)
+
+
+def of_weightings() -> dict[str, tuple[str, ...]]:
+    """Return the fields that are read only by weightings, with the names of these; no names for any weighting."""
+    marks = {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, OfWeighting)}
+    return {name: mark.names for name, mark in marks.items()}
+
+
+def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return ``changes`` if every name is that of a field.
+
+    Raises:
+        RequestError: One is not.
+    """
+    for name in changes:
+        if name not in OPTIONS:
+            raise RequestError(f"unknown option {name!r}{nearest(str(name), OPTIONS)}")
+    return changes
+
+
+def changes(**values: Any) -> dict[str, Any]:
+    """Return values for `Config.replace`, with their names checked at once.
+
+    Raises:
+        RequestError: A name is no field of a group.
+    """
+    return dict(check_names(values))
+
+
+def data_devices(config: Config) -> int:
+    """Return the number of devices that share one learner, with the default of ``data_devices`` filled in."""
+    if config.run.data_devices is not None:
+        return config.run.data_devices
+    return config.run.devices if config.run.seeds == 1 else 1
+
+
+def config_from_dict(values: Any) -> Config:
+    """Read a saved configuration: `dataclasses.asdict` after a round trip through JSON, which turns tuples into lists.
+
+    Missing groups and fields take their defaults.
+
+    Raises:
+        RequestError: ``values`` is no dictionary of groups, or a field is unknown or of the wrong type. The message names it.
+    """
+    if not isinstance(values, Mapping):
+        raise RequestError(f"a configuration must be a dictionary of groups, not {type(values).__name__}")
+    groups = [field.name for field in dataclasses.fields(Config)]
+    options: dict[str, Any] = {}
+    for group, saved in values.items():
+        if group not in groups:
+            raise RequestError(f"unknown group of options {group!r}{nearest(str(group), groups)}")
+        if not isinstance(saved, Mapping):
+            raise RequestError(f"{group} must be a dictionary of options, not {type(saved).__name__}")
+        for name, value in saved.items():
+            if name not in OPTIONS or OPTIONS[name].group != group:
+                known = [option for option, field in OPTIONS.items() if field.group == group]
+                raise RequestError(f"unknown option {name!r} in {group}{nearest(str(name), known)}")
+            options[name] = fields.check(name, OPTIONS[name].hint, value)
+    return Config().replace(**options)

@@ -1,0 +1,169 @@
+"""Presets, and what they have otherwise for some tasks."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from jaxrl_vis.config.groups import Config
+from jaxrl_vis.config.methods import METHODS
+from jaxrl_vis.errors import RequestError, nearest
+
+_PAPER = Config().replace(
+    preset="paper",
+    image_size=100,
+    num_envs=80,
+    env_steps=800_000,
+    updates_per_iteration=40,
+    batch_size=512,
+    replay_transitions=40_000,
+    target_decay=0.98,
+    target_update_interval=40,
+    clip_targets_above=False,
+    eval_interval=5,
+)
+
+_FAST = Config()
+
+_CPU = _FAST.replace(
+    preset="cpu",
+    pixels="depth",
+    image_size=32,
+    num_envs=64,
+    env_steps=64_000,
+    updates_per_iteration=200,
+    batch_size=128,
+    replay_transitions=64_000,
+    latent_size=128,
+    hidden_sizes=(256, 256),
+    eval_interval=2,
+    eval_episodes=256,
+)
+
+_DEBUG = _CPU.replace(
+    preset="debug",
+    image_size=16,
+    num_envs=4,
+    env_steps=800,
+    updates_per_iteration=4,
+    batch_size=16,
+    replay_transitions=800,
+    encoder_filters=(8, 8),
+    latent_size=16,
+    hidden_sizes=(32,),
+    eval_interval=2,
+    eval_episodes=8,
+    checkpoint_interval=2,
+)
+
+PRESETS: dict[str, Config] = {config.run.preset: config for config in (_PAPER, _FAST, _CPU, _DEBUG)}
+"""``paper``: the authors' release. ``fast``: ours. ``cpu``: minutes on two cores. ``debug``: seconds, too short to learn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskValues:
+    """Values of one task in one preset, for images or states; see docs/learner.md.
+
+    Attributes:
+        always: Values for every method.
+        images: Values for image observations, unless the method compares images in the latent space of an autoencoder.
+        oracle: Values for rewards from the true state: other methods cannot read it, and have a balance of their own.
+        images_and_oracle: Values for images with rewards from the true state.
+    """
+
+    always: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    images: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    oracle: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    images_and_oracle: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def all(self) -> dict[str, Any]:
+        """All values, whether or not they apply to the same method."""
+        return {**self.always, **self.images, **self.oracle, **self.images_and_oracle}
+
+    def choose(self, shows_images: bool, method_name: str) -> dict[str, Any]:
+        """Return the values that apply.
+
+        Args:
+            shows_images: True if observations are images.
+            method_name: Method, built-in or ``module:Name``.
+        """
+        reward = METHODS[method_name].reward if method_name in METHODS else None
+        oracle, images = reward == "oracle", shows_images and reward != "autoencoder"
+        return {
+            **self.always,
+            **(self.images if images else {}),
+            **(self.oracle if oracle else {}),
+            **(self.images_and_oracle if images and oracle else {}),
+        }
+
+
+_FINGER = TaskValues(always={"actor_log": "loss"}, oracle={"trivial_goals": 0.2})
+TASKS: Mapping[tuple[str, str], TaskValues] = {
+    # A rollout of the hand is bound by GPU latency: with 500 environments it takes hardly longer than with 100.
+    ("fast", "HandReach"): TaskValues(
+        always={
+            "num_envs": 500,
+            "updates_per_iteration": 1000,
+            "replay_transitions": 700_000,
+            "random_action_probability": 0.1,
+            "encoders": "shared",
+            "target_encoder": False,
+            "actor_interval": 2,
+        },
+        images={"random_shift": 2},
+    ),
+    # FetchReach is learned in so few steps that more frequent evaluations are worthwhile; a checkpoint takes as long as two of
+    # its iterations.
+    ("fast", "FetchReach"): TaskValues(
+        always={
+            "num_envs": 25,
+            "updates_per_iteration": 50,
+            "eval_interval": 4,
+            "checkpoint_interval": 20,
+            "encoders": "shared",
+            "target_encoder": False,
+        },
+        images={"random_shift": 6, "relabel_probability": 0.8},
+        images_and_oracle={"balance_probability": 0.3},
+    ),
+    ("cpu", "FetchReach"): TaskValues(
+        always={
+            "num_envs": 16,
+            "updates_per_iteration": 50,
+            "eval_interval": 8,
+            "encoders": "shared",
+            "target_encoder": False,
+        },
+        images={"random_shift": 1, "relabel_probability": 0.8},
+        images_and_oracle={"balance_probability": 0.3},
+    ),
+    ("cpu", "Reacher"): TaskValues(images={"relabel_probability": 0.8}, images_and_oracle={"balance_probability": 0.3}),
+    ("fast", "FingerTurn"): _FINGER,
+    ("cpu", "FingerTurn"): _FINGER,
+}
+"""(preset, task without ``Visual``) -> values that this preset has otherwise for the task."""
+
+
+def preset(name: str, **overrides: Any) -> Config:
+    """Return a preset for a task and a method, with some options changed.
+
+    Args:
+        name: ``paper``, ``fast``, ``cpu`` or ``debug`` (`PRESETS`). Some have task-specific values (`TASKS`).
+        **overrides: Options and their values, by name of a field, whatever its group.
+
+    Raises:
+        RequestError: There is no such preset, or no such option.
+    """
+    if name not in PRESETS:
+        raise RequestError(f"unknown preset {name!r}{nearest(name, list(PRESETS))}")
+    config = PRESETS[name]
+    env = str(overrides.get("env", config.environment.env))
+    method = str(overrides.get("method", config.reward.method))
+    values = TASKS.get((name, env.removeprefix("Visual")), TaskValues())
+    return config.replace(**{**values.choose(env.startswith("Visual"), method), **overrides})
+
+
+def general_values(name: str, task: str) -> dict[str, Any]:
+    """Return what a preset has for other tasks, for the options that have values of their own for ``task``."""
+    values = TASKS.get((name, task.removeprefix("Visual")), TaskValues())
+    return {option: PRESETS[name].value(option) for option in values.all}

@@ -1,0 +1,213 @@
+"""All annotations of a folder, whatever they were written with, and the images that they are of."""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.stalks.phenotyping.io.annotation_files import coco, label_studio, labelme, voc, yolo
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, together
+from jaxrl_vis.stalks.phenotyping.io.images import image_size
+from jaxrl_vis.stalks.phenotyping.io.names import readable
+from jaxrl_vis_envs.documents import parse_json, parse_xml, read_bytes, read_json, read_text
+
+_MAX_BYTES = 10_000_000  # of a file of one image
+_DEPTH = 4  # folders in folders
+_MAX_FILES = 200_000
+_IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
+_HELD_BACK = {"valid", "val", "test", "testing", "validation"}
+"""Folders that hold what is kept from training, where there is one called train."""
+_WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError)
+"""Errors that reading a file of another form raises."""
+
+
+def gather(folder: Path) -> list[tuple[Any, Annotated]]:
+    """Images of a folder with their ids and annotations, and with names that lead from the folder to them.
+
+    Raises:
+        RequestError: There are none, or a file cannot be read.
+    """
+    found = _read(folder)
+    index = _Index(folder)
+    for _, image in found:
+        if isinstance(image.name, str):
+            index.settle(image)
+        image.annotations = together(image.annotations)
+    return found
+
+
+def _read(folder: Path) -> list[tuple[Any, Annotated]]:
+    path = folder / "annotations.json"
+    if path.exists():
+        return _one(path, lambda: _coco(path, read_json(path)), "COCO")
+    found: list[tuple[Any, Annotated]] = []
+    others: list[Path] = []
+    names: list[str] | None = None
+    numbers = itertools.count()
+    images = {image.stem: image for image in _files(folder, _IMAGES) if image.is_file()}
+    for file in _files(folder, {".json", ".xml", ".txt"}):
+        if file.suffix.lower() == ".json":
+            read = _json(file, numbers)
+        elif file.suffix.lower() == ".xml":
+            read = _xml(file, numbers)
+        elif file.stem in images and file.name not in yolo.NAMES:
+            names = _class_names(folder) if names is None else names
+            read = list(zip(numbers, _one(file, lambda file=file, names=names: _yolo(file, images[file.stem], names), "YOLO")))
+        else:
+            continue
+        found += read or []
+        others += [file] if read is None else []
+    broken = next((file for file in others if file.stem in images), None)
+    if broken is not None:  # another one, as of a calibration, may lie there
+        kinds = "Pascal VOC" if broken.suffix.lower() == ".xml" else "LabelMe"
+        raise RequestError(f"{broken} is no annotation of {kinds}, but called as an image is")
+    if not found:
+        there = f" ({others[0].name} is none)" if others else ""
+        raise RequestError(
+            f"there are no annotations in {folder}{there}: put annotations.json of COCO there, or .xml of Pascal VOC, .json of "
+            "LabelMe or .txt of YOLO beside each image"
+        )
+    return found
+
+
+def _one(file: Path, read: Any, kind: str) -> Any:
+    """What ``read`` makes of a file.
+
+    Raises:
+        RequestError: It cannot be read, or is of another kind.
+    """
+    try:
+        return read()
+    except RequestError:
+        raise
+    except OSError as error:
+        raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
+    except _WRONG as error:
+        what = "not COCO: it needs images and annotations" if kind == "COCO" else f"no annotation of {kind}"
+        raise RequestError(f"{file} is {what}{_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Message of a reader's error, where it has one in words."""
+    words = " ".join(str(error).split()) if isinstance(error, ValueError) else ""
+    return f" ({words[:200]})" if words else ""
+
+
+def _coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
+    if not coco.is_coco(data):
+        raise KeyError("images")
+    return coco.read_coco(path, data)
+
+
+def _json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+    """Images of a file of JSON: COCO's, LabelMe's or Label Studio's; None if it is another one."""
+    data = _one(file, lambda: parse_json(read_text(file)), "LabelMe")
+    if coco.is_coco(data):
+        read = _one(file, lambda: _coco(file, data), "COCO")
+        # Of several such files, ids may be the same.
+        return [((str(file), number) if isinstance(number, (int, str)) else number, image) for number, image in read]
+    if label_studio.is_label_studio(data):
+        return list(zip(numbers, _one(file, lambda: label_studio.read_label_studio(file, data), "Label Studio")))
+    if labelme.is_labelme(data):
+        return list(zip(numbers, _one(file, lambda: labelme.read_labelme(file, data), "LabelMe")))
+    return None
+
+
+def _xml(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+    """Images of a file of XML: Pascal VOC's or CVAT's; None if it is another one."""
+    root = _one(file, lambda: parse_xml(read_bytes(file)), "Pascal VOC")
+    if root.tag not in ("annotation", "annotations"):
+        return None
+    return list(zip(numbers, _one(file, lambda: voc.read_xml(file, root), "Pascal VOC")))
+
+
+def _yolo(file: Path, image: Path, names: list[str]) -> list[Annotated]:
+    text = read_text(file, _MAX_BYTES)
+    if not yolo.is_yolo(text):
+        raise ValueError("its lines are not a class and numbers")
+    height, width = image_size(image)
+    return [Annotated(image.name, width, height, file, yolo.read_yolo(file, text, names, (width, height)))]
+
+
+def _class_names(folder: Path) -> list[str]:
+    """Names of YOLO's classes, from the first of the files that name them; none where there is no such file."""
+    for name in yolo.NAMES:
+        for path in (folder / name, folder.parent / name, *sorted(folder.glob(f"*/{name}"))):
+            if path.is_file():
+                return _one(path, lambda path=path: yolo.read_names(path), "YOLO's classes")
+    return []
+
+
+def _files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
+    """Files of a folder and of what lies in it, in order; without what is held back from training.
+
+    Raises:
+        RequestError: There are too many.
+    """
+    count, waiting = 0, [(folder, 0)]
+    while waiting:
+        here, depth = waiting.pop(0)
+        try:
+            inside = sorted(path for path in here.iterdir() if not path.name.startswith("."))
+        except OSError:
+            continue
+        folders = [path for path in inside if path.is_dir() and path.name != "truth"]
+        if any(path.name.lower() == "train" for path in folders):
+            folders = [path for path in folders if path.name.lower() not in _HELD_BACK]
+        for path in inside:
+            if path.suffix.lower() in suffixes and not path.is_dir():
+                count += 1
+                if count > _MAX_FILES:
+                    raise RequestError(f"{folder} holds more than {_MAX_FILES} files: name the folder of the annotations")
+                yield path
+        waiting += [(path, depth + 1) for path in folders if depth + 1 < _DEPTH]
+
+
+class _Index:
+    """Images of a folder by their names, in small letters, with and without what follows the last point."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._by_name: dict[str, list[Path]] = {}
+        self._taken: dict[Path, Path] = {}
+        for path in filter(Path.is_file, _files(folder, _IMAGES)):
+            self._by_name.setdefault(path.name.lower(), []).append(path)
+            self._by_name.setdefault(path.stem.lower() + "\0", []).append(path)
+
+    def settle(self, image: Annotated) -> None:
+        """Write the way from the folder to an image's file into it, and its size where that is missing.
+
+        Raises:
+            RequestError: Several files could be meant, or another annotation is of the same one.
+        """
+        path = self._locate(image.name, image.source)
+        if path is None:
+            return
+        other = self._taken.setdefault(path, image.source)
+        if other != image.source:
+            raise RequestError(f"{path.name} is annotated twice, in {other} and in {image.source}: keep one of them")
+        image.name = readable(path.relative_to(self._folder).as_posix()) if path.name == readable(path.name) else image.name
+        if not image.width or not image.height:
+            try:
+                image.height, image.width = image_size(path)
+            except OSError as error:
+                raise RequestError(f"the annotations in {self._folder} name an image that cannot be read: {error}") from error
+
+    def _locate(self, name: str, source: Path) -> Path | None:
+        parts = PureWindowsPath(name).parts
+        base = parts[-1] if parts else ""
+        beside = [
+            path for path in (source.parent.joinpath(*parts), self._folder.joinpath(*parts)) if parts and ".." not in parts
+        ]
+        for path in beside:
+            if path.suffix.lower() in _IMAGES and path in self._by_name.get(base.lower(), []):
+                return path
+        stem = Path(base).stem if Path(base).suffix.lower() in _IMAGES else base
+        found = self._by_name.get(base.lower()) or self._by_name.get(f"{stem.lower()}\0", [])
+        near = [path for path in found if path.parent == source.parent] or found
+        exact = [path for path in near if path.name == base] or near
+        if len(exact) > 1:
+            both = " or ".join(readable(str(path.relative_to(self._folder))) for path in exact[:2])
+            raise RequestError(f"{source} is of {readable(name)[:80]}, which may be {both}: rename or remove one of them")
+        return exact[0] if exact else None

@@ -1,0 +1,70 @@
+"""Annotations of LabelMe and X-AnyLabeling: one JSON an image, with polygons, rectangles, turned rectangles and masks."""
+
+import base64
+import binascii
+import io
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, Annotation, outlined, without_width
+from jaxrl_vis.stalks.phenotyping.io.image_headers import plain_png, size_in
+from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
+from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask
+
+_CORNERS = {"polygon": 3, "rectangle": 2, "rotation": 4}
+
+
+def is_labelme(data: Any) -> bool:
+    """Return whether a file of JSON is LabelMe's."""
+    return isinstance(data, dict) and "shapes" in data
+
+
+def read_labelme(path: Path, data: Any) -> list[Annotated]:
+    """The image of a file.
+
+    Raises:
+        ValueError, KeyError, TypeError, AttributeError: The data are not LabelMe's.
+    """
+    size = int(data["imageWidth"]), int(data["imageHeight"])
+    annotations = [_shape(shape, size, f"{path}: annotation {place + 1}") for place, shape in enumerate(data["shapes"])]
+    # The path is as its writer's machine spelled it.
+    return [Annotated(str(data["imagePath"]).replace("\\", "/").rpartition("/")[2], *size, path, annotations)]
+
+
+def _shape(shape: dict[str, Any], size: tuple[int, int], source: str) -> Annotation:
+    name, kind = str(shape["label"]), str(shape.get("shape_type") or "polygon")
+    points = np.asarray(shape["points"], float).reshape(-1, 2)
+    if kind == "mask":
+        return {"name": name, "segmentation": _mask(shape, points, size), "source": source}
+    if kind not in _CORNERS:
+        return without_width(name, kind, source)
+    if len(points) < _CORNERS[kind]:
+        return {"name": name, "problem": f"is a {kind} of {len(points)} points", "source": source}
+    if kind == "rectangle":
+        low, high = points.min(axis=0), points.max(axis=0)
+        points = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    return outlined(name, points, source, shape.get("group_id"))
+
+
+def _mask(shape: dict[str, Any], points: np.ndarray, size: tuple[int, int]) -> dict[str, Any]:
+    """The mask that is kept as a PNG of the box between two points, both of which belong to it."""
+    if len(points) != 2 or not np.isfinite(points).all() or np.abs(points).max() > 1e7:
+        raise ValueError("a mask without its box")
+    left, top = (int(edge) for edge in points[0])
+    try:
+        data = base64.b64decode(shape["mask"], validate=True)
+    except binascii.Error as error:
+        raise ValueError("a mask that is not base64") from error
+    shown = size_in(io.BytesIO(data))
+    if shown is None or shown[0] * shown[1] > MAX_PIXELS:
+        raise ValueError("a mask that is no PNG")
+    if not 0 < size[0] * size[1] <= MAX_PIXELS or min(left, top) < 0 or left + shown[1] > size[0] or top + shown[0] > size[1]:
+        raise ValueError("a mask that reaches beyond its image")
+    plain = plain_png(data)
+    mask = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED) if plain else None
+    if mask is None or mask.shape != shown:
+        raise ValueError("a mask that is no PNG")
+    return encode_mask(mask > 0, (top, left), (size[1], size[0]))

@@ -1,0 +1,66 @@
+"""Choice of the annotations that are stalks, by what they are called."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.stalks.phenotyping.io.names import readable
+
+_STALKS = {"stalk", "stalks"}
+_CROPS = {"sorghum", "maize", "corn", "cane", "sugarcane", "wheat", "rice", "millet", "crop", "plant", "plants", "the", "a"}
+_SHOWN = 6
+
+
+def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str) -> tuple[list[dict[str, Any]], str]:
+    """The annotations that are called a stalk.
+
+    Args:
+        annotations: With a ``name`` each, which may be empty.
+        labels: Names that are taken for stalks; if there are none, ``stalk``, with a crop's name and a number or without. Where
+            nothing has a name, everything is a stalk.
+        source: Name of the annotations, for messages.
+
+    Returns:
+        The annotations, and a line that says what was taken and what was left out.
+
+    Raises:
+        RequestError: Nothing is called so.
+    """
+    names = Counter(_tidy(annotation.get("name", "")) for annotation in annotations)
+    if labels:
+        wanted = {_tidy(label).casefold() for label in labels}
+        taken = {name for name in names if name.casefold() in wanted}
+    elif set(names) <= {""}:
+        taken = set(names)
+    else:
+        taken = {name for name in names if _says_stalk(name)}
+    if not taken and names:
+        there = _listed(names)
+        if labels:
+            raise RequestError(f"{source}: nothing is called {', '.join(labels)} there, but {there}: name one with --label")
+        example = next((name for name, _ in names.most_common() if name), "stem")
+        quoted = f"'{readable(example)}'" if " " in example else readable(example)
+        raise RequestError(
+            f"{source}: nothing is called a stalk there, but {there}: name what counts as one with --label, as --label {quoted}"
+        )
+    left_out = Counter({name: count for name, count in names.items() if name not in taken})
+    chosen = Counter({name: count for name, count in names.items() if name in taken})
+    summary = f"stalks: {_listed(chosen)}" + (f"; left out as none: {_listed(left_out)}" if left_out else "")
+    return [annotation for annotation in annotations if _tidy(annotation.get("name", "")) in taken], summary
+
+
+def _says_stalk(name: str) -> bool:
+    """Return whether a name says stalk and nothing else: ``stalk_2`` and ``sorghum stalk`` do, ``not stalk`` does not."""
+    words = {word for word in re.split(r"[^a-z]+", name.casefold()) if word}
+    return bool(words & _STALKS) and words <= _STALKS | _CROPS
+
+
+def _tidy(name: Any) -> str:
+    return " ".join(str(name).split())[:200]
+
+
+def _listed(names: Counter[str]) -> str:
+    parts = [f"{readable(name) or 'without a name'} ({count})" for name, count in names.most_common(_SHOWN)]
+    return ", ".join(parts) + (f" and {len(names) - _SHOWN} others" if len(names) > _SHOWN else "")

@@ -1,0 +1,113 @@
+"""Annotations in XML: Pascal VOC's of one image, as labelImg and Roboflow write it, roLabelImg's turned boxes, and CVAT's."""
+
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import (
+    Annotated,
+    Annotation,
+    boxed,
+    outlined,
+    turned_box,
+    without_width,
+)
+from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
+from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask
+
+_EDGES = ("xmin", "ymin", "xmax", "ymax")
+
+
+def read_xml(path: Path, root: Element) -> list[Annotated]:
+    """Images of a file of Pascal VOC or of CVAT.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if root.tag == "annotations":
+        if root.find("track") is not None:
+            raise ValueError("it holds tracks of a video: export it as CVAT for images, or as COCO")
+        return [_cvat_image(path, image) for image in root.iter("image")]
+    return [_voc_image(path, root)]
+
+
+def _text(node: Element, name: str) -> str:
+    value = node.findtext(name)
+    if value is None:
+        raise ValueError(name)
+    return value
+
+
+def _voc_image(path: Path, root: Element) -> Annotated:
+    annotations = []
+    for place, element in enumerate(root.iter("object")):
+        name, source = _text(element, "name"), f"{path}: annotation {place + 1}"
+        if element.find("robndbox") is not None:
+            x, y, wide, high, angle = (float(_text(element, f"robndbox/{part}")) for part in ("cx", "cy", "w", "h", "angle"))
+            if not np.isfinite([x, y, wide, high, angle]).all():
+                raise ValueError("robndbox")
+            annotations.append(outlined(name, turned_box((x, y), (wide, high), angle), source))
+        else:
+            # Pixels count from 1, and the last ones belong to the box.
+            left, top, right, bottom = (float(_text(element, f"bndbox/{edge}")) for edge in _EDGES)
+            annotations.append(boxed(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
+    width, height = (_whole(root.findtext(f"size/{side}")) for side in ("width", "height"))
+    return Annotated(_text(root, "filename"), width, height, path, annotations)
+
+
+def _whole(text: str | None) -> int | None:
+    """A number of pixels; None where labelImg did not know it, and wrote 0."""
+    return int(text) or None if text is not None and text.strip() else None
+
+
+def _cvat_image(path: Path, element: Element) -> Annotated:
+    size = int(element.get("width") or 0), int(element.get("height") or 0)
+    annotations = []
+    for place, shape in enumerate(element):
+        if shape.tag in ("tag", "attribute"):
+            continue
+        name, source = shape.get("label") or "", f"{path}: annotation {place + 1} of {element.get('name')}"
+        group = shape.get("group_id") if shape.get("group_id") not in (None, "", "0") else None
+        annotations.append(_cvat_shape(shape, size, name, source, group))
+    return Annotated(element.get("name") or "", *size, path, annotations)
+
+
+def _cvat_shape(shape: Element, size: tuple[int, int], name: str, source: str, group: str | None) -> Annotation:
+    def numbers(*names: str) -> list[float]:
+        values = [float(shape.get(key) or "nan") for key in names]
+        if not np.isfinite(values).all():
+            raise ValueError(f"{shape.tag} without {' and '.join(names)}")
+        return values
+
+    if shape.tag == "box":
+        left, top, right, bottom = numbers("xtl", "ytl", "xbr", "ybr")
+        angle = np.radians(float(shape.get("rotation") or 0.0))
+        if angle:
+            centre = ((left + right) / 2, (top + bottom) / 2)
+            return outlined(name, turned_box(centre, (right - left, bottom - top), float(angle)), source, group)
+        return boxed(name, [left, top, right - left, bottom - top], source, group)
+    if shape.tag == "polygon":
+        points = [list(map(float, point.split(","))) for point in (shape.get("points") or "").split(";") if point]
+        return outlined(name, np.reshape(np.array(points, float), (-1, 2)), source, group)
+    if shape.tag == "mask":
+        left, top, wide, high = (int(value) for value in numbers("left", "top", "width", "height"))
+        return {
+            "name": name,
+            "segmentation": _cvat_mask(shape.get("rle") or "", (left, top, wide, high), size),
+            "source": source,
+        }
+    return without_width(name, str(shape.tag), source)
+
+
+def _cvat_mask(runs: str, box: tuple[int, int, int, int], size: tuple[int, int]) -> dict[str, Any]:
+    """The mask of CVAT's runs, which go along the lines of its box and begin with what is outside."""
+    left, top, wide, high = box
+    if not 0 < size[0] * size[1] <= MAX_PIXELS or min(left, top) < 0 or left + wide > size[0] or top + high > size[1]:
+        raise ValueError("a mask that reaches beyond its image")
+    counts = np.array([int(count) for count in runs.replace(",", " ").split()], np.int64)
+    if min(wide, high) < 1 or (counts < 0).any() or counts.sum() != wide * high:
+        raise ValueError("a mask whose runs do not cover its box")
+    mask = np.repeat(np.arange(counts.size) % 2 == 1, counts).reshape(high, wide)
+    return encode_mask(mask, (top, left), (size[1], size[0]))

@@ -1,0 +1,78 @@
+"""Annotations of YOLO: a text for each image, one line a box, a turned box or an outline, in shares of the image."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotation, boxed, outlined
+from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
+from jaxrl_vis_envs.documents import read_text
+
+NAMES = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml", "classes.txt", "obj.names", "_darknet.labels")
+"""Files that name the classes."""
+_MAX_BYTES = 1_000_000  # of such a file
+_BEYOND = 0.02  # of the image: as far as roundings and hasty hands go
+
+
+def read_names(path: Path) -> list[str]:
+    """Names of the classes, in their order.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It names nothing.
+    """
+    text = read_text(path, _MAX_BYTES)
+    if path.suffix not in (".yaml", ".yml"):
+        return [line.strip() for line in text.splitlines() if line.strip()]
+    store = parse_storage(text)
+    names = store.get("names") if isinstance(store, dict) else None
+    if isinstance(store, dict) and store.get("kpt_shape") is not None:
+        raise ValueError("it is of key points, not of boxes or outlines")
+    if isinstance(names, dict):
+        numbered = {float(number): str(name) for number, name in names.items()}
+        return [numbered.get(float(place), str(place)) for place in range(int(max(numbered, default=-1.0)) + 1)][:10_000]
+    if isinstance(names, list):
+        return [str(name) for name in names]
+    raise ValueError("it has no names")
+
+
+def is_yolo(text: str) -> bool:
+    """Return whether a text is such a file: lines of numbers, of which the first is a class."""
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    return all(len(words) >= 5 and re.fullmatch(r"\d{1,4}", words[0]) is not None for words in lines)
+
+
+def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) -> list[Annotation]:
+    """Annotations of one image.
+
+    Args:
+        path: The file, for messages.
+        text: Its contents.
+        names: Of the classes.
+        size: Width and height of the image.
+
+    Raises:
+        ValueError: A line is none of YOLO's.
+    """
+    annotations = []
+    for place, words in enumerate(line.split() for line in text.splitlines() if line.strip()):
+        number, source = int(words[0]), f"{path}: annotation {place + 1}"
+        name = names[number] if number < len(names) else str(number)
+        values = [float(word) for word in words[1:]]
+        if len(values) in (4, 5):
+            shares: list[Any] = values[:4]  # the fifth is a score
+        elif len(values) >= 6 and len(values) % 2 == 0:
+            shares = values
+        else:
+            raise ValueError(f"line {place + 1} has {len(values)} numbers")
+        if not all(math.isfinite(share) and -_BEYOND <= share <= 1.0 + _BEYOND for share in shares):
+            raise ValueError(f"line {place + 1} holds what is no share of an image")
+        if len(shares) == 4:
+            x, y, wide, high = (share * size[axis % 2] for axis, share in enumerate(shares))
+            annotations.append(boxed(name, [x - wide / 2, y - high / 2, wide, high], source))
+        else:
+            annotations.append(outlined(name, np.reshape(shares, (-1, 2)) * size, source))
+    return annotations

@@ -1,0 +1,74 @@
+"""Calibrations of OpenCV: P1 and P2 as ``cv2.stereoRectify`` returns them, or camera matrices with R and T.
+
+OpenCV's sample ``stereo_calib`` writes both into two files, intrinsics.yml and extrinsics.yml, and no size of images.
+"""
+
+import reprlib
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, RectifiedPair, Unit, named_size, numbers
+
+_MATRICES = (("M1", "M2"), ("K1", "K2"), ("cameraMatrix1", "cameraMatrix2"), ("camera_matrix_1", "camera_matrix_2"))
+_DISTORTIONS = (("D1", "D2"), ("distCoeffs1", "distCoeffs2"), ("dist_coeffs_1", "dist_coeffs_2"))
+_MOST_COEFFICIENTS = 14
+
+
+def read_projections(store: dict[str, Any], path: Path) -> RectifiedPair:
+    """The rectified pair of a file that holds P2.
+
+    Raises:
+        RequestError: A matrix is none.
+    """
+    matrices = []
+    for name, side in (("P1", "left"), ("P2", "right")):
+        if store.get(name) is None:
+            raise RequestError(f"{path} has no projection matrix of the {side} camera ({name}): rectify the pair first")
+        matrix = numbers(store[name], 12)
+        if matrix is None:
+            raise RequestError(f"{path}: {name} of the {side} camera must be 3 x 4 numbers")
+        matrices.append(matrix.reshape(3, 4))
+    return RectifiedPair(matrices[0], matrices[1], named_size(store, path), _unit(store, path))
+
+
+def read_raw(store: dict[str, Any], path: Path) -> RawPair | None:
+    """The cameras before rectification; None where the file does not hold both of them, R and T."""
+    matrices = [numbers(store.get(name), 9) for name in _present(store, _MATRICES)]
+    distortions = [_coefficients(store.get(name)) for name in _present(store, _DISTORTIONS)]
+    rotation, translation = numbers(store.get("R"), 9), numbers(store.get("T"), 3)
+    if len(matrices) < 2 or matrices[0] is None or matrices[1] is None or rotation is None or translation is None:
+        return None
+    width = max([coefficients.size for coefficients in distortions], default=0)
+    padded = np.zeros((2, width))
+    for row, coefficients in zip(padded, distortions):
+        row[: coefficients.size] = coefficients
+    both = np.stack([matrices[0], matrices[1]]).reshape(2, 3, 3)
+    size, unit = named_size(store, path), _unit(store, path)
+    return RawPair(both, padded, False, rotation.reshape(3, 3), translation, size, unit, "OpenCV")
+
+
+def _present(store: dict[str, Any], pairs: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
+    return next((names for names in pairs if all(store.get(name) is not None for name in names)), ())
+
+
+def _coefficients(value: Any) -> np.ndarray:
+    data = value.get("data") if isinstance(value, dict) else value
+    for count in (4, 5, 8, 12, _MOST_COEFFICIENTS):
+        found = numbers(data, count)
+        if found is not None:
+            return found
+    return np.zeros(0)
+
+
+def _unit(store: dict[str, Any], path: Path) -> Unit | None:
+    said = store.get("unit")
+    if said is None:
+        return None
+    for unit in get_args(Unit):
+        if said == unit:
+            return unit
+    unit_read = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
+    raise RequestError(f"{path}: unit must be m, cm or mm, not {unit_read}")

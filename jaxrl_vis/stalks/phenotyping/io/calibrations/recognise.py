@@ -1,0 +1,184 @@
+"""Recognition of calibrations by what they hold, whatever their names."""
+
+from pathlib import Path
+from typing import Any
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.stalks.phenotyping.io.calibrations import kalibr, kitti, middlebury, opencv, realsense, ros, zed
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, RectifiedPair
+from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
+from jaxrl_vis.stalks.phenotyping.io.images import image_size
+from jaxrl_vis.stalks.phenotyping.io.names import readable
+from jaxrl_vis.stalks.phenotyping.io.naming.sides import partners
+from jaxrl_vis_envs.documents import read_text
+
+_MAX_BYTES = 2_000_000  # of a file
+_SUFFIXES = (".yaml", ".yml", ".xml", ".json", ".txt", ".conf", ".ini")
+_NAMES = ("calibration", "extrinsics", "calib", "calib_cam_to_cam", "camchain", "stereo")
+"""Stems of files that hold a pair, the first of which goes before the others."""
+_KINDS = "OpenCV, ROS, kalibr, ZED, RealSense, Middlebury or KITTI"
+_NO_PAIR = (
+    "holds neither P1 and P2 of OpenCV nor one side of a ROS camera_info (left.yaml and right.yaml): "
+    "calibrate the pair, and rectify its images"
+)
+
+
+def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPair:
+    """The cameras of a calibration.
+
+    Args:
+        path: A file, or a folder that holds one, or one for each camera.
+        image: A left image, of whose size the calibration must be where a file holds several; None where none is known.
+
+    Raises:
+        RequestError: There is none, or it cannot be read.
+    """
+    if path.is_dir():
+        return _in_folder(path, image)
+    found = _read(path, image)
+    if not isinstance(found, list):
+        return found
+    if len(found) == 2:
+        return ros.read_pair(found, [path, path], path)
+    pair = both_sides(path)
+    if pair is None:
+        other = next((name for _, name in partners(path.stem)), None)
+        if other is None:
+            raise RequestError(
+                f"{path} is of one camera: put the files of both into a folder, as left and right, and name that"
+            )
+        raise RequestError(
+            f"there is no calibration {path.with_stem(other)}: name a file of a pair, or a folder with left.yaml and right.yaml"
+        )
+    return _of_sides(pair, path, image)
+
+
+def files_in(folder: Path) -> list[Path]:
+    """Files of a folder that may be calibrations by what their names end with, in order."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file())
+
+
+def named_pair(files: list[Path]) -> Path | None:
+    """The file whose name says that it is the calibration of a pair; None if there is none."""
+    stems = {path: path.stem.lower() for path in files}
+    zed_files = [path for path in files if path.suffix.lower() == ".conf"]
+    for name in _NAMES:
+        found = [path for path, stem in stems.items() if stem == name or (name == "camchain" and stem.startswith(f"{name}-"))]
+        if found:
+            return found[0]
+    return zed_files[0] if zed_files else None
+
+
+def _in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
+    files = files_in(folder)
+    pairs = {pair for pair in map(both_sides, files) if pair is not None}
+    if len(pairs) == 1:
+        return _of_sides(pairs.pop(), folder, image)
+    if len(pairs) > 1:
+        names = " and ".join(readable(left.name) for left, _ in sorted(pairs))
+        raise RequestError(f"{folder} holds several pairs of calibrations, of {names}: name one of the files")
+    alone = named_pair(files) or (files[0] if len(files) == 1 else None)
+    if alone is None:
+        raise RequestError(
+            f"there is no calibration {folder / 'left.yaml'}: name a file of a pair, or a folder with left.yaml and right.yaml"
+        )
+    return read_cameras(alone, image)
+
+
+def both_sides(path: Path) -> tuple[Path, Path] | None:
+    """The files of the left and of the right camera, one of which is ``path``; None where there is no other."""
+    try:
+        there = {file.name.lower(): file for file in path.parent.iterdir()}
+    except OSError:
+        return None
+    for side, name in partners(path.stem):
+        other = there.get(f"{name}{path.suffix}".lower())
+        if other is not None and other.is_file() and other != path:
+            return (path, other) if side == "left" else (other, path)
+    return None
+
+
+def _of_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> RectifiedPair | RawPair:
+    cameras: list[dict[str, Any]] = []
+    for file in pair:
+        found = _read(file, image)
+        if not isinstance(found, list):
+            return found  # one file of both, beside another one
+        if len(found) != 1:
+            raise RequestError(f"{file} {_NO_PAIR}")
+        cameras += found
+    return ros.read_pair(cameras, list(pair), path)
+
+
+def _read(path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
+    """The pair of a file, or what it says of one or two cameras of ROS."""
+    try:
+        text = read_text(path, _MAX_BYTES)
+        if middlebury.is_middlebury(text):
+            return middlebury.read_middlebury(text, path)
+        if kitti.is_kitti(text):
+            return kitti.read_kitti(text, path, image)
+        if zed.is_settings(text):
+            return zed.read_settings(text, path, _size(image))
+        cameras = ros.from_sections(text)
+        if cameras is not None:
+            if not 1 <= len(cameras) <= 2:
+                raise RequestError(f"{path} holds {len(cameras)} cameras with a projection: name a file of one or of a pair")
+            return cameras
+        printed = ros.from_print(text) or ros.from_table(text)
+        if printed is not None:
+            return [printed]
+        store = parse_storage(ros.message(text))
+    except RequestError:
+        raise
+    except OSError as error:
+        raise RequestError(f"there is no calibration {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        why = " ".join(str(error).split())[:200]
+        raise RequestError(
+            f"{path} is not a calibration: it is neither YAML nor XML as OpenCV and ROS write it ({why})"
+        ) from error
+    return _of_store(store, path, image)
+
+
+def _of_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
+    if isinstance(store, list):
+        raise RequestError(f"{path} is not a calibration: it holds a list, not names with values such as P1 and P2")
+    if not isinstance(store, dict):
+        raise RequestError(f"{path} is not a calibration: it is neither YAML nor XML as {_KINDS} write it")
+    if store.get("P2") is not None:
+        return opencv.read_projections(store, path)
+    if kalibr.is_chain(store):
+        return kalibr.read_chain(store, path)
+    both = ros.both_in_one(store)
+    if both is not None:
+        return both
+    if realsense.is_table(store):
+        return realsense.read_table(store, path, _size(image))
+    if ros.is_camera(store):
+        return [store]
+    raw = opencv.read_raw({**_intrinsics(path), **store}, path)
+    if raw is None:
+        raise RequestError(f"{path} {_NO_PAIR}")
+    return raw
+
+
+def _intrinsics(path: Path) -> dict[str, Any]:
+    """Contents of the other file of OpenCV's sample, where ``path`` is its extrinsics.yml."""
+    beside = path.with_name(path.name.replace("extrinsics", "intrinsics"))
+    if beside == path or not beside.is_file():
+        return {}
+    try:
+        store = parse_storage(read_text(beside, _MAX_BYTES))
+    except (OSError, ValueError):
+        return {}
+    return store if isinstance(store, dict) else {}
+
+
+def _size(image: Path | None) -> tuple[int, int] | None:
+    """Width and height of an image; None where it cannot be read, which is told elsewhere."""
+    try:
+        size = None if image is None else image_size(image)
+    except OSError:
+        return None
+    return None if size is None else (size[1], size[0])

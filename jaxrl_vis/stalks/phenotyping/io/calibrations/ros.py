@@ -1,0 +1,191 @@
+"""Calibrations of ROS 1 and 2: one file a camera, as the calibrators write it or as a message of camera_info is printed.
+
+camera_calibration, image_pipeline   left.yaml and right.yaml: image_width, image_height, projection_matrix
+the same in the older form           ost.txt, left.ini and right.ini: sections with a camera's name
+rostopic echo, ros2 topic echo       width, height, P or p, binning and region of interest, one or more messages
+rostopic echo -p                     a table whose columns are field.width, ..., field.P0, ...
+ros2 topic echo --csv                a line without names of columns
+print() of a message in Python       CameraInfo(header=..., p=array([...]), ...)
+"""
+
+import csv
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, named_size, numbers, plain_numbers
+
+_MATRIX_NAMES = ("projection_matrix", "P", "p")
+_SIDES = (("left", "right"), ("LEFT", "RIGHT"), ("Left", "Right"), ("cam0", "cam1"))
+"""Names of the two cameras in files that hold both."""
+_HEADER = re.compile(r"^header:", re.MULTILINE)
+_PRINTED = re.compile(r"CameraInfo\(.*?\bheight=(\d{1,9}), ?width=(\d{1,9})", re.DOTALL)
+_PRINTED_MATRIX = re.compile(r"\bp=array\(\[([^\]]*)\]")
+_PRINTED_NUMBER = re.compile(r"\b(binning_x|binning_y|x_offset|y_offset|height|width)=(\d{1,9})")
+_REGION = ("x_offset", "y_offset", "height", "width")
+_CSV_END = ("binning_x", "binning_y", *_REGION, "do_rectify")
+
+
+def read_pair(stores: list[dict[str, Any]], files: list[Path], path: Path) -> RectifiedPair:
+    """The rectified pair of two cameras' files.
+
+    Args:
+        stores: Contents of the left and of the right camera's file.
+        files: The files.
+        path: Name of both, for messages.
+
+    Raises:
+        RequestError: They are no rectified cameras, or of images of two sizes.
+    """
+    sides = ("left", "right")
+    (left, size), (right, other) = (_camera(store, file, side) for store, file, side in zip(stores, files, sides))
+    if size is not None and other is not None and size != other:
+        raise RequestError(f"{path}: the left image has {_times(size)} pixels and the right one {_times(other)}")
+    return RectifiedPair(left, right, size or other, "m" if any("header" in store for store in stores) else None)
+
+
+def message(text: str) -> str:
+    """Text without what programs print before the first message."""
+    match = _HEADER.search(text)
+    return text if match is None else text[match.start() :]
+
+
+def is_camera(store: dict[str, Any]) -> bool:
+    """Return whether a file's contents are those of one camera of ROS."""
+    return any(store.get(name) is not None for name in _MATRIX_NAMES)
+
+
+def both_in_one(store: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """Both cameras of a file with a table for each, or with ``LEFT.P`` and ``RIGHT.P`` as of ORB-SLAM; None if not so."""
+    for left, right in _SIDES:
+        cameras = [store.get(left), store.get(right)]
+        if not all(isinstance(camera, dict) for camera in cameras):
+            cameras = [_beginning_with(store, f"{name}.") for name in (left, right)]
+        tables = [camera for camera in cameras if isinstance(camera, dict) and is_camera(camera)]
+        if len(tables) == 2:
+            return tables
+    return None
+
+
+def _beginning_with(store: dict[str, Any], begin: str) -> dict[str, Any]:
+    return {name.removeprefix(begin): value for name, value in store.items() if name.startswith(begin)}
+
+
+def from_print(text: str) -> dict[str, Any] | None:
+    """Contents of a message that Python printed; None where it is none.
+
+    Raises:
+        ValueError: Its matrix holds no numbers.
+    """
+    size, matrix = _PRINTED.search(text), _PRINTED_MATRIX.search(text)
+    if size is None or matrix is None:
+        return None
+    region: dict[str, float] = {}
+    binning: dict[str, float] = {}
+    for name, value in _PRINTED_NUMBER.findall(text[matrix.end() :]):
+        (binning if name.startswith("binning") else region).setdefault(name, float(value))
+    found = {"header": {}, "height": float(size[1]), "width": float(size[2]), "p": plain_numbers(matrix[1])}
+    return {**found, **binning, "roi": region}
+
+
+def from_table(text: str) -> dict[str, Any] | None:
+    """Contents of a message that was printed as a table, with names of its columns (ROS 1) or without (ROS 2); None if not so.
+
+    Raises:
+        ValueError: Its cells are no numbers.
+    """
+    lines = [line for line in text[:200_000].splitlines() if line.strip()]
+    try:
+        rows = list(csv.reader(io.StringIO("\n".join(lines[:2]))))
+    except csv.Error:
+        return None
+    if len(rows) == 2 and "field.P0" in rows[0]:
+        cells = dict(zip(rows[0], rows[1]))
+        matrix = [float(cells[f"field.P{place}"]) for place in range(12) if f"field.P{place}" in cells]
+        rest = {name: float(cells[f"field.{name}"]) for name in ("height", "width", *_CSV_END[:2]) if f"field.{name}" in cells}
+        region = {name: float(cells[f"field.roi.{name}"]) for name in _REGION if f"field.roi.{name}" in cells}
+        return {"header": {}, **rest, "P": matrix, "roi": region}
+    # sec, nsec, frame, height, width, model, d, k [9], r [9], p [12], binning, region
+    if rows and len(rows[0]) >= 6 + 30 + len(_CSV_END) and rows[0][-1].strip().lower() in ("true", "false", "0", "1"):
+        row, end = rows[0], len(rows[0]) - len(_CSV_END)
+        tail = dict(zip(_CSV_END[:-1], map(float, row[end:-1])))
+        region = {name: tail[name] for name in _REGION}
+        matrix = [float(cell) for cell in row[end - 12 : end]]
+        return {"header": {}, "height": float(row[3]), "width": float(row[4]), "p": matrix, **tail, "roi": region} | {
+            "height": float(row[3]),
+            "width": float(row[4]),
+        }
+    return None
+
+
+def from_sections(text: str) -> list[dict[str, Any]] | None:
+    """Cameras of the older form of the calibrator's files (oST), one or two; None where it is none of them.
+
+    Raises:
+        ValueError: Something stands where numbers should.
+    """
+    if not re.search(r"^\[image\]", text, re.MULTILINE):
+        return None
+    sections: list[tuple[str, dict[str, str]]] = []
+    name = ""
+    for line in (line.strip() for line in text.splitlines()):
+        if line.startswith("["):
+            sections.append((line.strip("[]"), {}))
+            name = ""
+        elif sections and line and not line.startswith("#"):
+            if re.fullmatch(r"[a-z][a-z _]*", line):
+                name = line
+            elif name:
+                sections[-1][1][name] = f"{sections[-1][1].get(name, '')} {line}"
+    size: dict[str, Any] = {}
+    cameras = []
+    for title, values in sections:
+        if title == "image":
+            size = {f"image_{side}": (plain_numbers(values.get(side, "")) or [None])[0] for side in ("width", "height")}
+        elif "projection" in values:
+            cameras.append({**size, "camera_name": title, "projection_matrix": plain_numbers(values["projection"])})
+    return cameras
+
+
+def _camera(store: dict[str, Any], path: Path, side: str) -> tuple[np.ndarray, Size | None]:
+    """Projection matrix [3, 4] and size of a camera's images as they leave it: its region of interest, binned."""
+    name = next((name for name in _MATRIX_NAMES if store.get(name) is not None), None)
+    if name is None:
+        raise RequestError(
+            f"{path} has no projection matrix of the {side} camera ({' or '.join(_MATRIX_NAMES)}): rectify the pair first"
+        )
+    matrix = numbers(store[name], 12)
+    if matrix is None:
+        raise RequestError(f"{path}: {name} of the {side} camera must be 3 x 4 numbers")
+    matrix = matrix.reshape(3, 4)
+    if not matrix.any():
+        raise RequestError(f"{path} is of a camera that was never calibrated (its {name} is all 0): calibrate the pair")
+    size = named_size(store, path)
+    if size is None:
+        return matrix, None
+    roi = store.get("roi")
+    region = roi if isinstance(roi, dict) else {}
+    x, y, high, wide = (_count(region.get(name), path, f"roi.{name}") for name in _REGION)
+    if high and wide:
+        matrix[:2, 2] -= (x, y)
+        size = (wide, high)
+    steps = [max(_count(store.get(f"binning_{axis}"), path, f"binning_{axis}"), 1) for axis in "xy"]
+    matrix[0] /= steps[0]
+    matrix[1] /= steps[1]
+    return matrix, (max(size[0] // steps[0], 1), max(size[1] // steps[1], 1))
+
+
+def _count(value: Any, path: Path, name: str) -> int:
+    if value is None:
+        return 0
+    if not isinstance(value, float) or not value.is_integer() or not 0 <= value <= 100_000:
+        raise RequestError(f"{path}: {name} must be a number of pixels")
+    return int(value)
+
+
+def _times(size: Size) -> str:
+    return f"{size[0]} x {size[1]}"

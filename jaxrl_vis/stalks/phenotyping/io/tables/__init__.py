@@ -1,0 +1,1 @@
+"""Tables from outside: odometries and plans of fields."""

@@ -1,0 +1,284 @@
+"""Odometry of plots: how far the robot had driven at each pair, from tables, from what ROS prints, and from GPS.
+
+odometry.csv     distance_m (_cm, _mm), or time_s (_ms, _us, _ns) with --speed, or positions (x, y), or latitude and longitude;
+                 with the name of the left image (left), or in order, or with the times that images have in their names
+odometry.txt     the same, parted by tabs, semicolons or spaces; or what rostopic echo or ros2 topic echo prints
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.spreadsheets import unescape_cell
+from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
+from jaxrl_vis.stalks.phenotyping.io.names import readable
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import seconds_in
+from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
+
+_MAX_ODOMETRY = 8_000_000  # bytes
+_NAMES = tuple(f"{stem}{end}" for stem in ("odometry", "odom", "gps") for end in (".csv", ".tsv", ".txt", ".yaml"))
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_DISTANCE = re.compile(r"(?:distance|odometer|dist|travelled)[ _]*[\[(]?(mm|cm|m|km|in|ft)[\])]?")
+_TIME = re.compile(r"(?:time|timestamp|stamp)[ _]*[\[(]?(s|ms|us|ns)[\])]?")
+_ROS_TIMES = ("%time", "field.header.stamp")  # ns
+_PLAIN_TIMES = ("time", "timestamp", "stamp")
+_LEFT = ("left", "left_image", "image", "filename", "file", "image_name", "left_file")
+_POSITIONS = (
+    ("field.pose.pose.position.x", "field.pose.pose.position.y", "field.pose.pose.position.z"),
+    ("pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z"),
+    ("field.pose.position.x", "field.pose.position.y", "field.pose.position.z"),
+    ("x_m", "y_m", "z_m"),
+    ("tx", "ty", "tz"),
+    ("easting", "northing"),
+    ("x", "y", "z"),
+)
+_GLOBE = (("latitude", "longitude"), ("lat", "lon"), ("lat", "lng"), ("field.latitude", "field.longitude"))
+_EARTH = 6_371_000.0  # m, radius
+_MOST_SECONDS = 1e11  # of time_s: larger numbers are in another unit
+_NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+_PRINTED_STAMP = re.compile(r"\bsecs?: *(\d{1,12})\s+n(?:ano)?secs?: *(\d{1,9})\b")
+_PRINTED_PLACE = re.compile(rf"\bposition:\s+x: *{_NUMBER}\s+y: *{_NUMBER}\s+z: *{_NUMBER}")
+_PRINTED_GLOBE = re.compile(rf"\blatitude: *{_NUMBER}\s+longitude: *{_NUMBER}")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Table:
+    """Odometry as a file holds it, one entry a row.
+
+    Attributes:
+        path: The file.
+        names: Names of left images; None where there is no such column.
+        times: Times, s from the first one; None where there are none.
+        start: The first of them, s.
+        distances: Distances, m; None where there are only times.
+    """
+
+    path: Path
+    names: list[str] | None
+    times: np.ndarray | None
+    start: float
+    distances: np.ndarray | None
+
+
+def odometry_file(folder: Path) -> Path:
+    """The file with a plot's odometry, whether it is there or not."""
+    return next((folder / name for name in _NAMES if (folder / name).exists()), folder / _NAMES[0])
+
+
+def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[str, dict[str, float] | None]:
+    """Read the odometry of each plot with `read_odometry`: a dictionary by the plot's name.
+
+    Raises:
+        RequestError: A file cannot be used, or none of them needs the speed.
+    """
+    tables = {plot.name: _read(odometry_file(plot.folder)) for plot in plots}
+    if speed is not None and not any(table and table.distances is None for table in tables.values()):
+        raise RequestError("--speed goes with an odometry.csv that holds times (time_s) and no distance_m: leave it out")
+    return {plot.name: _of_pairs(plot, tables[plot.name], speed) for plot in plots}
+
+
+def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
+    """Read the distance that the robot had driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
+
+    Args:
+        plot: With ``odometry.csv``, or a file of one of the other names.
+        speed: Speed of the robot, m/s: for files that hold times only.
+
+    Raises:
+        RequestError: The file cannot be read, states neither distances nor times, or its rows cannot be matched with the pairs.
+    """
+    return _of_pairs(plot, _read(odometry_file(plot.folder)), speed)
+
+
+def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
+    """Say in words what is missing to know the distance that the robot had driven; None if nothing is.
+
+    Args:
+        plot: The plot.
+        driven: Its odometry, from `read_odometry`.
+        pairs: Those of its pairs for which it must be known.
+    """
+    path = odometry_file(plot.folder)
+    if driven is None:
+        return f"{path} holds times only: give the robot's speed with --speed" if path.exists() else f"there is no {path}"
+    unknown = [pair.name if pair.left is None else readable(pair.left.name) for pair in pairs if pair.name not in driven]
+    if not unknown:
+        return None
+    others = f" and {len(unknown) - 3} others" if len(unknown) > 3 else ""
+    return f"{path} has no row for {', '.join(unknown[:3])}{others}: its column left must name them"
+
+
+def _of_pairs(plot: PlotFolder, table: _Table | None, speed: float | None) -> dict[str, float] | None:
+    if table is None:
+        return None
+    if table.distances is not None:
+        values = table.distances
+    elif speed is None or table.times is None:
+        return None
+    else:
+        values = (table.times + table.start) * speed if abs(table.start) < 1e6 else table.times * speed
+    if table.names is not None:
+        return _by_name(plot, table.names, values)
+    if len(values) == len(plot.pairs):
+        return {pair.name: float(value) for pair, value in zip(plot.pairs, values)}
+    by_time = _by_time(plot, table, values)
+    if by_time is None:
+        raise RequestError(
+            f"{table.path} has {len(values)} rows for {len(plot.pairs)} pairs, so nobody can tell which is which: "
+            "add a column left with the names of the left images"
+        )
+    return by_time
+
+
+def _by_name(plot: PlotFolder, names: list[str], values: np.ndarray) -> dict[str, float]:
+    """Distances of rows that name a left image, with its path or without, whatever the case, with what ends it or without."""
+    exact: dict[str, str] = {}
+    loose: dict[str, set[str]] = {}
+    for pair in plot.pairs:
+        if pair.left:
+            name = readable(pair.left.name)
+            exact[name] = pair.name
+            for other in (name.lower(), readable(pair.left.stem).lower()):
+                loose.setdefault(other, set()).add(pair.name)
+    driven: dict[str, float] = {}
+    for written, value in zip(names, values):
+        name = re.split(r"[/\\]", written)[-1]
+        alike = loose.get(name.lower(), set())
+        pair = exact.get(name) or (next(iter(alike)) if len(alike) == 1 else None)
+        if pair is not None:
+            driven[pair] = float(value)
+    return driven
+
+
+def _by_time(plot: PlotFolder, table: _Table, values: np.ndarray) -> dict[str, float] | None:
+    """Distances at the times that left images have in their names, between those of the rows; None where there are no times."""
+    taken = {pair.name: seconds_in(readable(pair.left.stem)) for pair in plot.pairs if pair.left}
+    times = table.times
+    if times is None or len(times) < 2 or (np.diff(times) < 0).any() or not taken or None in taken.values():
+        return None
+    period = float(np.median(np.diff(times)))
+    moments = {name: float(moment - table.start) for name, moment in taken.items() if moment is not None}
+    inside = {name: moment for name, moment in moments.items() if -period <= moment <= times[-1] + period}
+    return {name: float(np.interp(moment, times, values)) for name, moment in inside.items()} if inside else None
+
+
+def _read(path: Path) -> _Table | None:
+    """The odometry of a file; None where there is no such file.
+
+    Raises:
+        RequestError: It cannot be read, or holds something else.
+    """
+    if not path.exists():
+        return None
+    text = read_table_text(path, _MAX_ODOMETRY)
+    return _printed(path, text) or _tabled(path, text)
+
+
+def _printed(path: Path, text: str) -> _Table | None:
+    """Odometry, or fixes of GPS, as ROS prints them; None where the text is none."""
+    messages = re.split(r"^---\s*$", text, flags=re.MULTILINE)
+    for pattern in (_PRINTED_PLACE, _PRINTED_GLOBE):
+        found = [(_PRINTED_STAMP.search(message), pattern.search(message)) for message in messages]
+        rows = [(stamp, place) for stamp, place in found if place is not None]
+        if not rows:
+            continue
+        places = np.array([[float(number) for number in place.groups()] for _, place in rows])
+        if not np.isfinite(places).all():
+            raise RequestError(f"{path} holds something that is no number: distances and times must be finite numbers")
+        stamps = [int(stamp[1]) + int(stamp[2]) * 1e-9 for stamp, _ in rows if stamp is not None]
+        times = np.array(stamps) - stamps[0] if len(stamps) == len(rows) else None
+        metres = places if pattern is _PRINTED_PLACE else _on_plane(places)
+        return _Table(path, None, times, stamps[0] if times is not None else 0.0, _along(metres))
+    return None
+
+
+def _tabled(path: Path, text: str) -> _Table:
+    """Odometry of a table.
+
+    Raises:
+        RequestError: A column or a number is missing.
+    """
+    columns, rows, comma = cells(path, text)
+    columns = [name.lower() for name in columns]
+    metres = [(place, _METRES[match[1]]) for place, name in enumerate(columns) if (match := _DISTANCE.fullmatch(name))]
+    time = _time_column(columns)
+    places = next((names for names in (*_POSITIONS, *_GLOBE) if set(names[:2]) <= set(columns)), None)
+    left = next((columns.index(name) for name in _LEFT if name in columns), None)
+    if not metres and time is None and places is None:
+        said = next((name for name in columns if name in ("distance", "dist", "odometer")), None)
+        hint = f" (its column {said} does not say its unit)" if said else ""
+        raise RequestError(f"{path} needs a column distance_m, or time_s and --speed{hint}")
+
+    def column(place: int) -> np.ndarray:
+        return np.array([_number(row[place] if place < len(row) else "", path, line, comma) for line, row in rows], float)
+
+    names = None if left is None else [unescape_cell(row[left].strip()) if left < len(row) else "" for _, row in rows]
+    distances: np.ndarray | None = None
+    if metres:
+        distances = column(metres[0][0]) * metres[0][1]
+    elif places is not None:
+        values = np.stack([column(columns.index(name)) for name in places if name in columns], axis=1)
+        distances = _along(_on_plane(values) if places in _GLOBE else values) if len(values) else np.zeros(0)
+    times, start = None, 0.0
+    if time is not None and (distances is None or names is None):
+        times, start = _seconds(column(time), columns[time], path)
+    return _Table(path, names, times, start, distances)
+
+
+def _time_column(columns: list[str]) -> int | None:
+    named = [place for place, name in enumerate(columns) if _TIME.fullmatch(name) or name in (*_ROS_TIMES, *_PLAIN_TIMES)]
+    return named[0] if named else None
+
+
+def _seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, float]:
+    """Times from the first one on, and the first one, s."""
+    match = _TIME.fullmatch(name)
+    largest = float(np.abs(values).max(initial=0.0))
+    if match and match[1] == "s" and largest > _MOST_SECONDS:
+        unit = "ns" if largest > 1e17 else "us" if largest > 1e14 else "ms"
+        raise RequestError(f"{path}: {name} holds {largest:.0f}, which are no seconds: name the column time_{unit} or mend it")
+    if match:
+        factor = _SECONDS[match[1]]
+    elif name in _ROS_TIMES:
+        factor = 1e-9
+    else:
+        factor = next((factor for limit, factor in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)) if largest > limit), 1.0)
+    start = float(values[0]) if len(values) else 0.0
+    return (values - start) * factor, start * factor
+
+
+def _on_plane(degrees: np.ndarray) -> np.ndarray:
+    """Positions [N, 2], m, of latitudes and longitudes [N, 2]."""
+    turned = np.radians(degrees - degrees[:1])
+    return _EARTH * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
+
+
+def _along(places: np.ndarray) -> np.ndarray:
+    """Distances [N] along the straight line that positions [N, 2 or 3] follow: what they stray to its sides is no way."""
+    if not np.isfinite(places).all() or np.abs(places).max(initial=0.0) > 1e9:
+        return np.full(len(places), np.nan)
+    centred = places - places.mean(axis=0)
+    direction = np.linalg.svd(centred, full_matrices=False)[2][0] if len(places) > 1 else np.eye(places.shape[1])[0]
+    along = centred @ direction
+    along = along if along[-1] >= along[0] else -along
+    return along - along[0]
+
+
+def _number(cell: str, path: Path, line: int, comma: bool) -> float:
+    text = unescape_cell(cell.strip())
+    try:
+        value = float(text.replace(",", ".") if comma else text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        shown = readable(text)[:40]
+        raise RequestError(
+            f"{path} holds something that is no number in line {line} ('{shown}'): distances and times must be finite"
+        )
+    return value
