@@ -99,6 +99,14 @@ def test_the_last_columns_of_both_cameras_count(tmp_path):
         read_calibration(tmp_path)
 
 
+def test_cameras_above_each_other_are_refused(tmp_path):
+    for side, shifts in (("left", (0, 0)), ("right", (0, -5e4))):  # millimetres
+        matrix = [500, 0, 319.5, shifts[0], 0, 500, 239.5, shifts[1], 0, 0, 1, 0]
+        (tmp_path / f"{side}.yaml").write_text(f"width: 640\nheight: 480\nP: {matrix}\n")
+    with pytest.raises(RequestError, match="cameras above each other"):
+        read_calibration(tmp_path, "mm")
+
+
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
