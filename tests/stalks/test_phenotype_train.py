@@ -229,6 +229,9 @@ def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):
     assert settings.density == TINY.density and settings.band_lines == 80.0
     (example,) = annotated_examples(tmp_path, settings)
     assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 88.0
+    without = [line for line in (tmp_path / "calibration.yaml").read_text().splitlines() if not line.startswith("image_")]
+    (tmp_path / "calibration.yaml").write_text("\n".join(without))  # of images that say their size themselves
+    assert settings_for(tmp_path, TINY) == settings
     write_calibration(tmp_path / "calibration.yaml", Calibration(80, 60, usual, (39.5, 29.5), 0.1))
     with pytest.raises(RequestError, match=r"row.png has 64 x 60 pixels, but the calibration is for 80 x 60"):
         settings_for(tmp_path, TINY)

@@ -235,7 +235,7 @@ def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | 
     path = find_calibration(folder)
     if path is None:
         return dict.fromkeys((image["id"] for image in images), None)
-    calibration = read_calibration(path)
+    calibration = read_calibration(path, image=folder / images[0]["file_name"])
     for image in images:
         check_size(calibration, image["width"], image["height"], str(folder / image["file_name"]))
     return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
