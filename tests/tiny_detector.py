@@ -4,6 +4,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 
 IMAGE = (60, 64)
 TINY = Settings(
+    density=2168 * 64 / 3376 / 0.8,
     width=64,
     full_width=64,
     snip_lines=32,

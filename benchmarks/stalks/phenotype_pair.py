@@ -19,10 +19,10 @@ import numpy as np
 from benchmarks.stalks.worker_rate import Once, options, print_rate, timed
 from jaxrl_vis.host.provenance import device_name
 from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad
-from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, reduce
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, resize
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 from jaxrl_vis.stalks.phenotyping.measure.ground import find_ground
-from jaxrl_vis.stalks.phenotyping.track.sightings import find_with_ground, grey_at, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, find_with_ground, grey_at, measure_pair
 from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -64,13 +64,14 @@ if __name__ == "__main__":
     whole = timed(once, asked.repeats)
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
     print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first one, which compiles, {first:.1f} s")
-    small = pad(reduce(left, settings.width)[0])
+    density = stated.focal / USUAL_DISTANCE
+    small = pad(resize(left, settings, density)[0])
     dtype = finder.dtype
     parts = {
         "image to the device": lambda: jax.block_until_ready(jax.device_put(left)),
-        "reduced image": lambda: reduce(left, settings.width),
+        "reduced image": lambda: resize(left, settings, density),
         "detector": lambda: jax.block_until_ready(detect(params["detector"], small, settings, dtype)),
-        "all of finding, with masks and edges": lambda: finder(left),
+        "all of finding, with masks and edges": lambda: finder(left, density),
         "ground, beside that": lambda: find_ground(grey_at(left), grey_at(right), stated),
         "disparities and widths": lambda: measure_pair(detections, left, right, stated, ground=ground),
     }

@@ -49,7 +49,9 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         views = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
         ideal = perfect_detections(map(dataclasses.asdict, views), instance)
-        finds, ground = find_with_ground((lambda image, ideal=ideal: ideal) if options.truth else finder, left, right, stated)
+        finds, ground = find_with_ground(
+            (lambda image, density, ideal=ideal: ideal) if options.truth else finder, left, right, stated
+        )
         sightings = measure_pair(finds, left, right, stated, ground=ground)
         owners, _ = match(finds, views)
         for find, sighting, owner in zip(finds, sightings, owners):

@@ -223,6 +223,14 @@ def test_the_folders_of_images_say_which_pair_of_kitti(tmp_path):
         read_calibration(path)
 
 
+def test_the_coloured_pair_of_kitti(tmp_path):
+    """Both of its cameras stand beside the first grey one, and not quite at one height."""
+    rows = "{0} 721.5377 0 609.5593 {1} 0 721.5377 172.854 {2} 0 0 1 {3}\n"
+    text = rows.format("P2:", 44.85728, 0.2163791, 0.002745884) + rows.format("P3:", -339.5242, 2.199936, 0.002729905)
+    found = read_calibration(put(tmp_path, {"calib.txt": text}) / "calib.txt", None, image(tmp_path, (1242, 375)))
+    assert found.baseline == pytest.approx(0.5327, abs=1e-4)
+
+
 REFUSED = {
     "a size that no image gives": ({"rig.yml": OPENCV}, None, "add image_width and image_height"),
     "an image that was cropped": ({"rig.yml": OPENCV}, (400, 480), "far from the middle"),

@@ -193,8 +193,8 @@ def test_snips_at_the_images_edge_are_black_beyond_it():
 
 
 def test_smaller_images_have_smaller_snips():
-    assert snip_shape(3376, (640, 128), 3376) == (640, 128)
-    assert snip_shape(1688, (640, 128), 3376) == (320, 64)
+    assert snip_shape((640, 128), 1.0) == (640, 128)
+    assert snip_shape((640, 128), 0.5) == (320, 64)
 
 
 # --- learning ---
@@ -429,12 +429,14 @@ def test_annotations_of_voc_and_labelme_are_those_of_coco(tmp_path):
         (image,), (annotation,) = data["images"], data["annotations"]
         assert image["file_name"] == "row.png" and (image["width"], image["height"]) == (64, 60)
         assert annotation["bbox"] == [10, 4, 10, 40]
+    (tmp_path / "empty").mkdir()
     with pytest.raises(RequestError, match="there are no annotations in"):
-        read_annotations(tmp_path)
+        read_annotations(tmp_path / "empty")
     (tmp_path / "voc" / "row.xml").write_text("<annotation>")
     with pytest.raises(RequestError, match="row.xml is no annotation of Pascal VOC"):
         read_annotations(tmp_path / "voc")
     (tmp_path / "labelme" / "row.json").write_text("{}")
+    (tmp_path / "labelme" / "row.png").touch()  # without it, any other file may be called so
     with pytest.raises(RequestError, match="row.json is no annotation of LabelMe"):
         read_annotations(tmp_path / "labelme")
 

@@ -190,7 +190,9 @@ def test_odometry_that_contradicts_the_images_gives_no_count(plots, results, tmp
         assert run(plot, tmp_path / str(factor) / "out") == 0
         (row,) = table(tmp_path / str(factor) / "out" / "plots.csv")
         assert row["flag"] == flag and row["stalks"] == (own["stalks"] if factor < 0 else "")
-    assert "plot_0000: odometry does not fit the images, so no count" in capsys.readouterr().err
+        assert (row["width_mean_mm"] == "") == (factor > 0)  # which of the two units is wrong, nobody knows
+    told = capsys.readouterr().err
+    assert "plot_0000: odometry does not fit the images (its distances, or the baseline of the calibration, may" in told
 
 
 def test_stalks_without_a_single_width_are_told(plots, results, tmp_path, capsys):
@@ -258,15 +260,18 @@ def test_widths_without_ground_say_so(plots, tmp_path, capsys):
     assert "mm thick, no visible ground" in page and "thick at 12 inches" not in page
 
 
-def test_empty_fields_have_no_stalks(plots, tmp_path):
+def test_nothing_seen_is_no_count(plots, tmp_path, capsys):
+    """It may be an empty plot, or a camera of which the networks know nothing."""
     plot = tmp_path / "plot_0000"
     shutil.copytree(plots / "plot_0000", plot)
     for path in (plot / "truth").glob("instance_*.png"):
         write_image(path, np.zeros_like(read_image(path)))
     assert run(plot, tmp_path / "out") == 0
     (row,) = table(tmp_path / "out" / "plots.csv")
-    assert row["flag"] == "no stalks" and row["stalks"] == "0" and row["width_mean_mm"] == ""
-    assert "no stalks" in (tmp_path / "out" / "qc.html").read_text()
+    assert row["flag"] == "nothing like a row seen" and row["stalks"] == row["stalks_per_m"] == row["width_mean_mm"] == ""
+    assert "nothing like a row seen" in (tmp_path / "out" / "qc.html").read_text()
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("plot_0000: ")]
+    assert line.startswith("plot_0000: nothing like a row seen (0 finds in 4 pairs") and line.endswith(", so no count")
 
 
 def test_disparities_of_ones_own_take_the_right_images_place(plots, results, tmp_path):

@@ -16,8 +16,10 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import initial
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, outlined_mask
 from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
+from jaxrl_vis_envs.plants import Calibration
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +69,7 @@ def test_training_goes_on_from_weights_and_boxes_leave_masks_alone(folder, weigh
     said = capsys.readouterr().out
     assert f"from {weights}" in said and "masks stay as they are" in said and "stalks: stalk (3)" in said
     _, settings, about = read_weights(tmp_path / "more.safetensors")
-    assert settings == TINY  # all the candidates of a new training
+    assert settings == dataclasses.replace(TINY, density=0.0)  # all the candidates of a new training
     assert about["origin"] == f"annotated images, from {weights}"
     changes = differences(tmp_path / "more.safetensors", weights)
     assert changes["detector"] > 1e-3 and changes["segmenter"] == 0.0
@@ -215,6 +217,24 @@ def test_a_box_that_is_not_there_is_the_one_around_the_mask(tmp_path, segmentati
         (found,) = read_annotations(coco_folder(tmp_path, {"segmentation": segmentation, **annotation}))["annotations"]
         assert found["bbox"] == BOX
     assert settings_for(tmp_path, TINY).band_lines == 40.0
+
+
+def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):
+    """Without one, images are reduced to one width, and so are those that the networks are used on."""
+    coco_folder(tmp_path, {"bbox": BOX})
+    assert settings_for(tmp_path, TINY).density == 0.0
+    usual = TINY.density * 0.8
+    write_calibration(tmp_path / "calibration.yaml", Calibration(IMAGE[1], IMAGE[0], 0.5 * usual, (31.5, 29.5), 0.1))
+    settings = settings_for(tmp_path, TINY)
+    assert settings.density == TINY.density and settings.band_lines == 80.0
+    (example,) = annotated_examples(tmp_path, settings)
+    assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 88.0
+    without = [line for line in (tmp_path / "calibration.yaml").read_text().splitlines() if not line.startswith("image_")]
+    (tmp_path / "calibration.yaml").write_text("\n".join(without))  # of images that say their size themselves
+    assert settings_for(tmp_path, TINY) == settings
+    write_calibration(tmp_path / "calibration.yaml", Calibration(80, 60, usual, (39.5, 29.5), 0.1))
+    with pytest.raises(RequestError, match=r"row.png has 64 x 60 pixels, but the calibration is for 80 x 60"):
+        settings_for(tmp_path, TINY)
 
 
 # --- masks from outlines ---

@@ -69,12 +69,42 @@ def matrices(
 
 def test_millimetres_are_not_taken_for_metres(tmp_path):
     millimetres = matrices(tmp_path / "mm.yaml", 100.0)
-    with pytest.raises(RequestError, match="it seems to be in mm, so say --calibration-unit mm"):
+    with pytest.raises(RequestError, match=r"--calibration-unit mm if the chessboard was measured in mm \(0.1 m\)"):
         read_calibration(millimetres)
     assert read_calibration(millimetres, "mm").baseline == pytest.approx(0.1)
     assert read_calibration(matrices(tmp_path / "said.yaml", 100.0, unit="mm")).baseline == pytest.approx(0.1)
-    with pytest.raises(RequestError, match="it seems to be in m, so say --calibration-unit m"):
+    with pytest.raises(RequestError, match=r"--calibration-unit m if the chessboard was measured in m \(0.1 m\)"):
         read_calibration(matrices(tmp_path / "m.yaml", 0.1), "mm")
+
+
+@pytest.mark.parametrize(
+    ("length", "unit", "told"), [(10.0, "cm", "cm if"), (4.16667, "24mm", "24mm if it was counted in squares")]
+)
+def test_chessboards_in_centimetres_and_squares(tmp_path, length, unit, told):
+    file = matrices(tmp_path / "board.yaml", length)
+    with pytest.raises(RequestError, match=f"no stereo pair's: say .*--calibration-unit {told}"):
+        read_calibration(file)
+    assert read_calibration(file, unit).baseline == pytest.approx(0.1, rel=1e-4)
+    with pytest.raises(RequestError, match="must be m, cm or mm, or the side of a square"):
+        read_calibration(file, "feet")
+
+
+def test_the_last_columns_of_both_cameras_count(tmp_path):
+    """Where both are written from a third one, the baseline is their difference; equal ones are no pair's."""
+    for side, place in (("left", 0.05), ("right", 0.15)):
+        (tmp_path / f"{side}.yaml").write_text(ros(CAMERAS, place))
+    assert read_calibration(tmp_path).baseline == pytest.approx(0.1)
+    (tmp_path / "left.yaml").write_text(ros(CAMERAS, 0.15))
+    with pytest.raises(RequestError, match="baseline of 0"):
+        read_calibration(tmp_path)
+
+
+def test_cameras_above_each_other_are_refused(tmp_path):
+    for side, shifts in (("left", (0, 0)), ("right", (0, -5e4))):  # millimetres
+        matrix = [500, 0, 319.5, shifts[0], 0, 500, 239.5, shifts[1], 0, 0, 1, 0]
+        (tmp_path / f"{side}.yaml").write_text(f"width: 640\nheight: 480\nP: {matrix}\n")
+    with pytest.raises(RequestError, match="cameras above each other"):
+        read_calibration(tmp_path, "mm")
 
 
 @pytest.mark.parametrize(
@@ -85,7 +115,7 @@ def test_millimetres_are_not_taken_for_metres(tmp_path):
         (dict(baseline=0.1, right_focal=510.0), "not rectified"),
         (dict(baseline=0.1, size=False), "add image_width and image_height"),
         (dict(baseline=0.1, focal=5.0, right_focal=5.0), "focal length of 5 pixels"),
-        (dict(baseline=0.1, unit="inch"), "unit must be m or mm"),
+        (dict(baseline=0.1, unit="inch"), "unit must be m, cm or mm"),
         (dict(baseline=1e5), "no stereo pair's"),
     ],
 )
@@ -116,7 +146,7 @@ def test_bad_calibrations_are_told_in_one_line(tmp_path, arguments, part):
         (f'P1: {LEFT}\nP2: {LEFT}\nimage_width: "640"\nimage_height: 480', "image_width and image_height must be numbers"),
         (f"P1: {LEFT}\nP2: {LEFT}\nimage_width: 640\nimage_height: .Inf", "image_width and image_height must be numbers"),
         (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640, x]", "image_size must be numbers"),
-        (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640, 480]\nunit: 5", "unit must be m or mm"),
+        (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640, 480]\nunit: 5", "unit must be m, cm or mm"),
         (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [1e9, 480]", "image_size must be numbers"),
         (f"P1: {LEFT}\nP2: {LEFT}\nimage_size: [640.5, 480]", "image_size must be numbers"),
         ("P2: &a [1]\nP1: *a", "a reference to another place"),

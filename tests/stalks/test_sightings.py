@@ -1,6 +1,7 @@
 """From folders of pairs to stalks: which images belong together, which sightings are one stalk, how good finds are."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
 
 BLANK = np.full((12, 16, 3), 80, np.uint8)
-CAMERAS = Calibration(1500, 1200, 1000.0, (0.0, 600.0), 0.1)
+CAMERAS = Calibration(1500, 1200, 1000.0, (749.5, 600.0), 0.1)
 
 
 # --- folders ---
@@ -107,7 +108,7 @@ def test_odometry_by_distance_time_and_name(tmp_path):
 
 def sighting(along: float, depth: float = 0.8, **parts) -> Sighting:
     values = dict(diameter_mm=14.0, deviation_mm=0.1, depth_m=depth, along_m=along, confidence=0.8)
-    column = 1000.0 * (along + 0.05) / depth
+    column = 749.5 + 1000.0 * (along + 0.05) / depth
     return Sighting((column - 20, 0, column + 20, 500), (column, column), 0.9, 250.0, column, **{**values, **parts})  # pyright: ignore[reportArgumentType]
 
 
@@ -258,7 +259,21 @@ def test_widths_are_medians_with_an_error():
     assert width is not None and width.mm == pytest.approx(14.05, abs=0.06) and 0.03 < width.error < 0.3 and width.count == 6
     assert robust_width([sighting(0.0, diameter_mm=None)]) is None
     one = robust_width(sightings[:1])
-    assert one is not None and one.error == pytest.approx(0.1)
+    assert one is not None and one.scatter == pytest.approx(0.1)
+
+
+def test_errors_of_widths_hold_what_pairs_share():
+    """Of pairs that agree exactly: masks that err alike, a calibration, and edges that may be hidden."""
+
+    def error(**parts) -> float:
+        width = robust_width([sighting(0.0, diameter_mm=14.0, deviation_mm=0.0, **parts) for _ in range(9)])
+        assert width is not None and width.scatter == 0.0
+        return width.error
+
+    assert error() == pytest.approx(0.07)
+    assert error(width_px=14.0) == pytest.approx(math.hypot(0.7, 0.07))
+    assert error(width_px=140.0) < 0.15 * error(width_px=14.0) + 0.07
+    assert error(hidden=True) == pytest.approx(math.hypot(0.8, 0.07))
 
 
 def test_widths_are_those_at_12_and_24_inches():
@@ -340,12 +355,21 @@ def test_average_precision_and_the_figures_of_plots():
     assert average_precision(np.array([[0.9, 0], [0.8, 1]]), 1) == pytest.approx(0.5)
     assert average_precision(np.zeros((0, 2)), 3) == 0.0
     scores = [
-        PlotScore(0, 30, 29, np.array([[14.0, 13.0], [12.0, 12.5]]), np.array([[0.9, 1.0], [0.2, 1.0]]), 2),
+        PlotScore(
+            0,
+            30,
+            29,
+            np.array([[14.0, 13.0], [12.0, 12.5]]),
+            np.array([[0.9, 1.0], [0.2, 1.0]]),
+            2,
+            errors=np.array([0.5, 0.3]),
+        ),
         PlotScore(1, 40, 41, np.zeros((0, 2)), np.zeros((0, 2)), 1),
     ]
     figures = summary(scores)
     assert figures["count_r2"] == pytest.approx(1.0 - 2.0 / 50.0) and figures["count_mae"] == 1.0
     assert figures["width_mae_mm"] == pytest.approx(0.75) and figures["width_bias_mm"] == pytest.approx(0.25)
+    assert figures["width_coverage_95"] == 0.5  # 1 mm beside, of 0.98, and 0.5 of 0.59
     assert figures["precision"] == 1.0 and figures["recall"] == pytest.approx(1 / 3)
     # Both finds, of scores .9 and .2, are right; one stalk of three is found by none.
     assert figures["f1_best"] == pytest.approx(0.8) and figures["f1_best_least_score"] == 0.2

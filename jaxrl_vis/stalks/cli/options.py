@@ -189,8 +189,9 @@ class CameraOptions:
     """Calibration of all folders: a file of OpenCV, RealSense, Middlebury or KITTI, or a folder with left.yaml and right.yaml
     of ROS. If not given, the one that lies in each folder: calibration.yaml, extrinsics.yml, calib.txt, left.yaml and
     right.yaml. Without one there are no metric lengths."""
-    calibration_unit: Literal["m", "mm"] | None = None
-    """Unit of the calibration's baseline, where the file does not say it."""
+    calibration_unit: str | None = None
+    """Unit of the calibration's baseline, where the file does not say it: m, cm or mm, or the side of a square of the
+    chessboard, as 24mm, where it was counted in squares."""
     speed: float | None = None
     """Speed of the robot in m/s, for an odometry.csv that holds times only."""
 

@@ -136,5 +136,6 @@ def _start(options: Train) -> tuple[Any, "Settings", str]:
         return None, fitting, ""
     # What was learned goes with its anchors, so those of the annotations are not taken. How many candidates there are is no
     # part of it: what the head has not seen yet it learns now.
-    settings = dataclasses.replace(settings, candidates=Settings().candidates)
+    density = settings.density if fitting is None else fitting.density
+    settings = dataclasses.replace(settings, density=density, candidates=Settings().candidates)
     return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"

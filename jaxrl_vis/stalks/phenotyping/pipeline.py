@@ -34,6 +34,7 @@ from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
 from jaxrl_vis.stalks.phenotyping.report.qc import Page, PlotResult
 from jaxrl_vis.stalks.phenotyping.report.tables import (
+    NO_ROW,
     PLOT_COLUMNS,
     STALK_COLUMNS,
     Origin,
@@ -45,13 +46,13 @@ from jaxrl_vis.stalks.phenotyping.report.tables import (
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
-from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, Sighting, find_with_ground, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, Sighting, view_pair
 from jaxrl_vis.stalks.results_folder import claim, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
-Find = Callable[[np.ndarray, PlotFolder, PairFiles], list[Detection]]
-"""Finds the stalks of a left image [H, W, 3] uint8."""
+Find = Callable[[np.ndarray, float | None, PlotFolder, PairFiles], list[Detection]]
+"""Finds the stalks in a left image [H, W, 3] uint8 with so many pixels per metre at the row; None if nobody knows."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")
@@ -159,7 +160,7 @@ def _run(
         ]
         result = _finish(plot, records, driven[plot.name], request, run_all)
         if result.row["stalks"] == "":
-            why = why_no_odometry(plot, driven[plot.name], plot.pairs) if result.row["flag"] == NO_ODOMETRY else None
+            why = _why_no_count(result, plot, driven[plot.name])
             say(plot.name, result.row["flag"] + ("" if why is None else f" ({why})"))
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
@@ -170,12 +171,29 @@ def _run(
     return rows, skipped
 
 
+def _why_no_count(result: PlotResult, plot: PlotFolder, driven: dict[str, float] | None) -> str | None:
+    """Return more words than the flag has on why a plot has no count; None where there is no more to say."""
+    flag = result.row["flag"]
+    if flag == NO_ODOMETRY:
+        return why_no_odometry(plot, driven, plot.pairs)
+    if flag == NO_FIT:
+        return "its distances, or the baseline of the calibration, may be in another unit"
+    if flag != NO_ROW:
+        return None
+    finds = sum(map(len, result.frames))
+    return (
+        f"{finds} finds in {len(result.frames)} pairs, none of which counts: unless the plot is empty, its images are not "
+        "such as the networks know, see its overlays"
+    )
+
+
 def _is_whole(record: dict[str, Any]) -> bool:
     """Return True for a record of sightings; a pair that was skipped is tried again."""
     lines, columns = record["size"]
+    first, last = record["columns"]
     for values in record["sightings"]:
         Sighting.read(values)
-    return isinstance(lines, int) and isinstance(columns, int)
+    return all(isinstance(count, int) for count in (lines, columns, first, last))
 
 
 def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
@@ -196,19 +214,21 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
     try:
         left, right = read_pair(pair, calibration, pair.disparity is None)
         disparity = known_disparity(pair, left, request.disparity_scale)
-        detections, ground = find_with_ground(lambda image: find(image, plot, pair), left, right, calibration, disparity)
     except Unusable as problem:
         return {"skipped": str(problem)}
-    sightings = measure_pair(detections, left, right, calibration, request.method, ground, disparity)
-    wrong = (
-        None if calibration is None or disparity is not None else pair_fault(detections, sightings, left, right, calibration)
+    view = view_pair(
+        lambda image, density: find(image, density, plot, pair), left, right, calibration, request.method, disparity
     )
+    wrong = None
+    if calibration is not None and disparity is None:
+        wrong = pair_fault(view.detections, view.sightings, left, right, calibration, view.ground)
     if wrong is not None:
         return {"skipped": wrong}
     return {
         "size": list(left.shape[:2]),
-        "camera_height_m": None if ground is None else round(ground.camera_height, 4),
-        "sightings": [dataclasses.asdict(sighting) for sighting in sightings],
+        "columns": list(view.columns),
+        "camera_height_m": None if view.ground is None else round(view.ground.camera_height, 4),
+        "sightings": [dataclasses.asdict(sighting) for sighting in view.sightings],
     }
 
 
@@ -226,10 +246,12 @@ def _finish(
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     drive = None
     if calibration is not None and driven is not None and known and len(usable) >= 2:
-        drive = follow_either_way(frames, np.array([driven[pair.name] for pair, _ in usable]), calibration)
+        first, last = np.median([record["columns"] for _, record in usable], axis=0)
+        driven_at = np.array([driven[pair.name] for pair, _ in usable])
+        drive = follow_either_way(frames, driven_at, calibration, (float(first), float(last)))
         why = NO_FIT
     if drive is None or not drive.fits:
-        stalks, row = rows_without_path(frames, skipped, origin, why)
+        stalks, row = rows_without_path(frames, skipped, origin, why, metric=why != NO_FIT)
     else:
         tracks, path = drive.tracks, drive.path
         labels = sighting_labels(frames, tracks)

@@ -21,9 +21,12 @@ class Settings:
     """Settings that are fixed with the weights, and stored beside them.
 
     Attributes:
-        width: Pixels to which the width of an image is reduced before stalks are looked for; narrower ones stay as they are.
-        full_width: Pixels of the widest images, in which snips have `snip_lines` and `snip_columns`; of narrower ones they are
-            smaller in proportion.
+        density: Pixels per metre at the row that an image is resized to before stalks are looked for; 0 for networks that
+            learned from images of unknown cameras, which are reduced to `width`.
+        width: Width of such an image of the cameras of `density`, pixels. Images of unknown cameras are reduced to it;
+            narrower ones stay as they are.
+        full_width: Width in pixels of the images in which snips have `snip_lines` and `snip_columns`; in images with fewer
+            pixels per metre they are smaller in proportion.
         snip_lines, snip_columns: Size of a snip.
         band_lines: Height of the band in an image that was reduced, pixels.
         anchor_widths: Widths of the boxes that are proposed, pixels there.
@@ -38,6 +41,7 @@ class Settings:
         least_score: Lowest score of a detection.
     """
 
+    density: float = 677.5
     width: int = 844
     full_width: int = 3376
     snip_lines: int = 640
@@ -53,6 +57,16 @@ class Settings:
     proposal_threshold: float = 0.7
     threshold: float = 0.4
     least_score: float = 0.05
+
+    def resizing(self, width: int, density: float | None) -> float:
+        """Factor by which an image is resized before stalks are looked for.
+
+        Args:
+            width: Width of the image, pixels.
+            density: Pixels per metre at the row; None if nothing is known of the camera, which then is taken to see as wide a
+                part of the row as those that the networks learned from.
+        """
+        return self.density / density if density and self.density else self.width / width
 
     def detector(self, dtype: Any = jnp.float32) -> Detector:
         """The network that these settings describe."""

@@ -13,10 +13,13 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, put_back, smoothed, snip_shape
+from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 
 _BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # snips that go through the network together
+_SHOWN = 0.5  # of a stalk's axis that must not lie on a border of the image
+_MAX_ENLARGED = 3.0  # beyond that, a stalk is three pixels wide and nothing tells it from others
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,13 +61,26 @@ def higher_up(stalk: np.ndarray) -> np.ndarray:
     return np.array([min(ends) - half, first, max(ends) + half, last, *ends], np.float32)
 
 
-def reduce(image: np.ndarray, width: int) -> tuple[np.ndarray, tuple[float, float]]:
-    """An image [H, W, 3] uint8 as stalks are looked for in it, and by how much its lines and columns are fewer."""
+def resize_factor(width: int, settings: Settings, density: float | None) -> float:
+    """Factor by which `resize` resizes an image ``width`` pixels wide: only where its density is known it is enlarged."""
+    return min(settings.resizing(width, density), _MAX_ENLARGED if density and settings.density else 1.0)
+
+
+def resize(image: np.ndarray, settings: Settings, density: float | None) -> tuple[np.ndarray, tuple[float, float]]:
+    """Resize an image [H, W, 3] uint8 as stalks are looked for in it; also return its lines and columns for each new one.
+
+    Args:
+        image: The image.
+        settings: Settings of the networks.
+        density: Pixels per metre at the row; None if unknown.
+    """
     height, across = image.shape[:2]
-    if across <= width:
+    factor = resize_factor(across, settings, density)
+    lines, columns = max(round(height * factor), 1), max(round(across * factor), 1)
+    if (lines, columns) == (height, across):
         return image, (1.0, 1.0)
-    lines = max(round(height * width / across), 1)
-    return cv2.resize(image, (width, lines), interpolation=cv2.INTER_AREA), (height / lines, across / width)
+    how = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_LINEAR
+    return cv2.resize(image, (columns, lines), interpolation=how), (height / lines, across / columns)
 
 
 def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
@@ -76,7 +92,7 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
 def _segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
     """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle.
 
-    Snips of smaller images are enlarged to the ``full`` size: the network knows stalks that are as many pixels wide as there.
+    Snips of another resolution are resized to the ``full`` size: the network knows stalks that are as many pixels wide there.
     """
     count, *shape = snips.shape[:3]
     enlarged = jax.image.resize(snips.astype(jnp.float32), (count, *full, 3), "linear")
@@ -103,22 +119,38 @@ class Finder:
         self.dtype = jnp.bfloat16 if accelerated else jnp.float32
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
 
-    def __call__(self, image: np.ndarray) -> list[Detection]:
-        """Stalks of an image [H, W, 3] uint8, from left to right, each of them once."""
+    def __call__(self, image: np.ndarray, density: float | None = None) -> list[Detection]:
+        """Stalks of an image, from left to right, each of them once.
+
+        Args:
+            image: [H, W, 3] uint8.
+            density: Pixels per metre at the row; None if nothing is known of the camera.
+        """
+        frame = find_frame(image)
+        detections = self._find(fill_borders(image, frame), density, frame)
+        return [_moved(detection, frame) for detection in sorted(detections, key=lambda detection: sum(detection.axis))]
+
+    def _find(self, image: np.ndarray, density: float | None, frame: Frame) -> list[Detection]:
+        """Stalks of an image [h, w, 3] uint8, in which a frame shows a scene."""
         settings = self._settings
-        reduced, scale = reduce(image, settings.width)
+        reduced, scale = resize(image, settings, density)
+        share = settings.width / settings.full_width / settings.resizing(image.shape[1], density)
         stalks_found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
         selected = np.flatnonzero(stalks_found.valid & (stalks_found.scores >= self._least))
         stalks, scores = in_image(stalks_found.stalks[selected], scale), stalks_found.scores[selected]
+        inside = np.array([_is_shown(stalk, frame) for stalk in stalks], bool)
+        stalks, scores = stalks[inside], scores[inside]
         on_device = jnp.asarray(image)
-        pieces = self._pieces(on_device, stalks, self._settings.snip_lines)
+        pieces = self._pieces(on_device, stalks, settings.snip_lines, share)
+        pieces = [(_without_border(mask, corner, frame), corner) for mask, corner in pieces]
         once = np.flatnonzero(without_duplicates(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
         strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
         higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
         shown = [place for place, upper in enumerate(higher) if upper is not None]
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
-        upper = dict(zip(shown, self._pieces(on_device, some, self._settings.snip_lines // 2)))
+        above = self._pieces(on_device, some, settings.snip_lines // 2, share)
+        upper = {place: (_without_border(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
         detections = []
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
@@ -126,18 +158,20 @@ class Finder:
                 box = (left, top, right, bottom)
                 axis = (above, below)
                 detections.append(Detection(box, axis, float(score), mask, corner, upper.get(place), strips[place]))
-        return sorted(detections, key=lambda detection: sum(detection.axis))
+        return detections
 
-    def _pieces(self, image: jax.Array, stalks: np.ndarray, lines: int) -> list[tuple[np.ndarray, tuple[int, int]]]:
-        """Masks and their corners of the snips of stalks [N, 6], which have ``lines`` lines in an image of full width."""
-        snips = self._segment(image, stalks, lines)
+    def _pieces(
+        self, image: jax.Array, stalks: np.ndarray, lines: int, share: float
+    ) -> list[tuple[np.ndarray, tuple[int, int]]]:
+        """Masks and their corners of the snips of stalks [N, 6], which have ``lines`` lines at full resolution."""
+        snips = self._segment(image, stalks, lines, share)
         return [put_back(snip, stalk, (image.shape[0], image.shape[1])) for snip, stalk in zip(snips, stalks)]
 
-    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int) -> np.ndarray:
-        """Masks [N, h, w] float32 of the snips of stalks [N, 6]."""
+    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, share: float) -> np.ndarray:
+        """Masks [N, h, w] float32 of the snips of stalks [N, 6] in an image of a ``share`` of full resolution."""
         settings = self._settings
         full = (lines, settings.snip_columns)
-        shape = snip_shape(on_device.shape[1], full, settings.full_width)
+        shape = snip_shape(full, share)
         if not len(stalks):
             return np.zeros((0, *shape), np.float32)
         masks = []
@@ -147,6 +181,43 @@ class Finder:
             snips = cut(on_device, filled, shape)
             masks.append(_segment(self._params["segmenter"], snips, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
+
+
+def _is_shown(stalk: np.ndarray, frame: Frame) -> bool:
+    """Return True unless most of a stalk's axis [6] lies on a border."""
+    if frame.shown is None:
+        return True
+    shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
+    line, column = (np.linspace(begin, end, 21).astype(int) for begin, end in (stalk[1:4:2], stalk[4:]))
+    there = (line >= 0) & (line < shown.shape[0]) & (column >= 0) & (column < shown.shape[1])
+    return bool(np.mean(shown[line[there], column[there]]) > _SHOWN) if there.any() else False
+
+
+def _without_border(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
+    """Return a mask without the lines in which it reaches a border: the stalk may go on there."""
+    if frame.shown is None or not mask.size:
+        return mask
+    shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
+    here = shown[corner[0] : corner[0] + mask.shape[0], corner[1] : corner[1] + mask.shape[1]]
+    visible = mask.copy()
+    visible[((mask >= 0.5) & ~here).any(axis=1)] = 0
+    return visible
+
+
+def _moved(detection: Detection, frame: Frame) -> Detection:
+    """Return a detection in a frame at its place in the whole image."""
+    down, over = frame.lines[0], frame.columns[0]
+    if not down and not over:
+        return detection
+    left, top, right, bottom = detection.box
+    upper = detection.upper
+    return dataclasses.replace(
+        detection,
+        box=(left + over, top + down, right + over, bottom + down),
+        axis=(detection.axis[0] + over, detection.axis[1] + over),
+        corner=(detection.corner[0] + down, detection.corner[1] + over),
+        upper=None if upper is None else (upper[0], (upper[1][0] + down, upper[1][1] + over)),
+    )
 
 
 def _follow(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:

@@ -56,13 +56,16 @@ def _shared_finder(weights: Path, least_score: float) -> Finder:
     return load_finder(weights, least_score)
 
 
-def find_stalks(weights: Path, least_score: float, image: np.ndarray, plot: Any, pair: Any) -> list[Detection]:
+def find_stalks(
+    weights: Path, least_score: float, image: np.ndarray, density: float | None, plot: Any, pair: Any
+) -> list[Detection]:
     """Find the stalks of an image [H, W, 3] uint8 in any process: `functools.partial` of this can be pickled.
 
     Args:
         weights: File of the weights, which must stay the same while the process lives.
         least_score: Lowest score of a detection, 0 to 1.
         image: Left image.
+        density: Pixels per metre at the row; None if nothing is known of the camera.
         plot, pair: Folder and files of the image, which networks do not need.
     """
-    return _shared_finder(weights, least_score)(image)
+    return _shared_finder(weights, least_score)(image, density)

@@ -15,15 +15,14 @@ _ALONG = 15  # lines of a snip of full size
 _EXPONENT = 0.35
 
 
-def snip_shape(width: int, full: tuple[int, int], full_width: int) -> tuple[int, int]:
-    """Lines and columns of snips of an image ``width`` pixels wide: multiples of 8.
+def snip_shape(full: tuple[int, int], share: float) -> tuple[int, int]:
+    """Lines and columns of snips: multiples of 8.
 
     Args:
-        width: Width of the image.
-        full: Shape of the snips of an image that is ``full_width`` wide.
-        full_width: Pixels.
+        full: Shape of the snips of an image of full resolution.
+        share: Resolution of the image, of the full one.
     """
-    lines, columns = (max(round(length * width / full_width / 8), 2) * 8 for length in full)
+    lines, columns = (max(round(length * share / 8), 2) * 8 for length in full)
     return lines, columns
 
 

@@ -23,6 +23,7 @@ _COMMAND = "jaxrl-vis phenotype train"
 _HINTS = fields.hints(Settings)
 # Least, most, and what it is a multiple of: a file must not ask for a network that no memory holds.
 _SANE: dict[str, tuple[float, float, int]] = {
+    "density": (0, 100_000, 1),
     **dict.fromkeys(("width", "full_width"), (32, 16384, 1)),
     **dict.fromkeys(("snip_lines", "snip_columns"), (16, 2048, 8)),
     **dict.fromkeys(("band_lines", "anchor_widths"), (0.1, 4096, 1)),

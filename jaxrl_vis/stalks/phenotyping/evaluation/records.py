@@ -24,7 +24,7 @@ from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, ThesisSco
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis_envs.plants import Family
 
-SCHEMA = 2
+SCHEMA = 3
 KEPT_SCORE = 0.05
 """Lowest score of recorded detections: others matter for nothing but the far end of the precision curve."""
 
@@ -153,6 +153,7 @@ def _record(score: PlotScore, pairs: int) -> Record:
         "true": score.true,
         "counted": score.counted,
         "widths_mm": score.widths.round(4).tolist(),
+        "width_errors_mm": score.errors.round(4).tolist(),
         "widths_24in_mm": score.upper.round(4).tolist(),
         "seconds_per_pair": None if math.isnan(score.seconds) else round(score.seconds, 4),
         "pairs": pairs,
@@ -179,6 +180,7 @@ def _read(record: Record) -> PlotScore:
         finds=np.stack([np.array(record["scores"], float), right], axis=1),
         stalks=record["stalks_in_view"],
         upper=pairs(record["widths_24in_mm"]),
+        errors=np.array(record["width_errors_mm"], float),
         seconds=math.nan if record["seconds_per_pair"] is None else record["seconds_per_pair"],
         thesis=thesis and ThesisScore(thesis["counted"], pairs(thesis["widths_mm"])),
     )

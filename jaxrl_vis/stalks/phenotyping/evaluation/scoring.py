@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,14 @@ from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.track.follow import follow
 from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, find_with_ground, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import Find, Sighting, find_with_ground, measure_pair
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
 
 MIN_VISIBLE = 0.3
 IOU = 0.5
+_DEVIATIONS_95 = 1.96  # standard errors on either side of a width: its interval of 95 %
 PERSON_SD = 1.45  # mm: of one person with calipers, from the thesis's 1.639 mm between two
 
 
@@ -37,6 +38,7 @@ class PlotScore:
         seed: Seed of the plot.
         true, counted: Stalks.
         widths: [N, 2] float64, measured and true diameter at 12 inches of each stalk that was counted and identified, mm.
+        errors: [N] float64, standard error of each of the measured diameters, mm.
         upper: [M, 2] float64, the same at 24 inches.
         seconds: Time of finding and measuring per pair, from arrays in memory; the first pair, which compiles, is left out.
         thesis: Score of the thesis's methods on the same detections.
@@ -53,6 +55,7 @@ class PlotScore:
     upper: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 2)))
     seconds: float = math.nan
     thesis: "ThesisScore | None" = None
+    errors: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,13 +71,10 @@ class ThesisScore:
     widths: np.ndarray
 
 
-Finder = Callable[[np.ndarray], list[Detection]]
-
-
 def score_plot(
     family: Family,
     seed: int,
-    find: Finder | None,
+    find: Find | None,
     method: Method = "strip",
     least_score: float = 0.5,
     with_thesis: bool = False,
@@ -84,7 +84,7 @@ def score_plot(
     Args:
         family: Family that the plot is drawn from.
         seed: Seed of the plot.
-        find: Detector of the stalks in a left image [H, W, 3] uint8, those of low scores too; None for true boxes and masks.
+        find: Detector of the stalks, those of low scores too; None for true boxes and masks.
         method: Method of widths.
         least_score: Lowest score of a detection that counts.
         with_thesis: Score the thesis's methods on the same detections, too.
@@ -113,7 +113,7 @@ def score_plot(
         finds += scored
         owners.append([matched[place] for place in selected])
     tracks, _ = follow(frames, drive.odometry, drive.stated)
-    widths, upper = [], []
+    widths, upper, errors = [], [], []
     counted = [track for track in tracks if track.counted]
     for track, measured in zip(counted, stalk_widths(frames, counted)):
         names = [owners[frame][place] for frame, place in track.sightings]
@@ -123,6 +123,7 @@ def score_plot(
         stalk = plot.stalks[max(sorted(set(known)), key=known.count)]
         if measured.lower is not None:
             widths.append((measured.lower.mm, true_diameter(stalk)))
+            errors.append(measured.lower.error)
         if measured.upper is not None:
             upper.append((measured.upper.mm, true_diameter(stalk, HEIGHTS[1])))
     return PlotScore(
@@ -135,10 +136,11 @@ def score_plot(
         np.array(upper).reshape(-1, 2),
         float(np.mean(seconds[1:])) if len(seconds) > 1 else math.nan,
         _thesis_score(as_thesis, owners, sequence) if with_thesis else None,
+        np.array(errors, float),
     )
 
 
-def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray) -> list[Detection]:
+def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, density: float | None) -> list[Detection]:
     """True boxes and masks, as a finder that needs no image."""
     return perfect_detections(map(dataclasses.asdict, stalks), instance, MIN_VISIBLE)
 
@@ -212,9 +214,10 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
 
     Returns:
         ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (of the true number), ``width_mae_mm``,
-        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers), the same at 24
-        inches, ``ap50``, ``f1``, ``precision``, ``recall``, the best F1 and the least score that gives it, and how much there
-        was of each. Not a number where there was nothing.
+        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers),
+        ``width_coverage_95`` (share of true widths in the interval of 95 % that is stated), errors of widths at 24 inches,
+        ``ap50``, ``f1``, ``precision``, ``recall``, the best F1 and the least score that gives it, and how much there was of
+        each. Not a number where there was nothing.
     """
     scores = list(scores)
     true = np.array([score.true for score in scores], float)
@@ -223,6 +226,7 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     finds = np.concatenate([score.finds for score in scores]) if scores else np.zeros((0, 2))
     stalks = sum(score.stalks for score in scores)
     error = widths[:, 0] - widths[:, 1]
+    stated = np.concatenate([score.errors for score in scores]) if scores else np.zeros(0)
     upper = np.concatenate([score.upper for score in scores]) if scores else np.zeros((0, 2))
     upper_error = upper[:, 0] - upper[:, 1]
     people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
@@ -239,6 +243,7 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
         "width_mae_mm": _mean(np.abs(error)),
         "width_bias_mm": _mean(error),
         "width_mae_two_people_mm": _mean(np.abs(error - people)),
+        "width_coverage_95": _mean(np.abs(error) <= _DEVIATIONS_95 * stated) if len(stated) == len(error) else float("nan"),
         "widths_24in": len(upper),
         "width_24in_mae_mm": _mean(np.abs(upper_error)),
         "width_24in_bias_mm": _mean(upper_error),

@@ -15,7 +15,7 @@ from jaxrl_vis_envs.documents import read_json
 _FARTHEST = 1e6  # pixels
 
 
-def find_truth(image: np.ndarray, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
+def find_truth(image: np.ndarray, density: float | None, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
     """The stalks of a pair of a synthetic plot.
 
     Raises:

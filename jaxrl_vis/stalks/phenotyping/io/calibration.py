@@ -18,23 +18,23 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Size, Unit
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Size
 from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import both_sides, files_in, named_pair, read_cameras
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
+from jaxrl_vis.stalks.phenotyping.io.units import baseline_in_metres
 from jaxrl_vis_envs.plants import Calibration
 
-_METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3}
-_BASELINES = (0.008, 2.0)  # m: of stereo pairs that look at plants from a robot
 _OFF_CENTRE = 0.25  # of an image's side: the principal point lies no further from its middle
+_DOWN = 0.02  # of the baseline: one camera stands no further above the other; 0.008 in KITTI's coloured pair
 
 
-def read_calibration(path: Path, unit: Unit | None = None, image: Path | None = None) -> Calibration:
+def read_calibration(path: Path, unit: str | None = None, image: Path | None = None) -> Calibration:
     """Read a calibration.
 
     Args:
         path: A file of any of these programs, or a folder that holds one for both cameras or one for each.
-        unit: Unit of the baseline; None for what the file says, or its program uses, and else metres.
+        unit: Unit of the baseline, see `in_metres`; None for what the file says, or its program uses, and else metres.
         image: A left image that was taken with the cameras: where a file is for several sizes or does not say for which, this
             one's is taken.
 
@@ -124,19 +124,18 @@ def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, i
         raise RequestError(
             f"{path}: the cameras differ in focal length or in lines, so they are not rectified: rectify the pair"
         )
-    length = -float(right[0, 3]) / focal
-    if length == 0.0:
+    # Each camera's last column is minus its place, times the focal length; OpenCV puts the left one at 0.
+    across, down = (abs(float(left[row, 3] - right[row, 3])) for row in (0, 1))
+    if down > _DOWN * across:
+        raise RequestError(f"{path} has its cameras above each other: turn the pair, so that they stand side by side")
+    length = float(left[0, 3] - right[0, 3]) / focal
+    if abs(length) < 1e-9:
         raise RequestError(
             f"{path} has a baseline of 0, as of two cameras that were calibrated apart: calibrate them as a pair"
         )
     if length < 0.0:
         raise RequestError(f"{path} has its cameras swapped (baseline {length:g}): the first one must be the left one")
-    baseline = length * _METRES[unit]
-    if not _BASELINES[0] <= baseline <= _BASELINES[1]:
-        other = "mm" if unit == "m" else "m"
-        fits = _BASELINES[0] <= length * _METRES[other] <= _BASELINES[1]
-        mend = f": it seems to be in {other}, so say --calibration-unit {other}" if fits else ""
-        raise RequestError(f"{path} has a baseline of {length:g} {unit}, which is no stereo pair's{mend}")
+    baseline = baseline_in_metres(path, length, unit)
     centre = (float(left[0, 2]), float(left[1, 2]))
     calibration = Calibration(width, height, focal, centre, baseline, float(left[0, 2] - right[0, 2]))
     return dataclasses.replace(calibration, offset=0.0) if abs(calibration.offset) < 1e-9 else calibration

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxrl_vis.host.files import replacing
 from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG, plain_png, size_in
+from jaxrl_vis.stalks.phenotyping.io.orientation import read_orientation, upright
 
 ImageFormat = Literal["png", "tiff", "jpeg"]
 SUFFIX: dict[str, str] = {"png": ".png", "tiff": ".tiff", "jpeg": ".jpg"}
@@ -37,16 +38,24 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Height and width of an image, from its header: nothing is decoded.
+    """Height and width of an image as `read_image` gives it, from its header: nothing is decoded.
 
     Raises:
         OSError: It cannot be read, is no image, or one that no camera takes. One line that names it.
     """
+    size, orientation = _header(path)
+    return (size[1], size[0]) if orientation > 4 else size
+
+
+def _header(path: Path) -> tuple[tuple[int, int], int]:
+    """Height and width of an image as it is stored, and its orientation; raises as `image_size` does."""
     if not path.is_file():
         path.stat()
         raise _unreadable(path, "is no ordinary file")
     with path.open("rb") as file:
         size = size_in(file)
+        file.seek(0)
+        orientation = read_orientation(file)
     if size is None:
         raise _unreadable(path, "is not an image, or only a part of one")
     pixels = size[0] * size[1]
@@ -54,11 +63,11 @@ def image_size(path: Path) -> tuple[int, int]:
         raise _unreadable(path, f"has {size[1]} x {size[0]} pixels, more than {MAX_PIXELS // 10**6} million")
     if path.stat().st_size > _MAX_BESIDES + _MAX_BYTES * pixels:
         raise _unreadable(path, f"is larger than {size[1]} x {size[0]} pixels can be")
-    return size
+    return size, orientation
 
 
 def read_image(path: Path) -> np.ndarray:
-    """An image as [H, W, 3] or [H, W], uint8 or uint16.
+    """An image as [H, W, 3] or [H, W], uint8 or uint16, turned as its EXIF says.
 
     Raises:
         OSError: It cannot be read, or is no whole image. One line that names it.
@@ -112,15 +121,21 @@ def _decoded(path: Path) -> np.ndarray | None:
     Raises:
         OSError: The file cannot be read, is no image, or one that no camera takes.
     """
-    size = image_size(path)
+    size, orientation = _header(path)
     data: bytes | None = path.read_bytes()
     if data.startswith(PNG):
         data = plain_png(data)
+    if not data:
+        return None
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
-    return image if image is not None and image.shape[:2] == size else None
+    if image is None:
+        return None
+    if data[:2] in (b"II", b"MM"):  # OpenCV turns TIFF by itself, in whatever way it is read
+        size, orientation = image_size(path), 1
+    return upright(image, orientation) if image.shape[:2] == size else None
 
 
 def _unreadable(path: Path, why: str) -> OSError:

@@ -11,9 +11,10 @@ import math
 import cv2
 import numpy as np
 
+from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
 from jaxrl_vis_envs.plants import Calibration
 
-_WIDTH = 1688  # pixels to which images are reduced: grains of the ground are still seen
+_FOCAL = 1084.0  # pixels, to which images are reduced: grains of the ground are still seen
 _WINDOW = (5, 41)  # lines and columns there: flat, as the ground comes nearer from line to line
 _COLUMNS, _LINES = 32, 32  # windows side by side and above each other
 _MIN_SCORE = 0.7
@@ -65,7 +66,11 @@ def find_ground(
             there is none.
         depths: Least and greatest depth at which it is looked for, m.
     """
-    scale = min(_WIDTH / left.shape[1], 1.0)
+    frame = find_frame(left)
+    part = (slice(*frame.lines), slice(*frame.columns))
+    left, right = left[part], right[part]
+    disparity = None if disparity is None else disparity[part]
+    scale = min(_FOCAL / calibration.focal, 1.0)
     if scale < 1.0:
         size = (round(left.shape[1] * scale), round(left.shape[0] * scale))
         left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
@@ -77,7 +82,8 @@ def find_ground(
     if len(values) < _MIN_WINDOWS:
         return None
     focal = calibration.focal * scale
-    centre = (np.array(calibration.centre) + 0.5) * scale - 0.5
+    corner = np.array([frame.columns[0], frame.lines[0]])
+    centre = (np.array(calibration.centre) - corner + 0.5) * scale - 0.5
     # Inverse depth, which is linear in the rays of a plane's points; one pixel of disparity is `unit` of it.
     unit = 1.0 / (focal * calibration.baseline)
     rays = np.concatenate([(places - centre) / focal, np.ones((len(places), 1))], axis=1)

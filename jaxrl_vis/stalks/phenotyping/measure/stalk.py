@@ -14,6 +14,8 @@ from jaxrl_vis.stalks.phenotyping.measure.width import Strip, ellipse_width, ind
 from jaxrl_vis_envs.plants import Calibration
 
 Method = Literal["strip", "ellipse"]
+DEPTHS = (0.5, 1.3)
+"""Least and greatest depth at which the stalks of a row stand, m."""
 _WINDOWS = 16
 _REACH = 0.025  # m along a stalk: sheaths and nodes further away do not matter
 
@@ -60,7 +62,7 @@ def measure(
     right: np.ndarray,
     calibration: Calibration,
     line: float | None = None,
-    depths: tuple[float, float] = (0.5, 1.3),
+    depths: tuple[float, float] = DEPTHS,
     method: Method = "strip",
     ground: Ground | None = None,
     height: float | None = None,
@@ -158,14 +160,36 @@ def _disparity(
     depths: tuple[float, float],
     disparity: np.ndarray | None,
 ) -> StalkDisparity:
-    """Disparities of windows spread over the lines in which both edges are seen."""
+    """Disparities of a stalk that stands between two depths in m."""
+    far, near = (float(calibration.disparity(np.array(depth))) for depth in (depths[1], depths[0]))
+    return stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
+
+
+def stalk_disparity(
+    strip: Strip,
+    corner: tuple[int, int],
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration,
+    bounds: tuple[float, float],
+    disparity: np.ndarray | None = None,
+) -> StalkDisparity:
+    """Match windows of a stalk that are spread over the lines in which both edges are seen.
+
+    Args:
+        strip: Edges of the stalk's mask.
+        corner: Line and column of the mask's first pixel in the image.
+        left, right: [H, W] grey, uint8 or float32, rectified.
+        calibration: Calibration of the cameras.
+        bounds: Least and greatest disparity, pixels.
+        disparity: [H, W] float32, disparities that are known, in place of those that are matched.
+    """
     half = max(round(8 * calibration.focal / 2168), 3)
     lines = np.unique(np.linspace(strip.first + half, max(strip.last - half, strip.first + half), _WINDOWS).round()).astype(int)
     edges = np.array([strip.edges(line) for line in lines]) + corner[1]
-    far, near = (float(calibration.disparity(np.array(depth))) for depth in (depths[1], depths[0]))
     if disparity is not None:
-        return sample_rows(disparity, lines + corner[0], (edges[:, 0], edges[:, 1]), (far, near))
-    return match_rows(left, right, lines + corner[0], (edges[:, 0], edges[:, 1]), (far, near), half)
+        return sample_rows(disparity, lines + corner[0], (edges[:, 0], edges[:, 1]), bounds)
+    return match_rows(left, right, lines + corner[0], (edges[:, 0], edges[:, 1]), bounds, half)
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:

@@ -54,6 +54,8 @@ Row = dict[str, Any]
 _MAX_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
 NO_GROUND = "no visible ground"
 """Flag of widths at a height that is not known."""
+NO_ROW = "nothing like a row seen"
+"""Flag of a plot in which no stalk was seen: it is empty, or its images are not such as networks know."""
 NO_WIDTHS = "no widths"
 """Flag of a plot whose stalks were counted, but none of them measured."""
 
@@ -110,7 +112,7 @@ def _flag(widths: StalkWidths, confidence: float) -> str:
         return NO_GROUND
     if widths.lower.count < 3:
         return "few frames"
-    if confidence < 0.3 or widths.lower.error > _MAX_ERROR * widths.lower.mm:
+    if confidence < 0.3 or widths.lower.scatter > _MAX_ERROR * widths.lower.mm:
         return "uncertain"
     return "corrected for taper" if widths.lower.corrected else "ok"
 
@@ -119,7 +121,7 @@ def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
     unknown = [row for row in stalks if row["flag"] == NO_GROUND]
     if not stalks:
-        flag = "no stalks"
+        flag = NO_ROW
     elif not widths.size:
         flag = NO_WIDTHS
     elif skipped:
@@ -131,8 +133,9 @@ def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin
         "pairs": pairs,
         "pairs_skipped": skipped,
         "length_m": _text(length, 4),
-        "stalks": len(stalks),
-        "stalks_per_m": _text(len(stalks) / length, 3) if length > 0 else "",
+        # Networks that know none of what images show find nothing in them, so that nothing is not a count.
+        "stalks": len(stalks) or "",
+        "stalks_per_m": _text(len(stalks) / length, 3) if stalks and length > 0 else "",
         **_widths(widths),
         **_higher(stalks),
         "flag": flag,
@@ -141,9 +144,20 @@ def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin
     }
 
 
-def rows_without_path(frames: list[list[Sighting]], skipped: int, origin: Origin, why: str) -> tuple[list[Row], Row]:
-    """The plot's row where pairs cannot be put together: widths of detections, but no count. There are no rows of stalks."""
-    measured = [sighting.diameter_mm for sightings in frames for sighting in sightings if sighting.diameter_mm is not None]
+def rows_without_path(
+    frames: list[list[Sighting]], skipped: int, origin: Origin, why: str, metric: bool = True
+) -> tuple[list[Row], Row]:
+    """The plot's row where pairs cannot be put together: no count, no rows of stalks.
+
+    Args:
+        frames: Sightings of each pair.
+        skipped: Number of pairs that could not be used.
+        origin: Values of every row.
+        why: Flag of the plot.
+        metric: The mean width of detections is stated; not where the unit of the calibration is in doubt.
+    """
+    sightings = [sighting for frame in frames for sighting in frame] if metric else []
+    measured = [sighting.diameter_mm for sighting in sightings if sighting.diameter_mm is not None]
     row = {
         "plot": origin.plot,
         "pairs": len(frames),

@@ -36,7 +36,12 @@ class Followed:
     fits: bool
 
 
-def follow_either_way(frames: list[list[Sighting]], distances: np.ndarray, calibration: Calibration) -> Followed:
+def follow_either_way(
+    frames: list[list[Sighting]],
+    distances: np.ndarray,
+    calibration: Calibration,
+    columns: tuple[float, float] | None = None,
+) -> Followed:
     """Put the sightings of a plot together, whichever way the cameras moved.
 
     What goes together with distances that grow to the cameras' right stays as `track.follow` makes it.
@@ -45,10 +50,11 @@ def follow_either_way(frames: list[list[Sighting]], distances: np.ndarray, calib
         frames: Sightings of each pair, in the order in which the robot passed.
         distances: [F] float64, how far it had driven by its odometry, m.
         calibration: Calibration of the cameras.
+        columns: See `track.follow`.
     """
-    tracks, path = follow(frames, distances, calibration)
+    tracks, path = follow(frames, distances, calibration, columns=columns)
     fits = not _contradicted(frames, path.places)
-    back, backwards = follow(frames, -np.asarray(distances, float), calibration)
+    back, backwards = follow(frames, -np.asarray(distances, float), calibration, columns=columns)
     # Where pairs are too unlike each other to contradict anything, the way on which they go together is the right one.
     better = _links(back) > (_LINK_RATIO if fits else 1.0) * _links(tracks)
     well = _links(back) > _MIN_LINKED * sum(map(len, frames))

@@ -103,7 +103,11 @@ class _Open:
 
 
 def follow(
-    frames: list[list[Sighting]], distances: np.ndarray, calibration: Calibration, gates: Gates = Gates()
+    frames: list[list[Sighting]],
+    distances: np.ndarray,
+    calibration: Calibration,
+    gates: Gates = Gates(),
+    columns: tuple[float, float] | None = None,
 ) -> tuple[list[Track], Path]:
     """Put the sightings of a plot together.
 
@@ -112,6 +116,7 @@ def follow(
         distances: [F] float64, how far it had driven by its odometry, m.
         calibration: Calibration of the cameras.
         gates: Limits of what belongs together.
+        columns: First column of the images that shows anything, and one past the last; None for all.
     """
     tracks: list[_Open] = []
     places = np.zeros(len(frames))
@@ -144,8 +149,10 @@ def follow(
             track.feet.append(float(along + places[frame] - view.over[new]))
     step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
     path = Path(places, abs(float(places[-1] - places[0]) + step) if len(places) else 0.0)
-    half_field = 0.5 * calibration.width / calibration.focal
-    closed = [_closed(track, path, step, half_field, usual, gates) for track in _merged(tracks, gates)]
+    field = tuple(
+        (column - 0.5 - calibration.centre[0]) / calibration.focal for column in columns or (0.0, float(calibration.width))
+    )
+    closed = [_closed(track, path, step, field, usual, gates) for track in _merged(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
@@ -279,13 +286,13 @@ def _apart(track: _Open, other: _Open) -> tuple[float, float]:
     return abs(track.at(depth) - other.at(depth)), 0.0
 
 
-def _closed(track: _Open, path: Path, step: float, half_field: float, usual: float, gates: Gates) -> Track:
+def _closed(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
     position = float(np.median(track.along))
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
     # What matters is how many pairs have the stalk well inside.
-    reach = 0.9 * half_field * (depth if math.isfinite(depth) else usual)
-    expected = int((np.abs(path.places - position) < reach).sum())
+    middle, half = (0.5 * (field[1] + sign * field[0]) * (depth if math.isfinite(depth) else usual) for sign in (1.0, -1.0))
+    expected = int((np.abs(path.places + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
     # What no pair says the distance of must be seen the more often.
     wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.share * expected), 1)

@@ -21,6 +21,11 @@ _TAPER_SPREAD = 0.3  # of a stalk's own taper about the plot's, of 1
 _MIN_SIGHTINGS = 5
 _MIN_CLEAR = 3  # sightings without a hidden edge that make others unnecessary
 _LOWER_BOUNDS = 0.85
+# What pairs do not disagree about, so that their scatter does not tell it: by the errors of synthetic stalks.
+_MASK_ERROR = 0.7  # pixels: masks err alike on one texture
+_HIDING_ERROR = 0.8  # mm, where all pairs may hide an edge
+_CALIBRATION_ERROR = 0.005  # of the width: focal length and baseline of a good calibration
+_FEW = 2.0  # pairs: few of them scatter by less than many would
 _FURTHEST = 4.0 * INCH  # m: what was measured further away says nothing of a height
 _NEAR_HEIGHT = 0.5 * INCH  # m: taper within that does not matter
 _ASIDE = (
@@ -34,14 +39,16 @@ class Width:
 
     Attributes:
         mm: Weighted median.
-        error: Its standard error, mm: that of the scatter between pairs, and at least what edges and disparity tell. What hides
-            a stalk from all sides is not in it.
+        error: Its standard error, mm: of the scatter between pairs, of masks that err alike in all of them, of hidden edges,
+            and of a good calibration. Intervals of twice that cover about 95 % of synthetic stalks.
+        scatter: Standard error of the scatter between pairs alone, mm, and at least what edges and disparity tell.
         count: Number of sightings.
         corrected: Most of them were measured elsewhere, so that taper had to make up for it.
     """
 
     mm: float
     error: float
+    scatter: float
     count: int
     corrected: bool = False
 
@@ -74,23 +81,41 @@ def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[Stal
 
 @dataclasses.dataclass(frozen=True)
 class _Value:
-    """Width in one pair: diameter and its standard error, mm, the height, m, the weight, and True if an edge may be hidden."""
+    """Width in one pair.
+
+    Attributes:
+        mm, deviation: Diameter and its standard error, mm.
+        height: Of the measurement, m.
+        confidence: Weight.
+        hidden: An edge may be hidden.
+        pixel: Length of a pixel there, mm.
+    """
 
     mm: float
     deviation: float | None
     height: float
     confidence: float
     hidden: bool
+    pixel: float
 
 
 def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     known = [
-        _Value(e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.hidden)
+        _Value(
+            e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.hidden, _pixel(e.diameter_mm, e.width_px)
+        )
         for e in sightings
         if e.diameter_mm is not None and e.height_m is not None
     ]
     above = [
-        _Value(e.upper_mm, e.upper_deviation_mm, e.upper_height_m, e.upper_confidence * _facing(e), e.upper_hidden)
+        _Value(
+            e.upper_mm,
+            e.upper_deviation_mm,
+            e.upper_height_m,
+            e.upper_confidence * _facing(e),
+            e.upper_hidden,
+            _pixel(e.upper_mm, None if e.upper_place is None else e.upper_place[2]),
+        )
         for e in sightings
         if e.upper_mm is not None and e.upper_height_m is not None
     ]
@@ -99,6 +124,11 @@ def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
         return StalkWidths(robust_width(sightings), upper, None, False)
     own = None if upper is None else (lower.mm - upper.mm) / ((UPPER - LOWER) / INCH)
     return StalkWidths(lower, upper, own, True)
+
+
+def _pixel(mm: float, pixels: float | None) -> float:
+    """Return the length of a pixel, mm, at a stalk that is so wide; 0 where nobody knows."""
+    return mm / pixels if pixels else 0.0
 
 
 def _facing(sighting: Sighting) -> float:
@@ -122,8 +152,13 @@ def _at(height: float, values: list[_Value], taper: float) -> Width | None:
 
 def robust_width(sightings: list[Sighting]) -> Width | None:
     """Diameter of a stalk wherever it was measured; None if it never was."""
-    measured = [sighting for sighting in sightings if sighting.diameter_mm is not None]
-    return _robust([_Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.hidden) for e in measured])  # pyright: ignore[reportArgumentType]
+    return _robust(
+        [
+            _Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.hidden, _pixel(e.diameter_mm, e.width_px))
+            for e in sightings
+            if e.diameter_mm is not None
+        ]
+    )
 
 
 def _robust(values: list[_Value]) -> Width | None:
@@ -143,4 +178,11 @@ def _robust(values: list[_Value]) -> Width | None:
     enough = float(weights.sum() ** 2 / (weights**2).sum())
     scatter = 1.4826 * float(np.median(np.abs(widths - middle))) * 1.2533 if len(widths) > 2 else 0.0
     least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
-    return Width(middle, max(scatter, least) / math.sqrt(enough), len(widths))
+    of_pairs = max(scatter, least) / math.sqrt(enough)
+    error = math.hypot(
+        of_pairs * math.sqrt(1.0 + _FEW / len(widths)),
+        _MASK_ERROR * float(np.median([value.pixel for value in some])),
+        _HIDING_ERROR * (1.0 - len(clear) / len(values)),
+        _CALIBRATION_ERROR * middle,
+    )
+    return Width(middle, error, of_pairs, len(widths))

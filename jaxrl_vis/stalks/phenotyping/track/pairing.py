@@ -1,21 +1,32 @@
-"""Why a right image shows hardly any stalk of its left one: the two may be swapped, or not rectified."""
+"""Faults of a pair that would make its widths wrong: swapped, upside down, not rectified, or calibrated in another unit."""
 
 import dataclasses
 
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, grey_at
+from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
+from jaxrl_vis.stalks.phenotyping.measure.stalk import DEPTHS, measure, stalk_disparity
+from jaxrl_vis.stalks.phenotyping.measure.width import strip_width
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, grey_at
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
+_MOST = 0.7  # of the detections: so many of a good pair are measured
+_SAME_DEPTH = 0.15  # of a distance, by which stalks of one row differ
+_NEAREST = 3.0  # baselines: nearer, the cameras see hardly anything in common
+_LEAST_DISPARITY = 2.0  # pixels
 _SMALL_SHARE, _LARGE_SHARE = 0.25, 0.6
-_LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels of an image 3376 wide
+_LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels at a focal length of 2168
 
 
 def pair_fault(
-    detections: list[Detection], sightings: list[Sighting], left: np.ndarray, right: np.ndarray, calibration: Calibration
+    detections: list[Detection],
+    sightings: list[Sighting],
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration,
+    ground: Ground | None = None,
 ) -> str | None:
     """Say in words what is wrong with a pair; None if nothing is, or too few stalks were detected to tell.
 
@@ -24,11 +35,17 @@ def pair_fault(
         sightings: Their sightings.
         left, right: [H, W, 3] uint8.
         calibration: Calibration of the cameras.
+        ground: The ground that the pair shows.
     """
+    grey_left, grey_right = grey_at(left), grey_at(right)
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
+    fault = _upside_down(grey_left, grey_right, calibration) if ground is None else None
+    if fault is None and (ground is None or measured < _MOST * len(detections)):
+        fault = _distance_fault(detections, grey_left, grey_right, calibration)
+    if fault is not None:
+        return fault
     if len(detections) < _MIN_STALKS or measured > _SMALL_SHARE * len(detections):
         return None
-    grey_left, grey_right = grey_at(left), grey_at(right)
     # Seen in a mirror, a pair that is swapped is one that is not.
     mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
     turned = [
@@ -42,16 +59,60 @@ def pair_fault(
     ]
     if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_SHARE:
         return "left and right are swapped: exchange their names"
-    for lines in sorted({max(round(line * calibration.width / 3376), 3) for line in _LINES}):
+    for lines in sorted({max(round(line * calibration.focal / 2168), 3) for line in _LINES}):
         for shift in (lines, -lines):
             if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_SHARE:
                 return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
     return None
 
 
+def _upside_down(left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
+    """Say in words that a pair [H, W] grey is upside down; None if it is not."""
+    column, line = calibration.centre
+    turned = dataclasses.replace(calibration, centre=(column, calibration.height - 1 - line))
+    if find_ground(left[::-1], right[::-1], turned) is not None:
+        return "the images are upside down, left and right exchanged: turn both by 180 degrees, and exchange their names back"
+    turned = dataclasses.replace(turned, centre=(calibration.width - 1 - column, turned.centre[1]))
+    if find_ground(left[::-1, ::-1], right[::-1, ::-1], turned) is not None:
+        return "the images are upside down: turn both by 180 degrees"
+    return None
+
+
+def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
+    """Say in words that the stalks of a pair [H, W] grey stand where no row does, by its calibration; None if they do not."""
+    depths = [depth for depth in (_any_depth(find, left, right, calibration) for find in _some(detections)) if depth]
+    if len(depths) < _MIN_STALKS:
+        return None
+    depth = float(np.median(depths))
+    agree = np.mean(np.abs(np.array(depths) / depth - 1.0) < _SAME_DEPTH)
+    if DEPTHS[0] <= depth <= DEPTHS[1] or agree < _LARGE_SHARE:
+        return None
+    baseline = calibration.baseline * USUAL_DISTANCE / depth
+    return (
+        f"its stalks stand {depth:.2g} m away by the calibration, not {DEPTHS[0]} to {DEPTHS[1]} m: say in which unit its "
+        f"baseline is with --calibration-unit (a baseline of about {baseline:.2g} m would put the row at {USUAL_DISTANCE} m)"
+    )
+
+
+def _any_depth(find: Detection, left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float | None:
+    """Return the depth of a detection wherever it may be, m; None where the right image does not show it clearly."""
+    strip = find.strip or strip_width(find.mask)
+    if strip is None:
+        return None
+    nearest = float(calibration.disparity(np.array(_NEAREST * calibration.baseline)))
+    matched = stalk_disparity(strip, find.corner, left, right, calibration, (calibration.offset + _LEAST_DISPARITY, nearest))
+    at = matched.at(strip.reference + find.corner[0])
+    return None if at is None else float(calibration.depth(np.array(at[0])))
+
+
+def _some(detections: list[Detection]) -> list[Detection]:
+    """Return ten of the detections at most."""
+    return detections[:: -(-len(detections) // 10)] if detections else []
+
+
 def _share(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
     """Return the share of detections, ten at most, that the right image shows."""
-    some = detections[:: -(-len(detections) // 10)]
+    some = _some(detections)
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
     measured = [
         measure(detection.mask, detection.corner, left, right, calibration).diameter_mm is not None for detection in some

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure
 from jaxrl_vis.stalks.phenotyping.measure.width import strip_width
@@ -18,6 +19,14 @@ from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
+Find = Callable[[np.ndarray, float | None], list[Detection]]
+"""Finds the stalks in a left image [H, W, 3] uint8 with so many pixels per metre at the row; None if nobody knows."""
+USUAL_DISTANCE = 0.8
+"""Distance from the cameras to the row, m, where nothing says otherwise."""
+_OTHER_DISTANCES = (0.55, 1.15)  # m: at which a row is looked for that is not seen at the usual one
+_SAME_DISTANCE = 0.12  # of 1: networks find stalks that are by so much larger or smaller than those of the usual distance
+_AT_DISTANCE = 3  # stalks that say how far away the row is
+_FAR_FROM_ROW = 0.2  # m: what stands there is not of the row
 _HIDDEN = 0.1  # of its confidence that a sighting keeps if one of its edges may be hidden
 _BEHIND = 0.003  # m: what stands so much further away hides nothing
 _TOUCHING = 0.1  # of half a stalk's width: edges so near are one
@@ -112,25 +121,88 @@ def grey_at(image: np.ndarray) -> np.ndarray:
 
 
 def find_with_ground(
-    find: Callable[[np.ndarray], list[Detection]],
+    find: Find,
     left: np.ndarray,
     right: np.ndarray,
     calibration: Calibration | None,
     disparity: np.ndarray | None = None,
+    distance: float = USUAL_DISTANCE,
 ) -> tuple[list[Detection], Ground | None]:
     """The stalks and the ground of a pair, looked for at the same time: an accelerator finds the one and the host the other.
 
     Args:
-        find: Detector of the stalks in a left image.
+        find: Detector of the stalks.
         left, right: [H, W, 3] uint8, rectified.
         calibration: Calibration of the cameras; without it, no ground is looked for.
         disparity: See `find_ground`.
+        distance: Distance from the cameras to the row, m, which with the focal length gives the size of stalks in pixels.
     """
     if calibration is None:
-        return find(left), None
+        return find(left, None), None
     with ThreadPoolExecutor(1) as aside:
         ground = aside.submit(lambda: find_ground(grey_at(left), grey_at(right), calibration, disparity))
-        return find(left), ground.result()
+        return find(left, calibration.focal / distance), ground.result()
+
+
+@dataclasses.dataclass(frozen=True)
+class PairView:
+    """All that a pair shows.
+
+    Attributes:
+        detections: In its left image.
+        sightings: Of each of them.
+        ground: Origin of heights; None where it shows none.
+        columns: First column of the left image that shows anything, and one past the last.
+    """
+
+    detections: list[Detection]
+    sightings: list[Sighting]
+    ground: Ground | None
+    columns: tuple[int, int]
+
+
+def view_pair(
+    find: Find,
+    left: np.ndarray,
+    right: np.ndarray,
+    calibration: Calibration | None,
+    method: Method = "strip",
+    disparity: np.ndarray | None = None,
+) -> PairView:
+    """Find and measure the stalks of a pair, whose row may be nearer or further away than usual.
+
+    Networks find stalks of about one size in pixels. Where stereo says that the row stands elsewhere, or nothing is found, they
+    look again for stalks of the size that they have there.
+
+    Args:
+        find: Detector of the stalks.
+        left, right: [H, W, 3] uint8, rectified.
+        calibration: Calibration of the cameras.
+        method: Method of widths.
+        disparity: See `measure_pair`.
+    """
+    detections, ground = find_with_ground(find, left, right, calibration, disparity)
+    columns = find_frame(left).columns
+    sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
+    usual = PairView(detections, sightings, ground, columns)
+    there = _row_distance(usual.sightings)
+    if calibration is None or (there is not None and abs(there / USUAL_DISTANCE - 1.0) <= _SAME_DISTANCE):
+        return usual
+    if there is None and len(detections) >= _AT_DISTANCE:
+        return usual
+    for distance in _OTHER_DISTANCES if there is None else (there,):
+        detections = find(left, calibration.focal / distance)
+        sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
+        there = _row_distance(sightings)
+        if there is not None and abs(there / distance - 1.0) <= _SAME_DISTANCE:
+            return PairView(detections, sightings, ground, columns)
+    return usual
+
+
+def _row_distance(sightings: list[Sighting]) -> float | None:
+    """Return the distance at which most stalks of a pair were measured, m; None where too few were."""
+    depths = [sighting.depth_m for sighting in sightings if sighting.diameter_mm is not None and sighting.depth_m is not None]
+    return float(np.median(depths)) if len(depths) >= _AT_DISTANCE else None
 
 
 def measure_pair(
@@ -165,6 +237,7 @@ def measure_pair(
         if ground is not None and detection.upper is not None:
             upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((got, upper))
+    measured = _without_strangers(measured, calibration, find_frame(grey_right).columns[0])
     hidden = _hidden_edges([got for got, _ in measured])
     above = _hidden_edges([upper or Measurement() for _, upper in measured])
     hidden = [behind or not got.here for behind, (got, _) in zip(hidden, measured)]
@@ -174,6 +247,31 @@ def measure_pair(
         sighting = _sighting(detection, less, upper, calibration)
         sightings.append(dataclasses.replace(sighting, hidden=behind[0], upper_hidden=behind[1]))
     return sightings
+
+
+def _without_strangers(
+    measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, begin: int
+) -> list[tuple[Measurement, Measurement | None]]:
+    """Return measurements without those that matched something else, as the right image does not reach as far as their stalk.
+
+    Args:
+        measured: Measurements of the stalks of a pair, lower and upper.
+        calibration: Calibration of the cameras.
+        begin: First column that the right image shows.
+    """
+    depths = [got.depth for got, _ in measured if got.diameter_mm is not None]
+    if len(depths) < _AT_DISTANCE:
+        return measured
+    row = float(np.median(depths))
+    disparity = float(calibration.disparity(np.array(row)))
+    kept = []
+    for got, upper in measured:
+        beyond = got.column - 0.5 * got.width - disparity < begin
+        if got.diameter_mm is not None and beyond and abs(got.depth - row) > _FAR_FROM_ROW:
+            got = Measurement(line=got.line, column=got.column, lean=got.lean, reason="the right image does not show it")
+            upper = None
+        kept.append((got, upper))
+    return kept
 
 
 def _hidden_edges(measurements: list[Measurement]) -> list[bool]:

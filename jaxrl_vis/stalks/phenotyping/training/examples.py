@@ -12,12 +12,14 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-from jaxrl_vis.stalks.phenotyping.detector.finder import higher_up, reduce
+from jaxrl_vis.stalks.phenotyping.detector.finder import higher_up, resize, resize_factor
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, snip_shape
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, find_calibration, read_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, rgb8
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, outlined_mask
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
 from jaxrl_vis_envs.plants.field import Plot
@@ -64,6 +66,7 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         frames: Number of images of it, spread over it.
     """
     sequence = Sequence.of(draw(family, seed))
+    density = sequence.drive.true.focal / family.rig.distance
     rng = np.random.default_rng([seed, 17])
     length = len(sequence)
     chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
@@ -75,7 +78,7 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         masks_of = functools.partial(_instance_masks, instance, indices)
-        examples.append(_example(image, stalks, kinds, masks_of, settings, rng, _HIGHER))
+        examples.append(_example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER))
     return examples
 
 
@@ -119,6 +122,7 @@ def true_boxes(
 
 def _example(
     image: Any,
+    density: float | None,
     stalks: np.ndarray,
     kinds: np.ndarray,
     masks_of: _MasksOf,
@@ -128,8 +132,9 @@ def _example(
 ) -> Example:
     """An example of a whole image [H, W, 3]; of a share of its stalks, there are snips around the upper height, too."""
     whole = np.asarray(image)
-    reduced, scale = reduce(whole, settings.width)
-    shape = snip_shape(whole.shape[1], (settings.snip_lines, settings.snip_columns), settings.full_width)
+    reduced, scale = resize(whole, settings, density)
+    share = settings.width / settings.full_width / settings.resizing(whole.shape[1], density)
+    shape = snip_shape((settings.snip_lines, settings.snip_columns), share)
     clear = np.flatnonzero(kinds == STALK)
     # A find is not exactly where the stalk is.
     moved = stalks[clear].copy()
@@ -155,12 +160,13 @@ def _example(
 
 
 def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Iterator[Example]:
-    """Examples of a folder of annotated images; see `read_annotations`.
+    """Examples of a folder of annotated images; see `read_annotations`. Its calibration, if it has one, gives their scale.
 
     Raises:
         RequestError: There are no annotations, or one is wrong; or an image is missing, or of another size than they say.
     """
     data = read_annotations(folder, labels)
+    density_of = _densities(folder, data["images"])
     of_image: dict[int, list[dict[str, Any]]] = {}
     for annotation in data["annotations"]:
         of_image.setdefault(annotation["image_id"], []).append(annotation)
@@ -184,7 +190,9 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         kinds = np.array([STALK] * len(stalks) + [UNCLEAR] * len(strips), np.int32)
         stalks = np.concatenate([stalks, strips])
         rng = np.random.default_rng([number, 18])
-        yield _example(image, stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng)
+        yield _example(
+            image, density_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
+        )
 
 
 def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
@@ -218,19 +226,45 @@ def _own_masks(
     return np.concatenate(snips)
 
 
+def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
+    """Pixels per metre at the row of each image by its id; None for all where the folder has no calibration.
+
+    Raises:
+        RequestError: The calibration cannot be read, or is for images of another size.
+    """
+    path = find_calibration(folder)
+    if path is None:
+        return dict.fromkeys((image["id"] for image in images), None)
+    calibration = read_calibration(path, image=folder / images[0]["file_name"])
+    for image in images:
+        check_size(calibration, image["width"], image["height"], str(folder / image["file_name"]))
+    return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
+
+
 def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
-    """Settings whose anchors are as large as the boxes of a folder's annotations."""
+    """Settings whose anchors are as large as the boxes of a folder's annotations.
+
+    What was learned from images of unknown cameras is looked for in images that are reduced as those were.
+
+    Raises:
+        RequestError: The annotations or the calibration of the folder cannot be read.
+    """
     data = read_annotations(folder, labels)
-    widths = {image["id"]: image["width"] for image in data["images"]}
+    densities = _densities(folder, data["images"])
+    factors = {image["id"]: resize_factor(image["width"], settings, densities[image["id"]]) for image in data["images"]}
     sizes = np.array(
         [
-            np.array(annotation["bbox"][2:], float) * min(settings.width / widths[annotation["image_id"]], 1.0)
+            np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]]
             for annotation in data["annotations"]
             if not annotation.get("iscrowd")
         ]
     )
-    across = tuple(round(float(width), 1) for width in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95)))
-    return dataclasses.replace(settings, band_lines=round(float(np.median(sizes[:, 1])), 1), anchor_widths=across)
+    return dataclasses.replace(
+        settings,
+        density=settings.density if all(densities.values()) else 0.0,
+        band_lines=round(float(np.median(sizes[:, 1])), 1),
+        anchor_widths=tuple(round(float(width), 1) for width in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95))),
+    )
 
 
 def any_outlined(folder: Path, labels: tuple[str, ...] = ()) -> bool:

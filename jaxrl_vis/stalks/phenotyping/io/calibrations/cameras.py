@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 
-Unit = Literal["m", "mm"]
+Unit = Literal["m", "cm", "mm"]
 Size = tuple[int, int]
 """Width and height of an image, pixels."""
 MAX_SIDE = 100_000

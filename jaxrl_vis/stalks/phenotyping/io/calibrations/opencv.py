@@ -71,4 +71,4 @@ def _unit(store: dict[str, Any], path: Path) -> Unit | None:
         if said == unit:
             return unit
     unit_read = reprlib.repr(said) if isinstance(said, str) else "something that is no text"
-    raise RequestError(f"{path}: unit must be m or mm, not {unit_read}")
+    raise RequestError(f"{path}: unit must be m, cm or mm, not {unit_read}")

@@ -1,0 +1,76 @@
+"""Orientation of images that cameras stored turned, by the tag of EXIF: 1 as they are, 3 upside down, 6 and 8 on their side.
+
+Viewers and annotation programs show images turned, so that is how they are read here. A calibration is for images as OpenCV
+reads them, which is turned, too.
+"""
+
+from typing import BinaryIO
+
+import numpy as np
+from PIL import Image
+
+from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG
+
+_TAG = 0x0112
+_EXIF = b"Exif\0\0"
+_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers of JPEG without a length
+
+
+def read_orientation(file: BinaryIO) -> int:
+    """Read the orientation of the image in a file of JPEG, PNG or TIFF, 1 to 8; 1 where nothing is said, or nothing sensible.
+
+    Args:
+        file: At its beginning, able to seek.
+    """
+    begin = file.read(8)
+    file.seek(0)
+    if begin.startswith(b"\xff\xd8"):
+        data = _of_jpeg(file)
+    elif begin.startswith(PNG):
+        data = _of_png(file)
+    else:
+        data = file.read() if begin[:4] in (b"II*\0", b"MM\0*") else b""
+    exif = Image.Exif()
+    try:
+        exif.load(data)
+        value = exif.get(_TAG, 1)
+    except Exception:  # Pillow's readers raise SyntaxError, struct.error, KeyError, OverflowError and more
+        return 1
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def upright(image: np.ndarray, orientation: int) -> np.ndarray:
+    """Turn an image [H, W, ...] of an orientation as it is meant to be seen."""
+    if orientation > 4:
+        image = np.swapaxes(image, 0, 1)
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    return np.ascontiguousarray(image)
+
+
+def _of_jpeg(file: BinaryIO) -> bytes:
+    """EXIF of a JPEG, empty where it has none before its pixels."""
+    file.seek(2)
+    while len(head := file.read(4)) == 4 and head[0] == 0xFF and head[1] not in (0xD9, 0xDA):
+        if head[1] in _ALONE or head[1] == 0xFF:
+            file.seek(-3 if head[1] == 0xFF else -2, 1)
+            continue
+        length = int.from_bytes(head[2:4], "big") - 2
+        if head[1] == 0xE1 and (data := file.read(length)).startswith(_EXIF):
+            return data
+        if head[1] != 0xE1:
+            file.seek(length, 1)
+    return b""
+
+
+def _of_png(file: BinaryIO) -> bytes:
+    """EXIF of a PNG, empty where it has none."""
+    file.seek(len(PNG))
+    while len(head := file.read(8)) == 8 and head[4:] != b"IEND":
+        length = int.from_bytes(head[:4], "big")
+        if head[4:] == b"eXIf":
+            return _EXIF + file.read(length)
+        file.seek(length + 4, 1)
+    return b""

@@ -1,0 +1,230 @@
+"""The same stalks by other lenses, in crops, with borders, upside down, and by a calibration in another unit."""
+
+import dataclasses
+import functools
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, _is_shown, _moved, _without_border, resize
+from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
+from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
+from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
+from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
+from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
+from jaxrl_vis.stalks.phenotyping.track.follow import follow
+from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, measure_pair, view_pair
+from jaxrl_vis_envs.plants import Calibration
+
+CAMERA = Calibration(844, 400, 542.0, (421.5, 199.5), 0.1)
+COLUMNS = range(120, 720, 100)
+
+
+@functools.cache
+def sample() -> tuple[np.ndarray, np.ndarray, Calibration]:
+    left, right = (read_image(SAMPLE / f"{side}_000.jpg") for side in ("left", "right"))
+    return left, right, read_calibration(SAMPLE / "calibration.yaml")
+
+
+# --- scale ---
+
+
+def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
+    settings = Settings()
+    whole = np.zeros((845, 1055, 3), np.uint8)
+    density = 677.5 / 0.8
+    assert resize(whole, settings, density)[0].shape[:2] == resize(whole, settings, None)[0].shape[:2] == (676, 844)
+    assert resize(whole[:, 600:900], settings, density)[0].shape[:2] == (676, 240)
+    assert resize(np.pad(whole, ((0, 0), (500, 555), (0, 0))), settings, density)[0].shape[:2] == (676, 1688)
+    assert resize(whole, settings, 0.6 * density)[0].shape[:2] == (1127, 1407)  # a wider lens: enlarged
+    assert resize(whole, settings, 1.66 * density)[0].shape[:2] == (407, 508)
+    # Networks that learned from images of unknown cameras know no density.
+    assert resize(whole[:, :900], dataclasses.replace(settings, density=0.0), density)[0].shape[1] == 844
+
+
+def test_widths_do_not_depend_on_crops_borders_and_lenses():
+    """One pair of the sample row: letterboxed, cropped, and as a lens of 1.66 times the focal length shows it."""
+    left, right, camera = sample()
+    finder = load_finder(SHIPPED, 0.5)
+
+    def widths(left: np.ndarray, right: np.ndarray, camera: Calibration, over: float = 0.0, scale: float = 1.0):
+        sightings = [each for each in view_pair(finder, left, right, camera).sightings if each.diameter_mm]
+        return {round((each.column - over) / scale / 10.0): (each.diameter_mm, each.confidence) for each in sightings}
+
+    plain = widths(left, right, camera)
+    assert len(plain) == 8
+    boxed = [np.pad(image, ((0, 0), (527, 528), (0, 0))) for image in (left, right)]
+    wide = dataclasses.replace(camera, width=2110, centre=(camera.centre[0] + 527, camera.centre[1]))
+    assert widths(boxed[0], boxed[1], wide, 527.0) == plain
+    part = dataclasses.replace(camera, width=300, centre=(camera.centre[0] - 600, camera.centre[1]))
+    cropped = widths(left[:, 600:900], right[:, 600:900], part, -600.0)
+    # One of these is cut off by the crop's side, and one is seen by the left camera alone.
+    assert len(cropped) >= 4
+    clear = [place for place, (_, confidence) in plain.items() if confidence > 0.4]  # not at the crossing of two
+    for place in set(clear) & cropped.keys():
+        assert cropped[place][0] == pytest.approx(plain[place][0], abs=0.1)
+    larger = [cv2.resize(image, None, fx=1.66, fy=1.66, interpolation=cv2.INTER_CUBIC) for image in (left, right)]
+    height, width = larger[0].shape[:2]
+    centre = (1.66 * (camera.centre[0] + 0.5) - 0.5, 1.66 * (camera.centre[1] + 0.5) - 0.5)
+    tele = dataclasses.replace(camera, width=width, height=height, focal=1.66 * camera.focal, centre=centre)
+    through = widths(larger[0], larger[1], tele, 0.33, 1.66)
+    assert len(through) == 8
+    beside = [abs(through[place][0] - plain[place][0]) for place in set(clear) & through.keys() if through[place][1] > 0.4]
+    assert len(beside) >= 3 and np.median(beside) < 0.1
+
+
+def stalks_at(disparity: int) -> tuple[np.ndarray, np.ndarray, list[Detection]]:
+    """A pair of six stalks with a texture, and what a perfect finder says of it."""
+    rng = np.random.default_rng(0)
+    left, right = (rng.integers(0, 20, (400, 844, 3)).astype(np.uint8) for _ in range(2))
+    finds = []
+    for column in COLUMNS:
+        texture = rng.integers(60, 255, (400, 14, 1)).astype(np.uint8)
+        left[:, column : column + 14] = texture
+        right[:, column - disparity : column - disparity + 14] = texture
+        mask = np.zeros((200, 24), bool)
+        mask[:, 5:19] = True
+        finds.append(
+            Detection((column, 100.0, column + 13.0, 300.0), (column + 6.5, column + 6.5), 1.0, mask, (100, column - 5))
+        )
+    return left, right, finds
+
+
+@pytest.mark.parametrize(("disparity", "sizes"), [(68, [0.8]), (50, [0.8, 0.55, 1.15]), (97, [0.8, 0.55])])
+def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, sizes):
+    """Networks find nothing where stalks have another size; where the row stands is not known before."""
+    left, right, finds = stalks_at(disparity)
+    asked = []
+
+    def find(image: np.ndarray, density: float | None) -> list[Detection]:
+        assert density is not None
+        asked.append(CAMERA.focal / density)
+        return finds if abs(asked[-1] * disparity / 54.2 - 1.0) < 0.12 else []
+
+    view = view_pair(find, left, right, CAMERA)
+    assert asked == pytest.approx(sizes) and all(each.diameter_mm for each in view.sightings) and len(view.sightings) == 6
+
+
+def test_the_field_of_a_crop_is_its_own():
+    """A stalk that a crop beside the axis shows once is not missed in pairs that cannot show it."""
+    narrow = dataclasses.replace(CAMERA, width=200, centre=(-300.0, 199.5))
+    frames = [[Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.54)]]
+    frames += [[] for _ in range(8)]
+    (track,), _ = follow(frames, np.arange(9) * 0.1, narrow)
+    assert track.counted
+    # The whole image, of which it may be a part, would have shown it in more pairs; what is letterboxed shows no more.
+    whole = dataclasses.replace(narrow, width=800, centre=(300.0, 199.5))
+    frames[0][0] = dataclasses.replace(frames[0][0], column=700.0)
+    (track,), _ = follow(frames, np.arange(9) * 0.1, whole)
+    assert track.reason.startswith("seen in 1 of")
+    (track,), _ = follow(frames, np.arange(9) * 0.1, whole, columns=(600.0, 800.0))
+    assert track.counted
+
+
+# --- borders ---
+
+
+def scene(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """A noisy image with wedges and bars around it, and where these are."""
+    rng = np.random.default_rng(1)
+    image = cv2.GaussianBlur(rng.integers(30, 255, (240, 320, 3)).astype(np.float32), (0, 0), 2.0).astype(np.uint8)
+    line, column = np.mgrid[:240, :320]
+    outside = (column < 40 - 0.2 * line) | (column > 310 - 0.05 * line) | (line < 8)
+    image[outside] = 0
+    if kind == "jpeg":
+        image = cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])[1], cv2.IMREAD_COLOR)
+    return np.asarray(image), outside
+
+
+@pytest.mark.parametrize("kind", ["png", "jpeg"])
+def test_borders_are_found_and_filled(kind):
+    image, outside = scene(kind)
+    frame = find_frame(image)
+    assert abs(frame.lines[0] - 8) <= 2 and frame.lines[1] == 240 and frame.shown is not None
+    assert not (frame.shown & outside).mean() > 0.004  # nothing of a border is shown
+    assert (~frame.shown & ~outside).mean() < 0.03  # and little is lost beside it
+    filled = fill_borders(image, frame)
+    assert filled.shape[1] == frame.columns[1] - frame.columns[0]
+    assert (filled.max(axis=-1) <= 12).mean() < 0.002  # at the tips of wedges
+    inside = frame.shown[slice(*frame.lines), slice(*frame.columns)]
+    np.testing.assert_array_equal(filled[inside], image[slice(*frame.lines), slice(*frame.columns)][inside])
+
+
+def test_dark_scenes_have_no_borders():
+    """A night behind stalks, with the noise of a camera; black leaves at the side; a stalk whose side is straight."""
+    rng = np.random.default_rng(2)
+    night = np.abs(rng.normal(0.0, 3.0, (240, 320, 3))).astype(np.uint8)
+    night[150:] = rng.integers(40, 200, (90, 320, 3))
+    night[:, 200:214] = 180
+    assert find_frame(night) == Frame((0, 240), (0, 320))
+    leaves = rng.integers(40, 200, (240, 320, 3)).astype(np.uint8)
+    for top in range(0, 240, 40):
+        leaves[top : top + 30, : rng.integers(10, 60)] = 0
+    assert find_frame(leaves) == Frame((0, 240), (0, 320))
+    assert find_frame(np.zeros((24, 32), np.uint8)).columns == (0, 32)
+
+
+def test_finds_on_borders_are_none_and_masks_end_before_them():
+    shown = np.ones((100, 80), bool)
+    shown[:, :30] = False
+    frame = Frame((0, 100), (0, 80), shown)
+    assert not _is_shown(np.array([10, 10, 30, 90, 20, 20]), frame) and _is_shown(np.array([40, 10, 60, 90, 50, 50]), frame)
+    mask = np.ones((4, 20), np.float32)
+    mask[2:, :5] = 0.0
+    np.testing.assert_array_equal(_without_border(mask, (10, 25), frame).any(axis=1), [False, False, True, True])
+    find = Detection((1.0, 2.0, 3.0, 4.0), (1.5, 2.5), 1.0, mask, (2, 1), (mask, (0, 1)))
+    moved = _moved(find, Frame((7, 100), (30, 80)))
+    assert moved.box == (31.0, 9.0, 33.0, 11.0) and moved.axis == (31.5, 32.5) and moved.corner == (9, 31)
+    assert moved.upper is not None and moved.upper[1] == (7, 31)
+
+
+# --- orientation, swapped sides and units ---
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tiff"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_images_are_turned_as_viewers_turn_them(tmp_path, suffix, orientation):
+    pixels = np.kron(np.random.default_rng(0).integers(0, 255, (5, 7, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    stored = Image.fromarray(pixels)
+    exif = stored.getexif()
+    exif[0x0112] = orientation
+    path = tmp_path / f"turned.{suffix}"
+    stored.save(path, exif=exif)
+    wanted = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("RGB"))
+    assert image_size(path) == wanted.shape[:2]
+    np.testing.assert_allclose(read_image(path).astype(int), wanted.astype(int), atol=3)
+
+
+def test_pairs_upside_down_are_told():
+    left, right, camera = sample()
+    assert pair_fault([], [], left, right, camera) is None
+    turned = [np.ascontiguousarray(image[::-1, ::-1]) for image in (left, right)]
+    assert pair_fault([], [], turned[0], turned[1], camera) == "the images are upside down: turn both by 180 degrees"
+    told = pair_fault([], [], turned[1], turned[0], camera)
+    assert told is not None and "exchange their names back" in told
+
+
+@pytest.mark.parametrize(("baseline", "distance"), [(0.01, "0.08"), (1.0, "8"), (0.0417, "0.33")])
+def test_a_row_that_stands_nowhere_is_told(baseline, distance):
+    """The chessboard was measured in another unit than is said: 10 times, a tenth, and squares of 24 mm taken for 1 cm."""
+    left, right, finds = stalks_at(68)
+    wrong = dataclasses.replace(CAMERA, baseline=baseline)
+    told = pair_fault(finds, measure_pair(finds, left, right, wrong), left, right, wrong)
+    assert told is not None and told.startswith(f"its stalks stand {distance} m away") and "about 0.1 m would" in told
+
+
+def test_what_the_right_image_does_not_reach_has_no_depth():
+    """Where the leftmost stalk would be, the right image ends; what is like it there would stand 1.2 m away."""
+    left, right, finds = stalks_at(68)
+    left, right = left[:, 65:], right[:, 65:].copy()
+    right[:, 10:24] = left[:, 55:69]
+    camera = dataclasses.replace(CAMERA, width=left.shape[1], centre=(CAMERA.centre[0] - 65, CAMERA.centre[1]))
+    finds = [dataclasses.replace(find, corner=(100, find.corner[1] - 65)) for find in finds]
+    first, *others = measure_pair(finds, left, right, camera)
+    assert first.depth_m is None and first.diameter_mm is None and first.reason == "the right image does not show it"
+    assert len(others) == 5 and all(each.diameter_mm for each in others)
