@@ -50,7 +50,7 @@ def folder(here: Path) -> Path:
     run = here / "runs" / "mine"
     (run / "checkpoints").mkdir(parents=True)
     (run / "config.json").write_text(
-        json.dumps({"schema": 2, "config": {"environment": {"env": "Reacher"}, "run": {"preset": "debug"}}})
+        json.dumps({"schema": 2, "run_id": "a" * 32, "config": {"environment": {"env": "Reacher"}, "run": {"preset": "debug"}}})
     )
     (here / "my_task.py").write_text("class MyReach:\n    pass\n")
     (here / "model.zip").write_text("")

@@ -109,6 +109,8 @@ class PixelEnv:
         views: Cameras, outputs and scenes.
     """
 
+    _frames: int
+
     def __init__(self, env: Any, views: Views, form: Format, goal_image: GoalImage = None, frames: int = 1) -> None:
         """See `wrap`."""
         own = dict(

@@ -182,14 +182,14 @@ class Scene:
         width: int = 64,
         groups: tuple[int, ...] = (0, 1, 2),
         site_groups: tuple[int, ...] = (),
-        tendon_groups: tuple[int, ...] = (0, 1, 2),
         textured: bool = True,
-        textures: tuple[str | int, ...] = (),
         shadows: bool = False,
         haze: bool = False,
         plane_backs: bool | None = None,
         leave_out: tuple[str, ...] = (),
         lights: str = "all",
+        tendon_groups: tuple[int, ...] = (0, 1, 2),
+        textures: tuple[str | int, ...] = (),
     ) -> Self:
         """Build a scene from ``mj_model``.
 
