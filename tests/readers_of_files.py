@@ -230,7 +230,7 @@ def read_truth(folder: Path) -> None:
 
     _stalks_by_pair.cache_clear()
     image = np.zeros((*ANNOTATED, 3), np.uint8)
-    for each in find_truth(image, PlotFolder("plot", folder, ()), PairFiles("0", None, None)):
+    for each in find_truth(image, None, PlotFolder("plot", folder, ()), PairFiles("0", None, None)):
         assert each.mask.dtype == bool and np.isfinite(each.box).all()
 
 
