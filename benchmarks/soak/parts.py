@@ -30,7 +30,7 @@ class Broken(AssertionError):
 
 
 LAST = threading.local()
-"""Of the process that this thread has seen the end of last: ``lines``, what it said."""
+"""Output of the last process that ended in this thread: ``lines``."""
 
 
 def environment() -> dict[str, str]:

@@ -17,21 +17,24 @@ from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry
 
 
 def calibration(path: Path) -> str:
-    found = read_calibration(path)
-    x, y = found.centre
-    size = f"{found.width} x {found.height}"
+    """Describe a calibration: sizes in pixels, baseline in metres."""
+    cameras = read_calibration(path)
+    x, y = cameras.centre
     return (
-        f"{size}, focal {found.focal:.2f}, centre {x:.1f} {y:.1f}, baseline {found.baseline:.4f} m, offset {found.offset:.1f}"
+        f"{cameras.width} x {cameras.height}, focal {cameras.focal:.2f}, centre {x:.1f} {y:.1f}, "
+        f"baseline {cameras.baseline:.4f} m, offset {cameras.offset:.1f}"
     )
 
 
 def annotations(path: Path, labels: Sequence[str] = ()) -> str:
-    found = read_annotations(path, labels)
-    boxes = "; ".join(" ".join(f"{value:g}" for value in one["bbox"]) for one in found["annotations"][:4])
-    return f"{len(found['images'])} images, {len(found['annotations'])} boxes ({boxes}), {found['summary']}"
+    """Describe annotated images: numbers of images and boxes, the first boxes, and labels."""
+    data = read_annotations(path, labels)
+    boxes = "; ".join(" ".join(f"{value:g}" for value in one["bbox"]) for one in data["annotations"][:4])
+    return f"{len(data['images'])} images, {len(data['annotations'])} boxes ({boxes}), {data['summary']}"
 
 
 def plots(path: Path) -> str:
+    """Describe the plots of a folder: names and pairs."""
     parts = []
     for plot in find_plots(path):
         whole = sum(pair.left is not None and pair.right is not None for pair in plot.pairs)
@@ -42,6 +45,7 @@ def plots(path: Path) -> str:
 
 
 def odometry(path: Path) -> str:
+    """Describe the odometry of one plot: distances in metres by pair."""
     (plot,) = find_plots(path)
     driven = read_odometry(plot)
     if driven is None:
@@ -69,6 +73,7 @@ def outcomes(folder: Path) -> list[tuple[str, str, str]]:
 
 
 def main(words: Sequence[str] | None = None) -> int:
+    """Print the table of a folder of cases; return 1 if any is a fault."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folder", type=Path)
     rows = outcomes(parser.parse_args(words).folder)

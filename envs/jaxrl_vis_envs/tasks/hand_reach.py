@@ -66,7 +66,7 @@ class HandReachConfig(TaskConfig):
     goal_substeps: int = 10
     """Physics steps per control step while generating a goal, for which only the distribution matters."""
     contacts: bool = True
-    """Whether fingers, thumb and palm collide. False is for measuring the effect of contacts."""
+    """Let fingers, thumb and palm collide. False is for measuring the effect of contacts."""
     solver_iterations: int = 1
     """Newton iterations per physics step."""
     line_search_iterations: int = 4

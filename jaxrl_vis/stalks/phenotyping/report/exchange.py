@@ -18,7 +18,7 @@ from jaxrl_vis.host.spreadsheets import to_csv
 
 Format = Literal["plain", "brapi", "miappe", "plantcv"]
 Plan = Mapping[str, Mapping[str, str]]
-"""What is known of plots: by plot, by column."""
+"""Columns of a field plan: plot -> column -> value."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -276,7 +276,7 @@ def _genotype(about: Mapping[str, str]) -> str:
 
 
 def _position(about: Mapping[str, str]) -> dict[str, str]:
-    """Where a plot stands in its field, in the names of BrAPI."""
+    """Return the position of a plot in its field, by BrAPI's names."""
     small = {name.lower(): value for name, value in about.items()}
     x, y = (next((name for name in names if small.get(name)), "") for names in (_X, _Y))
     y = "" if y == x else y

@@ -72,7 +72,7 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
 
 
 def _one(file: Path, read: Any, kind: str) -> Any:
-    """What ``read`` makes of a file.
+    """Read a file by ``read``.
 
     Raises:
         RequestError: It cannot be read, or is of another kind.

@@ -32,7 +32,7 @@ _OBSERVED = {"trait", "uservalue", "value", "timetaken", "time_taken", "person",
 
 
 def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[str, dict[str, str]]]:
-    """What a table says of plots.
+    """Read the plan of a field: the columns of a table, by plot.
 
     Args:
         path: A CSV with a row for each plot, or, as Field Book exports observations, several that say the same of it.
