@@ -253,6 +253,13 @@ class StudyOptions:
     """Gradient steps over which OL-AUX averages gradients before it compares them; 4 in the authors' release."""
     weighting_log: Annotated[bool, OfWeighting(("cosine",))] = False
     """Minimise the logarithms of the losses, with weighting cosine."""
+    weighting_heads: Annotated[Literal["weighted", "always"] | None, OfWeighting(("cosine", "ol_aux"))] = None
+    """Weights of the losses for the auxiliary tasks' heads: those of the encoder (weighted), or 1 (always). None: always with
+    cosine, as in the thesis, and weighted with OL-AUX."""
+    weighting_eps: Annotated[Positive | None, OfWeighting(("fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"))] = None
+    """Number added to auxiliary losses before their logarithm is taken. None: 0.02."""
+    weighting_maximum: Annotated[Positive | None, OfWeighting(("ol_aux",))] = None
+    """Greatest weight of an auxiliary loss in OL-AUX. None: unbounded."""
     aux_form: Annotated[Literal["thesis", "release"], OfWeighting()] = "thesis"
     """Form of the auxiliary tasks' targets, where the thesis and the authors' release differ (`auxtasks.Options`)."""
 

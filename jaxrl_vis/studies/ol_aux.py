@@ -44,6 +44,20 @@ VARIANTS: dict[str, Variant] = {
     "ol_aux_5_ablation": Variant(
         "OL-AUX-5 (ablation)", _ALL | changes(weighting="ol_aux_ablation", weighting_interval=5), "#3b5bdb"
     ),
+    "ol_aux_5_release": Variant(
+        "OL-AUX-5 as released",
+        _ALL
+        | changes(
+            weighting="ol_aux",
+            weighting_interval=5,
+            weighting_main_grad="total",
+            weighting_window=4,
+            aux_form="release",
+            normalizers="separate",
+            normalizer_source="relabelled",
+        ),
+        "#5c940d",
+    ),
     "ol_aux_1": Variant("OL-AUX-1", _ALL | changes(weighting="ol_aux", weighting_interval=1), "#a61e8c"),
     **{
         name: Variant(f"{name.replace('_', ' ')} alone", changes(aux_tasks=(name,), weighting="balance"), _AUX_COLOURS[name])

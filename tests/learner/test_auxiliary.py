@@ -182,6 +182,28 @@ def test_weights_move_every_so_many_updates():
     assert len(set(seen[5:10])) == 1 and seen[10] != seen[5]
 
 
+@pytest.mark.parametrize("way", ["per_loss", "latents"])
+def test_heads_of_both_networks_learn_while_their_losses_are_kept_out_of_the_encoders(way):
+    tasks = {"aux_tasks": ("inverse_dynamics",)}
+    _, update, working, batch = learner(way, **tasks, weighting="ol_aux", weighting_heads="always")
+    weights = {**working.agent.weighting.weights, "inverse_dynamics": jnp.zeros(())}
+    state = working.agent.weighting.replace(weights=weights)
+    working = working._replace(agent=working.agent.replace(weighting=state))
+    _, always, _ = update(working, batch)
+    _, balanced, start, _ = learner(**tasks, weighting="balance")
+    _, ones, _ = balanced(start, batch)
+    for found, one in ((always.critic, ones.critic), (always.actor, ones.actor)):
+        for left, right in zip(jax.tree.leaves(found["heads"]), jax.tree.leaves(one["heads"]), strict=True):
+            np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
+        assert sizes(found["heads"])["inverse_dynamics"] > 0
+    _, update, start, _ = learner(way, **tasks, weighting="ol_aux")
+    _, weighted, _ = update(start._replace(agent=start.agent.replace(weighting=state)), batch)
+    for found, one in ((always.critic, weighted.critic), (always.actor, weighted.actor)):
+        for left, right in zip(jax.tree.leaves(found["encoder"]), jax.tree.leaves(one["encoder"]), strict=True):
+            np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
+        assert sizes(one["heads"])["inverse_dynamics"] == 0
+
+
 def test_the_ablation_compares_gradients_of_held_parameters():
     settings = {"aux_tasks": ("inverse_dynamics",), "weighting_interval": 5}
     _, update, working, batch = learner(**settings, weighting="ol_aux_ablation")

@@ -11,6 +11,7 @@ from weighting_problem import (
     NAMES,
     WAYS,
     assert_close,
+    encode,
     encoder_gradients,
     encoder_of,
     gradient_by,
@@ -34,8 +35,12 @@ def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -
     @jax.jit
     def all_ways(params: Any, state: Any) -> Any:
         found = [gradient_by(way, weighting)(params, state, batch) for way in ways_of(weighting)]
-        weights = found[0].weights
-        return found, jax.grad(lambda params: weighting.objective(weights, losses_of(params, batch)))(params)
+        in_encoder, in_heads = found[0].weights, weighting.head_weights(found[0].weights)
+        expected = {
+            part: jax.grad(lambda params, weights=weights: weighting.objective(weights, losses_of(params, batch)))(params)[part]
+            for part, weights in (("encoder", in_encoder), ("heads", in_heads))
+        }
+        return found, expected
 
     state = weighting.init(NAMES, encoder_of(params))
     for _ in range(6):
@@ -52,6 +57,32 @@ def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -
     if "ol_aux" in case:  # weights have moved, and differently
         moved = np.array([reference.weights[name] for name in NAMES[1:]])
         assert (moved >= 0).all() and (np.abs(moved - 1) > 0.001).all() and moved[0] != moved[1]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("case", ["cosine", "cosine of logarithms", "ol_aux"])
+def test_heads_learn_while_their_loss_is_kept_out_of_the_encoder(case: str, way: Any) -> None:
+    params, batch = in_float32(problem(0))
+    for name in NAMES[1:]:  # opposed to the main loss: the same head and targets with the other sign of the latents' error
+        params["heads"][name], batch[name] = (
+            params["heads"][MAIN],
+            2.0 * (encode(params["encoder"], batch) @ params["heads"][MAIN]),
+        )
+        batch[name] = batch[name] - batch[MAIN]
+    weighting = weighting_of(case)._replace(heads="always")
+    state = weighting.init(NAMES)
+    state = state.replace(weights={MAIN: jnp.ones(()), "near": jnp.zeros(()), "far": jnp.zeros(())})
+    found = gradient_by(way, weighting)(params, state, batch)
+    gradients = jax.jacrev(losses_of)(params, batch)
+    slopes = weighting.slopes(losses_of(params, batch))
+    assert [float(found.weights[name]) for name in NAMES] == [1, 0, 0]
+    assert_close(found.gradient["encoder"], jax.tree.map(lambda leaf: slopes[MAIN] * leaf, gradients[MAIN]["encoder"]))
+    for name in NAMES:
+        expected = slopes[name] * gradients[name]["heads"][name]
+        assert_close(found.gradient["heads"][name], expected)
+        assert np.abs(expected).max() > 0.01
+    still = gradient_by(way, weighting._replace(heads="weighted"))(params, state, batch)
+    assert not np.any(still.gradient["heads"]["near"])
 
 
 def passes_through_the_encoder(way: Any, losses: int) -> int:

@@ -6,9 +6,11 @@ ddpg         latents of all observations that some task reads, losses, and a wei
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
@@ -98,7 +100,14 @@ class Auxiliary:
                 targets[name] = task.target(transitions)
         return batch.replace(views=views, targets=targets)
 
-    def losses(self, heads: dict[str, Params], view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, jax.Array]:
+    def losses(
+        self,
+        heads: dict[str, Params],
+        view: View,
+        latents: dict[str, jax.Array],
+        batch: Batch,
+        latent_weights: Mapping[str, jax.Array] | None = None,
+    ) -> dict[str, jax.Array]:
         """Compute the loss of each task, [] float32 by name.
 
         Args:
@@ -106,8 +115,11 @@ class Auxiliary:
             view: Inputs that all tasks share.
             latents: [B, L] of the tasks' own views, by name.
             batch: The transitions, with targets.
+            latent_weights: [] float32 by name, factors of each loss's gradient in its latents; None: 1.
         """
         views = self._views(view, latents, batch)
+        if latent_weights is not None:
+            views = {name: _scale_latents(view, latent_weights[name]) for name, view in views.items()}
         return {name: task.loss(heads[name], views[name]) for name, task in self.tasks.items()}
 
     def predictions(
@@ -126,6 +138,29 @@ class Auxiliary:
                 target = task.shift(target, batch.shift)
             views[name] = view.replace(latent_view=latents.get(name), target=target)
         return views
+
+
+def _scale_latents(view: View, weight: jax.Array) -> View:
+    """Multiply the gradient in a view's latents by ``weight``; the latents stay as they are."""
+    names = ("latent_t", "latent_tp1", "latent_view")
+    latents = {name: getattr(view, name) for name in names if getattr(view, name) is not None}
+    return view.replace(**{name: _scale_gradient(latent, weight) for name, latent in latents.items()})
+
+
+@jax.custom_vjp
+def _scale_gradient(values: jax.Array, weight: jax.Array) -> jax.Array:
+    return values
+
+
+def _scale_forward(values: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return values, weight
+
+
+def _scale_backward(weight: jax.Array, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return (weight * gradient).astype(gradient.dtype), jnp.zeros_like(weight)
+
+
+_scale_gradient.defvjp(_scale_forward, _scale_backward)
 
 
 def make_auxiliary(
@@ -175,6 +210,10 @@ def make_auxiliary(
 def _options(config: Config) -> dict[str, Any]:
     """Return the arguments for the constructor of the configuration's weighting."""
     options: dict[str, Any] = {}
+    if config.study.weighting_heads is not None:
+        options["heads"] = config.study.weighting_heads
+    if config.study.weighting_eps is not None:
+        options["eps"] = config.study.weighting_eps
     if config.auxiliary.weighting in ("ol_aux", "ol_aux_ablation"):
         options |= {
             "interval": config.auxiliary.weighting_interval,
@@ -185,6 +224,8 @@ def _options(config: Config) -> dict[str, Any]:
             options["main_grad"] = config.study.weighting_main_grad
         if config.study.weighting_window != 1:
             options["window"] = config.study.weighting_window
+        if config.study.weighting_maximum is not None:
+            options["maximum"] = config.study.weighting_maximum
     if config.auxiliary.weighting == "fixed":
         options["weights"] = config.auxiliary.weighting_fixed
     if config.auxiliary.weighting == "cosine":

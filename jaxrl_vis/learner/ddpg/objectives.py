@@ -195,7 +195,7 @@ class Objectives:
         latents, others = critic_latents, {}
         if has_encoder:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
-            others = self._auxiliary(actor, latents, inputs, image, batch)
+            others = self._auxiliary(actor, latents, inputs, image, batch, weights)
         if self.auxiliary.weighting.log:
             others = {name: self.shards.whole(loss) for name, loss in others.items()}
         action = self.networks.act(actor, latents.pair)
@@ -204,14 +204,25 @@ class Objectives:
         loss = losses.actor_loss(
             value, action, self.config.ddpg.action_penalty, best, self.shards.whole, self.config.ddpg.actor_log
         )
-        return loss + self.auxiliary.weighting.objective(weights, others), action
+        weighting = self.auxiliary.weighting
+        return loss + weighting.objective(weighting.head_weights(weights), others), action
 
     def _auxiliary(
-        self, params: Params, latents: Latents, inputs: Inputs, image: jax.Array | None, batch: Batch
+        self,
+        params: Params,
+        latents: Latents,
+        inputs: Inputs,
+        image: jax.Array | None,
+        batch: Batch,
+        weights: dict[str, jax.Array] | None = None,
     ) -> dict[str, jax.Array]:
-        """Compute the auxiliary losses of a network's latents, by name."""
+        """Compute the auxiliary losses of a network's latents, by name.
+
+        ``weights`` take effect here where they are for the encoder alone: the losses' sum has those of the heads.
+        """
         if not self.auxiliary.tasks:
             return {}
         patches = inputs.observed if self.networks.uses_kernel else None
         view = View(latents.before, batch.action, latents.after, image, patches=patches)
-        return self.auxiliary.losses(params["heads"], view, latents.views, batch)
+        latent_weights = weights if self.auxiliary.weighting.heads == "always" else None
+        return self.auxiliary.losses(params["heads"], view, latents.views, batch, latent_weights)

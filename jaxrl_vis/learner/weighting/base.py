@@ -3,7 +3,8 @@
 One gradient step with losses L_i, shared parameters theta and a weighting:
 
     c_i = w_i s_i,  s_i = 1, or d log(L_i + eps) / d L_i where the weighting takes logarithms     `Weighting.coefficients`
-    gradient = sum over i of c_i grad L_i, over all parameters; the optimiser takes it
+    gradient = sum over i of c_i grad L_i, over all parameters; the optimiser takes it. Where ``heads`` is always, weights apply
+        to theta alone, and s_i takes the place of c_i for all other parameters
     statistics = what the weighting needs of the gradients with respect to theta alone
 
 Losses, dots and gradients cross this interface as they are, without logarithms; the weighting multiplies them by s_i itself.
@@ -25,6 +26,7 @@ MAIN = "main"
 """Name of the loss that the others are to help. Its weight is always 1."""
 
 Needs = Literal["losses", "dots", "gradients"]
+Heads = Literal["weighted", "always"]
 Losses = Mapping[str, jax.Array]  # [] floats by name, `MAIN` among them
 Weights = dict[str, jax.Array]
 
@@ -70,6 +72,8 @@ class Weighting(NamedTuple):
         log: True if logarithms of the losses are learned.
         eps: Added to auxiliary losses before their logarithm is taken.
         main_eps: Added to the main loss likewise.
+        heads: Weights for parameters that are not shared. weighted: those of the shared ones, so that a head rests while its
+            loss weighs nothing; always: 1.
         interval: N, calls of ``update`` from one change of the weights to the next.
         hold: (parameters of this step, WeightingState) -> WeightingState with the ``params`` that losses and statistics of
             this step must belong to; None: they are those of the step.
@@ -83,6 +87,7 @@ class Weighting(NamedTuple):
     log: bool = False
     eps: float = 0.02
     main_eps: float = 1e-8
+    heads: Heads = "weighted"
     interval: int = 1
     hold: Callable[[Params, WeightingState], WeightingState] | None = None
 
@@ -102,6 +107,10 @@ class Weighting(NamedTuple):
         weights = jax.lax.stop_gradient(weights)
         learned = {name: log_loss(loss, self._loss_eps(name)) if self.log else loss for name, loss in losses.items()}
         return sum((weights[name] * loss for name, loss in learned.items()), jnp.zeros(()))
+
+    def head_weights(self, weights: Weights) -> Weights:
+        """Return the weights for parameters that are not shared, [] float32 by name."""
+        return {name: jnp.ones_like(weight) for name, weight in weights.items()} if self.heads == "always" else weights
 
     def _loss_eps(self, name: str) -> float:
         return self.main_eps if name == MAIN else self.eps

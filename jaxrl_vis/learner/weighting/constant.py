@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.learner.weighting.base import (
     MAIN,
+    Heads,
     Losses,
     Weighting,
     WeightingState,
@@ -58,8 +59,8 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: flo
     return _constant("fixed", weights, log=log, eps=eps, main_eps=main_eps)
 
 
-def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
-    """Use an auxiliary loss, with weight 1, only if its gradient does not oppose the main one's.
+def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8, heads: Heads = "always") -> Weighting:
+    """Use an auxiliary loss in the shared parameters, with weight 1, only if its gradient does not oppose the main one's.
 
     Weight 1 where the cosine of the two gradients is at least 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine Similarity"). Only
     the sign matters, so no norm is needed, and logarithms do not change the weights.
@@ -67,6 +68,8 @@ def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8) -> Weig
     Args:
         log: True if logarithms of the losses are learned.
         eps, main_eps: See `Weighting`.
+        heads: See `Weighting`; always in the thesis, so that a loss that is kept out of the shared parameters goes on being
+            learned.
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
@@ -81,7 +84,7 @@ def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8) -> Weig
         weights = {MAIN: one} | {name: jnp.where(statistics[name] >= 0.0, one, 0.0 * one) for name in dots}
         return weights, state.replace(weights=weights, updates=state.updates + 1), report(weights, dots)
 
-    weighting = checked(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps))
+    weighting = checked(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads))
     return weighting
 
 

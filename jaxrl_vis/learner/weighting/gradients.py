@@ -171,6 +171,10 @@ def weighted_grad(
         statistics = measure(weighting, compared_losses, {name: shared(tree) for name, tree in compared.items()})
         weights, state, metrics = weighting.update(compared_losses, statistics, state)
         combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
+        if weighting.heads == "always":
+            in_heads = weighted_sum(gradients, weighting.coefficients(weighting.head_weights(weights), losses))
+            is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(combined)))
+            combined = jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, combined, in_heads)
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def find_by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
@@ -195,7 +199,8 @@ def weighted_grad(
         added = through.backward(differentiated.at_latents, rest)
         if of_main is not None:  # the main loss's own is known already, and gradients add up
             added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
-        combined = jax.tree.map(jnp.add, differentiated.combined(params, coefficients), _embed(shared, params, added))
+        in_heads = differentiated.combined(params, weighting.coefficients(weighting.head_weights(weights), losses))
+        combined = jax.tree.map(jnp.add, in_heads, _embed(shared, params, added))
         return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
 
     return find_per_loss if way == "per_loss" else find_by_latents

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.weighting.base import (
     MAIN,
+    Heads,
     Losses,
     Weighting,
     WeightingState,
@@ -40,6 +41,8 @@ def ol_aux(
     eps: float = 0.02,
     main_eps: float = 1e-8,
     minimum: float | None = 0.0,
+    maximum: float | None = None,
+    heads: Heads = "weighted",
 ) -> Weighting:
     """Build OL-AUX-N. Weights start at 1; a step uses the weights from before its own gradients.
 
@@ -50,11 +53,13 @@ def ol_aux(
         log: True if logarithms of the losses are learned and compared.
         eps, main_eps: See `Weighting`. The release adds nothing to the main loss.
         minimum: Least weight; None for none (thesis). Without one, weights turn negative and losses grow.
+        maximum: Greatest weight; None for none (thesis).
+        heads: See `Weighting`.
 
     Raises:
         RequestError: An argument makes no sense; from ``update``: the state is another weighting's.
     """
-    move = make_rule("ol_aux", interval, learning_rate, beta, minimum)
+    move = make_rule("ol_aux", interval, learning_rate, beta, minimum, maximum)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         others = auxiliary_names("ol_aux", names)
@@ -68,7 +73,9 @@ def ol_aux(
         after = move(state, scaled(sums, 1.0 / interval), sums)
         return state.weights, after, report(state.weights, dots)
 
-    weighting = checked(Weighting("ol_aux", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, interval=interval))
+    weighting = checked(
+        Weighting("ol_aux", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)
+    )
     return weighting
 
 
@@ -78,13 +85,14 @@ def make_rule(
     learning_rate: float,
     beta: float | None,
     minimum: float | None,
+    maximum: float | None = None,
     multiplicative: bool = False,
 ) -> Callable[..., WeightingState]:
     """Build the rule that updates weights by the inner products of their losses' gradients with the main one's.
 
     Args:
         label: Name of the weighting, for messages.
-        interval, learning_rate, beta, minimum: As of `ol_aux`.
+        interval, learning_rate, beta, minimum, maximum: As of `ol_aux`.
         multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Returns:
@@ -97,6 +105,8 @@ def make_rule(
     step_size = (5.0 * interval if beta is None else beta) * learning_rate
     if not math.isfinite(step_size):
         raise RequestError(f"beta and learning_rate of weighting {label} must be finite, not {beta} and {learning_rate}")
+    if maximum is not None and not maximum >= max(minimum or 0.0, 0.0):
+        raise RequestError(f"maximum of weighting {label} must be at least its minimum, not {maximum}")
 
     def move(state: WeightingState, mean: dict[str, jax.Array], sums: Any, **more: Any) -> WeightingState:
         due = (state.updates + 1) % interval == 0
@@ -104,7 +114,7 @@ def make_rule(
         for name, value in mean.items():
             old = state.weights[name]
             moved = old + step_size * (old * value if multiplicative else value)
-            weights[name] = jnp.where(due, moved if minimum is None else jnp.maximum(moved, minimum), old)
+            weights[name] = jnp.where(due, jnp.clip(moved, minimum, maximum), old)
         sums = jax.tree.map(lambda leaf: jnp.where(due, 0.0, leaf), sums)
         after = WeightingState(weights=weights, updates=state.updates + 1, sums=sums, **more)
         return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # a scan's carry keeps its dtypes

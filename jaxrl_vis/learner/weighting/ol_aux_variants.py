@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.learner.weighting.base import (
     MAIN,
+    Heads,
     Losses,
     Weighting,
     WeightingState,
@@ -41,11 +42,13 @@ def ol_aux_window(
     window: int = 1,
     minimum: float | None = 0.0,
     multiplicative: bool = False,
+    maximum: float | None = None,
+    heads: Heads = "weighted",
 ) -> Weighting:
     """Build OL-AUX-N as in the authors' release: gradients are averaged over the latest updates before they are compared.
 
     Args:
-        interval, learning_rate, beta, log, eps, main_eps, minimum: As of `ol_aux.ol_aux`.
+        interval, learning_rate, beta, log, eps, main_eps, minimum, maximum, heads: As of `ol_aux.ol_aux`.
         main_grad: main, the gradient of the main loss (thesis), or total, that of everything that is learned, which adds
             w_i |g_i|^2 to each dot (release).
         window: Latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
@@ -58,7 +61,7 @@ def ol_aux_window(
     label = "ol_aux"
     check_count(label, "window", window)
     _check_main_grad(label, main_grad)
-    move = make_rule(label, interval, learning_rate, beta, minimum, multiplicative)
+    move = make_rule(label, interval, learning_rate, beta, minimum, maximum, multiplicative)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         others = _names(label, names, shared)
@@ -78,7 +81,7 @@ def ol_aux_window(
         return state.weights, after, report(state.weights, dots)
 
     weighting = checked(
-        Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, interval=interval)
+        Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)
     )
     return weighting
 
