@@ -11,8 +11,9 @@ from test_steps import Float32Numpy, arithmetic_of, columns
 
 import jaxrl_vis_envs
 from benchmarks.tasks import environments
-from jaxrl_vis_envs.physics.scalar import line_search, scalar_model, scalar_newton, sparse_algebra, steps
-from jaxrl_vis_envs.physics.scalar.scalar_newton import Problem, Solution
+from jaxrl_vis_envs.physics.scalar import scalar_model, sparse_algebra, steps
+from jaxrl_vis_envs.physics.scalar.solver import line_search, scalar_newton
+from jaxrl_vis_envs.physics.scalar.solver.scalar_newton import Problem, Solution
 
 DRY, CONE = 1, (4, 3)
 JOINTS, ITERATIONS = 4, 12

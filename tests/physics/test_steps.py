@@ -27,18 +27,16 @@ from jaxrl_vis_envs.physics.scalar import (
     constraint_softness,
     contacts,
     dynamics,
-    friction_cones,
-    line_search,
     links,
     partial_arithmetic,
     quaternions,
     scalar_model,
-    scalar_newton,
     sparse_algebra,
     steps,
     steps_kernel,
     welds,
 )
+from jaxrl_vis_envs.physics.scalar.solver import friction_cones, line_search, scalar_newton
 from jaxrl_vis_envs.tasks.hand_reach import HandReach, HandReachConfig
 
 # Every kind of joint, body, actuator, limit and contact that steps take, at places and along axes that nothing folds away.

@@ -9,7 +9,7 @@ bottom:
     partial_arithmetic, quaternions, sparse_algebra    scalars, vectors and matrices whose known entries generate no operations
     links, dynamics, link_frames                       kinematic tree, mass matrix and bias forces, poses and their derivatives
     contacts, welds, constraint_softness               residuals, Jacobians and softness of constraints
-    friction_cones, line_search, scalar_newton         the constraint solver
+    solver/                                            friction cones, line search, Newton's method
     scalar_model                                       constants of a model, and the subset of MuJoCo
     steps, triton_scalars, steps_kernel                physics steps, in plain JAX and as a GPU kernel
 """

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis_envs.physics.scalar import contacts, dynamics, link_frames, links, scalar_model, scalar_newton, welds
+from jaxrl_vis_envs.physics.scalar import contacts, dynamics, link_frames, links, scalar_model, welds
 from jaxrl_vis_envs.physics.scalar.dynamics import JointTransform
 from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames, MocapPose
 from jaxrl_vis_envs.physics.scalar.partial_arithmetic import minus, plus, times
@@ -21,7 +21,8 @@ from jaxrl_vis_envs.physics.scalar.scalar_model import (
     ScalarModel,
     WeldConstraint,
 )
-from jaxrl_vis_envs.physics.scalar.scalar_newton import Problem
+from jaxrl_vis_envs.physics.scalar.solver import scalar_newton
+from jaxrl_vis_envs.physics.scalar.solver.scalar_newton import Problem
 from jaxrl_vis_envs.physics.scalar.sparse_algebra import Column, Matrix, Row
 
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis_envs.physics.scalar.friction_cones import Cone, evaluate_cone
-from jaxrl_vis_envs.physics.scalar.line_search import minimize_along_line
+from jaxrl_vis_envs.physics.scalar.solver.friction_cones import Cone, evaluate_cone
+from jaxrl_vis_envs.physics.scalar.solver.line_search import minimize_along_line
 from jaxrl_vis_envs.physics.scalar.sparse_algebra import (
     Column,
     Matrix,

@@ -1,0 +1,1 @@
+"""Solver of constraint forces: friction cones, line search, Newton's method."""
