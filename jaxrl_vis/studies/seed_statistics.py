@@ -4,7 +4,8 @@ The definitions are those of Agarwal et al., "Deep Reinforcement Learning at the
 section 4): the interquartile mean is taken over all scores of all tasks, and seeds are resampled within their task.
 """
 
-import math
+import functools
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -49,9 +50,18 @@ def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
     first, second = np.asarray(first, float), np.asarray(second, float)
     if min(len(first), len(second)) > 10 or len(first) + len(second) > 20:
         raise ValueError(f"an exact test takes at most ten seeds in each group, not {len(first)} and {len(second)}")
+    pooled = np.concatenate([first, second])
+    sums = pooled[_choices(len(pooled), len(first))].sum(axis=1)
+    # Of equal scores, sums differ by rounding alone.
+    margin = 1e-12 * np.abs(pooled).sum()
+    rarer = min(np.mean(sums <= first.sum() + margin), np.mean(sums >= first.sum() - margin))
+    return min(1.0, 2.0 * float(rarer))
 
-    def difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
-        return np.mean(a, axis=axis) - np.mean(b, axis=axis)
 
-    count = math.comb(len(first) + len(second), len(first))
-    return float(scipy.stats.permutation_test((first, second), difference, n_resamples=count, vectorized=True).pvalue)
+@functools.cache
+def _choices(count: int, size: int) -> np.ndarray:
+    """Return all ways to choose ``size`` of ``count`` places, [ways, size] uint8.
+
+    `scipy.stats.permutation_test` finds them anew in each call, one by one, which takes 0.3 s for two groups of ten.
+    """
+    return np.array(list(itertools.combinations(range(count), size)), np.uint8)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
 
@@ -16,6 +17,11 @@ def test_the_permutation_test_counts_assignments():
     separated = permutation_p_value(np.arange(5.0), np.arange(5.0) + 10.0)
     assert separated == pytest.approx(2 / 252)
     assert permutation_p_value(np.arange(5.0), np.arange(5.0)) == 1.0
+    random = np.random.default_rng(0)
+    for sizes in ((3, 6), (5, 5), (6, 3)):
+        first, second = (np.round(random.normal(size=size), 1) for size in sizes)  # some scores are equal
+        expected = scipy.stats.permutation_test((first, second), lambda a, b: np.mean(a) - np.mean(b), n_resamples=np.inf)
+        assert permutation_p_value(first, second) == pytest.approx(expected.pvalue)
     with pytest.raises(ValueError, match="at most ten"):
         permutation_p_value(np.zeros(11), np.zeros(11))
 
