@@ -16,11 +16,9 @@ import math
 import multiprocessing
 import os
 import threading
-import time
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar
@@ -122,28 +120,16 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
     try:
         yield unordered_map
     except BrokenProcessPool as error:
+        pool.shutdown()  # not left to the end of this process, where the pool's thread may close what that writes to
         raise WorkerError(
             f"one of {workers} processes was killed from outside, most likely because memory ran out: use fewer --workers"
         ) from error
     except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        children = set(multiprocessing.active_children()) - others
-        for child in children:
+        for child in set(multiprocessing.active_children()) - others:
             child.kill()
-        _wait_for(children, 5.0)
+        pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
-
-
-def _wait_for(children: Collection[BaseProcess], seconds: float) -> None:
-    """Wait for children to end, up to a number of seconds.
-
-    `BaseProcess.join` may return too soon: the pool's own thread waits for its processes too, and the system reports the exit
-    of a process to only one of the two threads; the other treats it as running until the first has recorded it.
-    """
-    deadline = time.monotonic() + seconds
-    while any(child.is_alive() for child in children) and time.monotonic() < deadline:
-        time.sleep(0.01)
 
 
 def share_accelerator() -> None:

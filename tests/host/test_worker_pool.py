@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -77,10 +78,14 @@ def test_workers_look_for_no_window_system(monkeypatch):
 
 def test_what_goes_wrong_in_a_process_is_told():
     results: dict[int, Record] = {}
+    before = set(threading.enumerate())
     with pytest.raises(ValueError, match="number 2 is broken"):
         evaluate_all(broken, range(3), 2, results.__setitem__)
+    # A pool's thread that outlives it may print a traceback when the process ends.
+    assert not set(threading.enumerate()) - before
     with pytest.raises(WorkerError, match="was killed from outside"):
         evaluate_all(killed, range(3), 2, results.__setitem__)
+    assert not set(threading.enumerate()) - before
 
 
 def test_signals_to_the_whole_group_do_not_reach_processes():
