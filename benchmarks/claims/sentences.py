@@ -130,6 +130,14 @@ def _single_tasks() -> Iterator[Sentence]:
         for name in ("ol_aux_1", "ol_aux_5_ablation")
     ]
     yield Sentence(LAB, f"(p from {min(ps):.3f} to {max(ps):.3f})", run(HAND, "ol_aux_1").name)
+    fresh, budget = ol_aux.claim(FETCH, "ol_aux_5"), ol_aux.BUDGETS[FETCH]
+    one, ablated = (run(FETCH, name) for name in ("ol_aux_1", "ol_aux_5_ablation"))
+    quote = (
+        f"OL-AUX-1 stays level on FetchReach ({_p(one, fresh, budget)}), and the ablation is worse there "
+        f"({_p(ablated, fresh, budget)})"
+    )
+    holds = [c.verdict(record, fresh, budget) for record in (one, ablated)] == ["level", "worse"]
+    yield Sentence(LAB, quote, ablated.name, holds)
 
 
 def _indicator() -> Iterator[Sentence]:
