@@ -50,6 +50,27 @@ def _logarithm() -> Iterator[Sentence]:
     yield Sentence(LAB, quote, alone[FINGER].name, is_level and verdicts[FINGER] == "worse")
 
 
+def _sum() -> Iterator[Sentence]:
+    plain, *others = (ol_aux.claim(FINGER, name) for name in ("sum", "none", "balance", "ol_aux_5"))
+    budget = ol_aux.BUDGETS[FINGER]
+    none, balance, ours = (f"({_p(plain, other, budget)})" for other in others)
+    quote = f"is better than none {none} and worse than balancing {balance} and OL-AUX-5 {ours}."
+    holds = [c.verdict(plain, other, budget) for other in others] == ["better", "worse", "worse"]
+    yield Sentence(LAB, quote, plain.name, holds)
+
+
+def _release() -> Iterator[Sentence]:
+    release, *others = (ol_aux.claim(FETCH, name) for name in ("ol_aux_5_release", "none", "balance", "ol_aux_5"))
+    budget, ours = ol_aux.BUDGETS[FETCH], others[-1]
+    p = [f"({_p(release, other, budget)})" for other in others]
+    quote = f"is level with none {p[0]} and balancing {p[1]} on FetchReach, and worse than OL-AUX-5 {p[2]}."
+    holds = [c.verdict(release, other, budget) for other in others] == ["level", "level", "worse"]
+    yield Sentence(LAB, quote, release.name, holds)
+    ends = [record.median(metric="train/weight/inverse_dynamics") for record in (release, ours)]
+    quote = "that of inverse dynamics is {:,.0f} at the end, and {:.0f} with ours (medians)".format(*ends)
+    yield Sentence(LAB, quote, release.name)
+
+
 def _weightings() -> Iterator[Sentence]:
     run = ol_aux.run
     none, ours, balance = (
@@ -330,6 +351,8 @@ def sentences() -> list[Sentence]:
     parts = (
         _weightings,
         _logarithm,
+        _sum,
+        _release,
         _single_tasks,
         _indicator,
         _parts_of_the_method,
