@@ -144,7 +144,7 @@ def study(family: str, stem: str, fresh: bool = False, budget: int = 0) -> Recor
 def fresh_variants(task: str) -> list[str]:
     """Return the variants of the study of auxiliary losses that were run with fresh seeds and the release's decay."""
     names = [folder.name for family in ("ol_aux", "target_decay") for folder in (RESULTS / "studies" / family).iterdir()]
-    pattern = rf"{re.escape(task)}-(\w+)-paper(?:-decay0\.98)?-seeds(\d+)to\d+(?:-.*)?"
+    pattern = rf"{re.escape(task)}-([\w.]+)-paper(?:-decay0\.98)?-seeds(\d+)to\d+(?:-.*)?"
     matches = [match for name in names if (match := re.fullmatch(pattern, name))]
     return sorted({match[1] for match in matches if int(match[2]) >= FIRST_FRESH_SEED})
 

@@ -206,7 +206,7 @@ def _balance_and_none() -> Claim:
 
 def _cosine() -> Claim:
     comparisons = _ol_aux("cosine", "none", ol_aux.BUDGETS)
-    note = "Here a closed gate also stops a loss's head; the thesis gates the shared parameters alone"
+    note = "On Fetch the gate is that of the thesis; on hand and finger it also stops the head of a loss"
     return _compared("Cosine similarity is better than none (figure 5.4)", comparisons, f"[5.4]({_LAB}#figure-54)", note=note)
 
 

@@ -145,7 +145,9 @@ def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
         status = part.stop()
         part.check_words()
         file = folder / "metrics.jsonl"
-        walls = [json.loads(line)["time/wall_s"] for line in (file.read_text() if file.exists() else "").splitlines()]
+        rows = [json.loads(line) for line in (file.read_text() if file.exists() else "").splitlines()]
+        # An earlier fault may have flipped a bit of the name.
+        walls = [row["time/wall_s"] for row in rows if "time/wall_s" in row]
         if walls != sorted(walls) or any(wall > 86400.0 for wall in walls):
             raise Broken(f"seconds follow the clock: {walls}")
         return status or None
