@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 from benchmarks.claims import columns as c
 from benchmarks.claims.markdown import Row, table
 from benchmarks.claims.records import FIRST_FRESH_SEED, Record, ablation, fresh_variants, study
-from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
+from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, OPTIONS
 
 LAB, GUIDE = "docs/lab/ol_aux.md", "docs/auxiliary_losses.md"
 VIEW = "view=fingertips-tip_marks=faint-depth_encoding=zbuffer"
@@ -175,6 +175,23 @@ def _main() -> str:
     return table(["`paper`", "auxiliary losses"], rows, columns)
 
 
+def _options() -> str:
+    """Options of OL-AUX-5 on FetchReach, with the seeds that options are chosen by."""
+    base, budget = run(FETCH, "ol_aux_5"), BUDGETS[FETCH]
+    rows = [Row("OL-AUX-5", base)]
+    rows += [Row(f"`{variant}`", run(FETCH, variant)) for variant in OPTIONS if _is_kept(FETCH, variant)]
+    weights = [f"train/weight/{name}" for name in AUX_TASKS]
+    total = c.Column("sum of weights at the end", lambda record: f"{sum(record.median(metric=name) for name in weights):.0f}")
+    return table([FETCH], rows, [c.mean_success(budget), c.p(base, "OL-AUX-5", budget), total, c.names()])
+
+
+def _is_kept(task: str, variant: str) -> bool:
+    try:
+        return bool(run(task, variant))
+    except LookupError:
+        return False
+
+
 def tables() -> dict[str, dict[str, str]]:
     """Page -> marker -> text."""
     four = ("none", "balance", "cosine", "ol_aux_5")
@@ -194,6 +211,7 @@ def tables() -> dict[str, dict[str, str]]:
             "fresh_fetch": _fresh(FETCH),
             "fresh_hand": _fresh(HAND),
             "fresh_finger": _fresh(FINGER),
+            "options": _options(),
             "departures": _departures(),
             "gaps": _gaps(),
         },

@@ -74,6 +74,15 @@ def _release() -> Iterator[Sentence]:
     yield Sentence(LAB, quote, release.name)
 
 
+def _options() -> Iterator[Sentence]:
+    ours, budget = ol_aux.run(FETCH, "ol_aux_5"), ol_aux.BUDGETS[FETCH]
+    tried = {name: ol_aux.run(FETCH, f"ol_aux_5_{name}") for name in ("eps_0.001", "beta_100", "heads")}
+    verdicts = {name: c.verdict(record, ours, budget) for name, record in tried.items()}
+    quote = "none of these is better than OL-AUX-5 as it is, and the smaller number in the logarithm is worse "
+    quote += f"({_p(tried['eps_0.001'], ours, budget)})"
+    yield Sentence(LAB, quote, ours.name, "better" not in verdicts.values() and verdicts["eps_0.001"] == "worse")
+
+
 def _weightings() -> Iterator[Sentence]:
     run = ol_aux.run
     none, ours, balance = (
@@ -359,6 +368,7 @@ def sentences() -> list[Sentence]:
         _logarithm,
         _sum,
         _release,
+        _options,
         _single_tasks,
         _indicator,
         _parts_of_the_method,

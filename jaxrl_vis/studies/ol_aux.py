@@ -28,6 +28,15 @@ AUX_TASKS: tuple[AuxTaskName, ...] = tuple(_AUX_COLOURS)
 
 _ALL: dict[str, Any] = {"aux_tasks": AUX_TASKS}
 
+OPTIONS: dict[str, dict[str, Any]] = {
+    "ol_aux_5_beta_100": changes(weighting_beta=100.0),
+    "ol_aux_5_beta_400": changes(weighting_beta=400.0),
+    "ol_aux_5_eps_0.001": changes(weighting_eps=0.001),
+    "ol_aux_5_heads": changes(weighting_heads="always"),
+    "ol_aux_5_maximum_5": changes(weighting_maximum=5.0),
+}
+"""Options of OL-AUX-5 that were tried, by variant."""
+
 VARIANTS: dict[str, Variant] = {
     "none": Variant("no auxiliary losses", {}, "#5b626c"),
     "none_log": Variant("none, log of the main loss", {"weighting": "none_log"}, "#9aa1ab"),
@@ -44,6 +53,14 @@ VARIANTS: dict[str, Variant] = {
     "ol_aux_5_ablation": Variant(
         "OL-AUX-5 (ablation)", _ALL | changes(weighting="ol_aux_ablation", weighting_interval=5), "#3b5bdb"
     ),
+    **{
+        name: Variant(
+            name.replace("ol_aux_5_", "OL-AUX-5, ").replace("_", " "),
+            _ALL | changes(weighting="ol_aux", weighting_interval=5) | options,
+            "#74b816",
+        )
+        for name, options in OPTIONS.items()
+    },
     "ol_aux_5_release": Variant(
         "OL-AUX-5 as released",
         _ALL
