@@ -74,7 +74,7 @@ def _release() -> Iterator[Sentence]:
     yield Sentence(LAB, quote, release.name)
 
 
-def _options() -> Iterator[Sentence]:
+def _ol_aux_options() -> Iterator[Sentence]:
     ours, budget = ol_aux.run(FETCH, "ol_aux_5"), ol_aux.BUDGETS[FETCH]
     tried = {name: ol_aux.run(FETCH, f"ol_aux_5_{name}") for name in ("eps_0.001", "beta_100", "heads")}
     verdicts = {name: c.verdict(record, ours, budget) for name, record in tried.items()}
@@ -368,7 +368,7 @@ def sentences() -> list[Sentence]:
         _logarithm,
         _sum,
         _release,
-        _options,
+        _ol_aux_options,
         _single_tasks,
         _indicator,
         _parts_of_the_method,
