@@ -348,6 +348,55 @@ def test_gymnasium_environments_stay_on_the_host() -> None:
     assert all(observation[name].flags.writeable for name in observation)
 
 
+class TargetEnv(gymnasium.Env):
+    """A cart that moves the site of its target when it renders, and then computes poses, as Gymnasium-Robotics does."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self) -> None:
+        spec = mujoco.MjSpec.from_string(_XML)
+        # Not at the origin: MuJoCo ignores later positions of a site that starts there.
+        spec.worldbody.add_site(name="target", pos=[0.6, 0.0, 1.0], size=[0.1, 0.1, 0.1], rgba=[0.0, 1.0, 0.0, 1.0])
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return self.data.qpos.copy(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, 10)
+        return self.data.qpos.copy(), 0.0, False, False, {}
+
+    def _render_callback(self) -> None:
+        self.model.site("target").pos = TARGET
+        mujoco.mj_forward(self.model, self.data)
+
+
+TARGET = (-0.6, 0.0, 1.0)  # m
+
+
+def test_targets_that_move_when_gymnasium_robotics_renders_are_in_the_images() -> None:
+    inner, bare = TargetEnv(), TargetEnv()
+    env = pixels.wrap(inner, "front", SIZE, ("rgb", "segmentation"), site_groups=(0, 1, 2))
+    bare.reset()
+    env.reset(seed=0)
+    for _ in range(2):
+        observation, *_ = env.step(np.ones(1))
+        bare.step(np.ones(1))
+    # Neither the physics nor the model has noticed.
+    np.testing.assert_array_equal(inner.data.xpos, bare.data.xpos)
+    np.testing.assert_array_equal(inner.data.qpos, bare.data.qpos)
+    np.testing.assert_array_equal(inner.model.site_pos, bare.model.site_pos)
+    inner._render_callback()
+    expected = np.asarray(render(env.views.scenes["front"], inner.data).segmentation)
+    assert inner.model.ngeom in expected
+    np.testing.assert_array_equal(observation["pixels/front/segmentation"][..., 0], expected)
+
+
 def test_frames_on_the_host_are_gymnasiums() -> None:
     with pytest.raises(ValueError, match="FrameStackObservation"):
         pixels.wrap(gymnasium.make("InvertedPendulum-v5"), frames=3)
