@@ -25,6 +25,7 @@ from render_models import poses_of
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs import pixels
+from jaxrl_vis_envs.adapters.brax import BraxEnv
 from jaxrl_vis_envs.render import Frame, Scene, render
 
 SIZE = 16
@@ -327,6 +328,16 @@ def test_plain_model_and_step_function(cart: mujoco.MjModel) -> None:
             state.obs[..., start + 3], np.rint(255 * np.clip((np.asarray(frame.depth) - 1) / 2, 0, 1)), atol=1
         )
     np.testing.assert_allclose(state.info["unwrapped_obs"], [-0.2, 0.0], atol=1e-6)
+
+
+def test_state_tasks_of_this_project_have_images_through_their_adapter_to_brax() -> None:
+    env = pixels.wrap(BraxEnv("Reacher", reward="dense"), None, SIZE, goal_image=lambda state: state.pipeline_state.data.qpos)
+    state, first = jaxrl_vis_envs.jit(lambda: (env.step(start := env.reset(jax.random.PRNGKey(0)), jnp.ones(2)), start))()
+    start, end = (np.asarray(each.pipeline_state.data.qpos) for each in (first, state))
+    assert not np.allclose(start, end)
+    assert_same_colours(state.obs["pixels/free"], truth(env.views.mj_model, end, -1))
+    assert_same_colours(state.obs["pixels/free/goal"], truth(env.views.mj_model, start, -1))
+    assert state.obs["state"].shape == (env.env.observation_size,)
 
 
 def test_plain_model_without_a_step_function_is_driven_by_its_actuators(cart: mujoco.MjModel) -> None:
