@@ -136,7 +136,7 @@ TASKS = {
 SMOKE: dict[str, Any] = {
     "num_timesteps": 64,
     "num_evals": 2,
-    "num_resets_per_eval": 0,
+    "num_resets_per_eval": 1,
     "episode_length": 20,
     "num_envs": 4,
     "num_eval_envs": 4,
