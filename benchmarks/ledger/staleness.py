@@ -38,7 +38,10 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "physics/peer_playground": (f"{_PEERS}/playground.py", _TIMING),
     "pixels/steps": ("benchmarks/pixels/playground.py", "benchmarks/pixels/speed.py", _TIMING),
     "pixels/steps_with_images": (*_WRAPPED, "benchmarks/pixels/speed.py", _TIMING),
-    **{f"pixels/{figure}": (*_WRAPPED, "benchmarks/pixels/train.py") for figure in ("return", "speed_to_900")},
+    **{
+        f"pixels/{figure}": (*_WRAPPED, "benchmarks/pixels/train.py", "benchmarks/pixels/training_tasks.py")
+        for figure in ("return", "speed_to_900", "success", "speed_to_0.8")
+    },
     "env/steps": (*_PHYSICS, *_IMAGES, *_TASK, "jaxrl_vis/bench/env.py", _TIMING),
     "update/gradient_steps": (*_LEARNER, "jaxrl_vis/bench/update.py", _TIMING),
     "update/peer_torch": (f"{_PEERS}/torch", _TIMING),

@@ -4,7 +4,8 @@ playground   the 25 tasks, with a camera each
 parity       images of the wrapped tasks beside `mujoco.Renderer`'s
 speed        environment steps per second with and without images
 gallery      page of start images, ours beside MuJoCo's
-train        brax PPO on CartpoleBalance from images
+train        brax PPO from images
+training_tasks   what it trains: CartpoleBalance, FetchReach
 
 python -m benchmarks.pixels [TASK ...]       parity, speed and gallery
 python -m benchmarks.pixels.train            training

@@ -5,7 +5,7 @@ import pathlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-COLUMNS, GAP, TITLE = 5, 4, 16  # pairs in a row; pixels
+COLUMNS, GAP, TITLE = 3, 4, 16  # pairs in a row, so many that titles are legible on a page of text; pixels
 
 
 def save(pairs: dict[str, tuple[np.ndarray, np.ndarray]], path: pathlib.Path) -> None:

@@ -57,7 +57,7 @@ def panel(name: str) -> tuple[str, Image.Image]:
     except ValueError:
         blank = np.full((SIZE, SIZE, 3), MISSING, np.uint8)
         return f"{title} (refused)", side_by_side(blank, theirs, blank)
-    ours = np.asarray(render_models.draw(scene, [render_models.poses_of(mj_data)])[0].rgb)
+    ours = np.asarray(render_models.draw(scene, [render_models.poses_of(mj_data)], quick=True)[0].rgb)
     return title, side_by_side(ours, theirs, difference(ours, theirs))
 
 

@@ -56,16 +56,19 @@ def test_the_gallery_has_each_pair_side_by_side(tmp_path: Path) -> None:
     assert np.all(cell[gallery.TITLE :, :8] == 10) and np.all(cell[gallery.TITLE :, 8 + gallery.GAP // 2 :][:, :8] == 200)
 
 
-def evaluation(env_steps: int, episode_return: float, wall_s: float) -> dict[str, float]:
-    return {"env_steps": env_steps, "episode_return": episode_return, "wall_s": wall_s, "training_s": wall_s / 2}
+def evaluation(env_steps: int, score: float, wall_s: float, measure: str = "return") -> dict[str, float]:
+    return {"env_steps": env_steps, measure: score, "wall_s": wall_s, "training_s": wall_s / 2}
 
 
 def test_the_speed_to_the_target_is_that_of_the_first_evaluation_above_it() -> None:
     below, above = evaluation(0, 120.0, 5.0), evaluation(1000, 940.0, 40.0)
-    records = train.measurements([below, above, evaluation(2000, 990.0, 80.0)], {}, 3)
+    records = train.measurements("CartpoleBalance", [below, above, evaluation(2000, 990.0, 80.0)], {}, 3)
     assert [record.name for record in records] == ["pixels/return", "pixels/speed_to_900"]
     assert records[0].value == 990.0 and records[1].value == 1 / 40 and records[1].details["training_s"] == 20.0
-    assert [record.name for record in train.measurements([below], {}, 3)] == ["pixels/return"]
+    assert [record.name for record in train.measurements("CartpoleBalance", [below], {}, 3)] == ["pixels/return"]
+    reached = train.measurements("FetchReach", [evaluation(1000, 0.81, 40.0, "success")], {}, 3)
+    assert [record.name for record in reached] == ["pixels/success", "pixels/speed_to_0.8"]
+    assert all(record.config["task"] == "FetchReach" for record in reached)
 
 
 def test_the_table_has_camera_parity_and_speeds(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from render_models import poses_of
 
 import jaxrl_vis_envs
 from jaxrl_vis_envs import pixels
+from jaxrl_vis_envs.adapters.brax import BraxEnv
 from jaxrl_vis_envs.render import Frame, Scene, render
 
 SIZE = 16
@@ -329,6 +330,16 @@ def test_plain_model_and_step_function(cart: mujoco.MjModel) -> None:
     np.testing.assert_allclose(state.info["unwrapped_obs"], [-0.2, 0.0], atol=1e-6)
 
 
+def test_state_tasks_of_this_project_have_images_through_their_adapter_to_brax() -> None:
+    env = pixels.wrap(BraxEnv("Reacher", reward="dense"), None, SIZE, goal_image=lambda state: state.pipeline_state.data.qpos)
+    state, first = jaxrl_vis_envs.jit(lambda: (env.step(start := env.reset(jax.random.PRNGKey(0)), jnp.ones(2)), start))()
+    start, end = (np.asarray(each.pipeline_state.data.qpos) for each in (first, state))
+    assert not np.allclose(start, end)
+    assert_same_colours(state.obs["pixels/free"], truth(env.views.mj_model, end, -1))
+    assert_same_colours(state.obs["pixels/free/goal"], truth(env.views.mj_model, start, -1))
+    assert state.obs["state"].shape == (env.env.observation_size,)
+
+
 def test_plain_model_without_a_step_function_is_driven_by_its_actuators(cart: mujoco.MjModel) -> None:
     env = pixels.wrap(cart, "front", 8)
     state = jaxrl_vis_envs.jit(lambda: env.step(env.reset(jax.random.key(0)), jnp.array([1.0])))()
@@ -346,6 +357,55 @@ def test_gymnasium_environments_stay_on_the_host() -> None:
     assert_same_colours(observation["pixels/free/goal"] / 255.0, truth(inner.unwrapped.model, [0.0, 0.3], -1))
     assert set(np.unique(observation["pixels/free/bodies"])) <= set(env.views.body_names)
     assert all(observation[name].flags.writeable for name in observation)
+
+
+class TargetEnv(gymnasium.Env):
+    """A cart that moves the site of its target when it renders, and then computes poses, as Gymnasium-Robotics does."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self) -> None:
+        spec = mujoco.MjSpec.from_string(_XML)
+        # Not at the origin: MuJoCo ignores later positions of a site that starts there.
+        spec.worldbody.add_site(name="target", pos=[0.6, 0.0, 1.0], size=[0.1, 0.1, 0.1], rgba=[0.0, 1.0, 0.0, 1.0])
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return self.data.qpos.copy(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, 10)
+        return self.data.qpos.copy(), 0.0, False, False, {}
+
+    def _render_callback(self) -> None:
+        self.model.site("target").pos = TARGET
+        mujoco.mj_forward(self.model, self.data)
+
+
+TARGET = (-0.6, 0.0, 1.0)  # m
+
+
+def test_targets_that_move_when_gymnasium_robotics_renders_are_in_the_images() -> None:
+    inner, bare = TargetEnv(), TargetEnv()
+    env = pixels.wrap(inner, "front", SIZE, ("rgb", "segmentation"), site_groups=(0, 1, 2))
+    bare.reset()
+    env.reset(seed=0)
+    for _ in range(2):
+        observation, *_ = env.step(np.ones(1))
+        bare.step(np.ones(1))
+    # Neither the physics nor the model has noticed.
+    np.testing.assert_array_equal(inner.data.xpos, bare.data.xpos)
+    np.testing.assert_array_equal(inner.data.qpos, bare.data.qpos)
+    np.testing.assert_array_equal(inner.model.site_pos, bare.model.site_pos)
+    inner._render_callback()
+    expected = np.asarray(render(env.views.scenes["front"], inner.data).segmentation)
+    assert inner.model.ngeom in expected
+    np.testing.assert_array_equal(observation["pixels/front/segmentation"][..., 0], expected)
 
 
 def test_frames_on_the_host_are_gymnasiums() -> None:

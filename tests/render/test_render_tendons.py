@@ -24,6 +24,8 @@ _XML = """
     <geom name="rod" type="cylinder" size=".15 .5" pos="2 0 .5" euler="90 0 20"/>
     <site name="above" pos="0 0 .8"/>
     <site name="inside" pos="0 0 .45" size=".01"/>
+    <site name="over" pos="-.3 0 .85"/><site name="beside" pos="-.3 0 .38"/>
+    <site name="rod_over" pos="1.7 .05 .85"/><site name="rod_beside" pos="1.7 0 .38"/>
     <site name="left" pos="-.5 0 .45"/><site name="rod_left" pos="1.5 .1 .45"/>
     <site name="hook" pos="4 0 1"/><site name="fixed" pos="5 0 1"/>
     <body name="slider">
@@ -48,6 +50,8 @@ _TENDONS = {
     "ball": '<spatial><site site="left"/><geom geom="ball"/><site site="right"/></spatial>',
     "ball_above": '<spatial><site site="left"/><geom geom="ball" sidesite="above"/><site site="right"/></spatial>',
     "ball_inside": '<spatial><site site="above"/><geom geom="ball" sidesite="inside"/><site site="right"/></spatial>',
+    "ball_beside": '<spatial><site site="over"/><geom geom="ball" sidesite="beside"/><site site="right"/></spatial>',
+    "rod_beside": '<spatial><site site="rod_over"/><geom geom="rod" sidesite="rod_beside"/><site site="rod_right"/></spatial>',
     "rod": '<spatial><site site="rod_left"/><geom geom="rod"/><site site="rod_right"/></spatial>',
     "hanging": '<spatial limited="true" range="0 .45" width=".01"><site site="hook"/><site site="end"/></spatial>',
     "spring": '<spatial stiffness="5" springlength="0 .8"><site site="end"/><site site="fixed"/></spatial>',
@@ -117,7 +121,8 @@ def test_capsules_and_colours_are_those_of_the_visualiser(name: str) -> None:
 
 def test_both_courses_occur_in_the_poses() -> None:
     """Of what the test above compares: tendons with and without contact, slack and taut, within a limit and beyond it."""
-    numbers: dict[str, set[Any]] = {"ball": set(), "ball_above": set(), "ball_inside": set(), "rod": set(), "hanging": set()}
+    names = ("ball", "ball_above", "ball_beside", "ball_inside", "rod", "rod_beside", "hanging")
+    numbers: dict[str, set[Any]] = {name: set() for name in names}
     for name, seen in numbers.items():
         mj_model = model_of(name)
         for qpos in _POSES:
@@ -125,7 +130,8 @@ def test_both_courses_occur_in_the_poses() -> None:
             mj_data.qpos[:] = qpos
             mujoco.mj_forward(mj_model, mj_data)
             seen.add(len(visualised(mj_model, mj_data)))
-    assert all(max(numbers[name]) > 2 for name in ("ball", "ball_above", "rod")) and 1 in numbers["rod"], numbers
+    assert all(max(numbers[name]) > 2 for name in names[:3] + names[4:6]), numbers
+    assert all(1 in numbers[name] for name in ("ball_beside", "rod", "rod_beside")), numbers
     assert {1, 2} == numbers["ball_inside"] and {1, 28} == numbers["hanging"], numbers
 
 

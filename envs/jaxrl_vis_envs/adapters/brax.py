@@ -108,6 +108,11 @@ class BraxEnv(Env):
         return self.goal_env.control_period
 
     @property
+    def mj_model(self) -> Any:
+        """The task's `mujoco.MjModel`, so that `jaxrl_vis_envs.pixels.wrap` can give images to a state task."""
+        return self.goal_env.mj_model  # type: ignore[attr-defined] - of MJX tasks
+
+    @property
     def backend(self) -> str:
         """Name of the physics engine: ``mjx``."""
         return "mjx"

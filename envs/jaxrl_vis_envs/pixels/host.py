@@ -1,6 +1,7 @@
 """Images for Gymnasium environments of MuJoCo, which run on the host; made by `jaxrl_vis_envs.pixels.wrap`."""
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -31,7 +32,8 @@ class _Drawn:
 class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """Gymnasium wrapper whose observations are, or contain, images of a MuJoCo environment; see `wrap`.
 
-    Poses are computed from the joint positions: those in the environment's data are older by one physics step.
+    Poses are computed from the joint positions: those in the environment's data are older by one physics step. Targets are
+    where the environment's own ``render`` shows them.
 
     Args:
         env: The environment.
@@ -71,7 +73,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     def _observe(self, own: Any) -> Any:
         # Goal images are copied: callers keep, and may change, what an observation holds.
-        images = self._render(self._inner.data.qpos) | {name: image.copy() for name, image in self._goals.items()}
+        images = self._render() | {name: image.copy() for name, image in self._goals.items()}
         layout = self._form.layout
         if layout == "image":
             return np.array(self._form.joined(images))  # type: ignore[arg-type]
@@ -79,19 +81,42 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             return images
         return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
 
-    def _render(self, qpos: np.ndarray) -> dict[str, np.ndarray]:
-        """Render the images at joint positions [nq], with the environment's present mocap poses."""
-        data = self._inner.data
-        self._drawn.qpos[:] = qpos
-        self._drawn.mocap_pos[:], self._drawn.mocap_quat[:] = data.mocap_pos, data.mocap_quat
-        mujoco.mj_kinematics(self.views.mj_model, self._drawn)
-        images = self._draw({name: np.asarray(getattr(self._drawn, name), np.float32) for name in _POSES})
+    def _render(self, qpos: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Render the images at joint positions [nq], by default the present ones, with the present mocap poses."""
+        model, drawn = self.views.mj_model, self._drawn
+        with self._targets() as data:
+            drawn.qpos[:] = data.qpos if qpos is None else qpos
+            drawn.mocap_pos[:], drawn.mocap_quat[:] = data.mocap_pos, data.mocap_quat
+            mujoco.mj_kinematics(model, drawn)
+        images = self._draw(self._poses())
         return {name: np.array(image) for name, image in images.items()}
+
+    def _poses(self) -> dict[str, np.ndarray]:
+        return {name: np.asarray(getattr(self._drawn, name), np.float32) for name in _POSES}
+
+    @contextlib.contextmanager
+    def _targets(self) -> Iterator[mujoco.MjData]:
+        """Yield the environment's physics data, with the targets at their places, in the model too, until the end.
+
+        Gymnasium-Robotics moves sites and bodies of targets in a callback of its ``render`` alone. That computes poses as well,
+        on which its next action depends; so it gets a copy of the data.
+        """
+        inner, own, model = self._inner, self._inner.data, self.views.mj_model
+        if not hasattr(inner, "_render_callback"):
+            yield own
+            return
+        sites = model.site_pos.copy()
+        mujoco.mj_copyData(self._drawn, model, own)
+        inner.data = self._drawn
+        try:
+            inner._render_callback()
+            yield self._drawn
+        finally:
+            inner.data, model.site_pos[:] = own, sites
 
     def _space(self) -> gymnasium.Space:
         """Return the space of observations."""
-        self._drawn.qpos[:] = self.views.mj_model.qpos0
-        images = self._render(self._drawn.qpos)
+        images = jax.eval_shape(self._draw, self._poses())
         spaces: dict[str, gymnasium.Space] = {}
         chosen = [output for outputs in self.views.outputs.values() for output in outputs]
         far = {name: float(scene.zfar) for name, scene in self.views.scenes.items()}

@@ -59,12 +59,16 @@ class Poses:
 
 
 def physics_data(state: Any) -> Any:
-    """Return the physics data in a state of an environment: its ``data`` or ``pipeline_state``, or ``state`` itself."""
+    """Return the physics data in a state of an environment, or in a state that is inside that; or else ``state`` itself."""
     for name in _STATES:
-        data = getattr(state, name, None)
-        if hasattr(data, "qpos") or hasattr(data, "q"):
+        inner = getattr(state, name, None)
+        if inner is not None and _has_positions(data := physics_data(inner)):
             return data
     return state
+
+
+def _has_positions(data: Any) -> bool:
+    return hasattr(data, "qpos") or hasattr(data, "q")
 
 
 def joint_positions(data: Any) -> Any:

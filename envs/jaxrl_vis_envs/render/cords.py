@@ -162,7 +162,6 @@ def _wrap(scene: Any, data: Any, piece: Piece) -> _Wrap:
     toward = None
     if side is not None:
         toward = jnp.stack([jnp.sum(side * across), jnp.sum(side * up)])
-        toward = radius * toward / jnp.maximum(_norm(toward), _TINY)
     start, turn, meets = _around_circle(flat[0], flat[1], toward, radius)
     if side is not None:
         touch, touches = _inside_circle(flat[0], flat[1], radius)
@@ -185,36 +184,34 @@ def _wrap(scene: Any, data: Any, piece: Piece) -> _Wrap:
 def _around_circle(begin: jax.Array, end: jax.Array, toward: jax.Array | None, radius: jax.Array) -> tuple:
     """Compute the way around a circle at the origin: angle of its beginning, turn (radians), and if there is contact.
 
-    Of the two ways around it, that on the side of ``toward`` counts, or else the shorter.
+    The way is the short one, where the circle is in between; or the long one around the back of the circle, where ``toward``
+    points there: into the angle opposite to that between the two ends. (MuJoCo before 4.0, and MJX, have another rule.)
     """
-    ways = [_tangents(begin, end, radius, sign) for sign in (1.0, -1.0)]
-    quality = []
-    for first, last, crosses in ways:
-        middle = first + last
-        if toward is None:
-            own = -jnp.sum(jnp.square(first - last))
-        else:
-            own = jnp.sum(middle * toward) / jnp.maximum(_norm(middle), _TINY)
-        quality.append(jnp.where(crosses, -1e4, own))
-    second = quality[1] > quality[0]
-    first, last, crosses = (jnp.where(second, two, one) for one, two in zip(*ways, strict=True))
-    turn = jnp.arctan2(first[0] * last[1] - first[1] * last[0], jnp.sum(first * last))
-    # Clockwise on the first way.
-    turn = jnp.where(second, jnp.mod(turn, 2.0 * jnp.pi), -jnp.mod(-turn, 2.0 * jnp.pi))
+    area = _area(begin, end)
+    is_long = jnp.zeros((), bool)
+    if toward is not None:
+        is_long = (_area(begin, toward) * area <= 0.0) & (_area(toward, end) * area <= 0.0)
+    counterclockwise = (area > 0.0) != is_long
+    first, last, crosses = _tangents(begin, end, radius, jnp.where(counterclockwise, -1.0, 1.0))
+    turn = jnp.arctan2(_area(first, last), jnp.sum(first * last))
+    turn = jnp.where(counterclockwise, jnp.mod(turn, 2.0 * jnp.pi), -jnp.mod(-turn, 2.0 * jnp.pi))
     along = end - begin
     square = jnp.sum(along * along)
     nearest = begin + along * jnp.clip(-jnp.sum(begin * along) / jnp.maximum(square, _TINY), 0.0, 1.0)
-    free = _norm(nearest) > radius
-    if toward is not None:
-        free = free & (jnp.sum(toward * nearest) >= 0.0)
+    free = (_norm(nearest) > radius) & ~is_long
     outside = (_norm(begin) >= radius) & (_norm(end) >= radius)
     return jnp.arctan2(first[1], first[0]), turn, outside & (square > _TINY) & ~free & ~crosses
 
 
-def _tangents(begin: jax.Array, end: jax.Array, radius: jax.Array, sign: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _area(one: jax.Array, two: jax.Array) -> jax.Array:
+    """Return the signed area between two vectors [2], positive if the second is counterclockwise of the first."""
+    return one[0] * two[1] - one[1] * two[0]
+
+
+def _tangents(begin: jax.Array, end: jax.Array, radius: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return the tangent points of one way around a circle, and if the two straight parts cross."""
 
-    def tangent(point: jax.Array, sign: float) -> jax.Array:
+    def tangent(point: jax.Array, sign: jax.Array) -> jax.Array:
         square = jnp.maximum(jnp.sum(point * point), _TINY)
         root = jnp.sqrt(jnp.maximum(square - radius * radius, 0.0))
         beside = jnp.stack([point[1], -point[0]])
@@ -222,9 +219,9 @@ def _tangents(begin: jax.Array, end: jax.Array, radius: jax.Array, sign: float) 
 
     first, last = tangent(begin, sign), tangent(end, -sign)
     one, two, gap = first - begin, last - end, end - begin
-    area = one[0] * two[1] - one[1] * two[0]
+    area = _area(one, two)
     safe = jnp.where(jnp.abs(area) > _TINY, area, 1.0)
-    shares = (gap[0] * two[1] - gap[1] * two[0]) / safe, (gap[0] * one[1] - gap[1] * one[0]) / safe
+    shares = _area(gap, two) / safe, _area(gap, one) / safe
     crosses = jnp.abs(area) > _TINY
     for share in shares:
         crosses = crosses & (share >= 0.0) & (share <= 1.0)
@@ -234,7 +231,7 @@ def _tangents(begin: jax.Array, end: jax.Array, radius: jax.Array, sign: float) 
 def _inside_circle(begin: jax.Array, end: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Compute the angle of the point of a circle to which it holds a tendon inside itself, and if it does at all."""
     start = jnp.arctan2(begin[1], begin[0])
-    turn = jnp.arctan2(begin[0] * end[1] - begin[1] * end[0], jnp.sum(begin * end))
+    turn = jnp.arctan2(_area(begin, end), jnp.sum(begin * end))
 
     def point(share: jax.Array) -> jax.Array:
         angle = start + share * turn
