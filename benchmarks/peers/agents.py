@@ -12,12 +12,13 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 # brax compiles without the options of `compilation.jit`. JAX reads this variable at its first import: a script may set it,
-# a library may not.
-if "fusion_emitters" not in os.environ.get("XLA_FLAGS", ""):
+# a library may not. JAX 0.11 does not know the option, and would end the process.
+if version("jaxlib").startswith("0.10.") and "fusion_emitters" not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
 
 import numpy as np

@@ -16,11 +16,12 @@ import pathlib
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "envs")]
-if __name__ == "__main__":  # brax compiles by itself: see docs/pixels.md
+if __name__ == "__main__" and version("jaxlib").startswith("0.10."):  # brax compiles by itself: see docs/pixels.md
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 
 from benchmarks.ledger.records import RESULTS  # noqa: E402
