@@ -12,7 +12,8 @@ truncated.
 
 Two properties of brax matter here. Its AutoResetWrapper restarts every episode of an environment from that environment's first
 one, with the same goal: use many environments, or set ``num_resets_per_eval``. And it compiles without the option that physics
-needs on a CPU with JAX 0.10 (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`` before JAX starts.
+needs on a CPU with JAX 0.10 (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`` before JAX
+starts.
 """
 
 import contextlib
