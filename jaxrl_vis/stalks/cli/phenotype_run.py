@@ -79,6 +79,7 @@ def run(options: Run) -> int:
         share_accelerator()
     check_devices()
     enable_compilation_cache()
+    from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
     from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND, NO_WIDTHS
 
@@ -94,7 +95,8 @@ def run(options: Run) -> int:
         name = f"{detector_name(weights)}, least score {options.least_score:g}"
         find = functools.partial(find_stalks, weights, options.least_score)
 
-    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale)
+    tried = TRIED if options.masks == "network" else None
+    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried)
     for plot in plots:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
