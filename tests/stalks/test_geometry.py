@@ -17,7 +17,8 @@ from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED, lens_fault
-from jaxrl_vis.stalks.phenotyping.track.follow import follow
+from jaxrl_vis.stalks.phenotyping.report.tables import Origin, plot_rows
+from jaxrl_vis.stalks.phenotyping.track.follow import Path, Track, follow
 from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, measure_pair, view_pair
 from jaxrl_vis_envs.plants import Calibration
@@ -155,15 +156,27 @@ def test_the_field_of_a_crop_is_its_own():
     narrow = dataclasses.replace(CAMERA, width=200, centre=(-300.0, 199.5))
     frames = [[Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.54)]]
     frames += [[] for _ in range(8)]
-    (track,), _ = follow(frames, np.arange(9) * 0.1, narrow)
+    (track,), path = follow(frames, np.arange(9) * 0.1, narrow)
     assert track.counted
+    assert path.seen == pytest.approx(0.51, abs=0.01)  # it begins 0.39 m to the right of where the robot did
     # The whole image, of which it may be a part, would have shown it in more pairs; what is letterboxed shows no more.
     whole = dataclasses.replace(narrow, width=800, centre=(300.0, 199.5))
     frames[0][0] = dataclasses.replace(frames[0][0], column=700.0)
-    (track,), _ = follow(frames, np.arange(9) * 0.1, whole)
-    assert track.reason.startswith("seen in 1 of")
+    (track,), path = follow(frames, np.arange(9) * 0.1, whole)
+    assert path.seen == 1.0 and track.reason.startswith("seen in 1 of")
     (track,), _ = follow(frames, np.arange(9) * 0.1, whole, columns=(600.0, 800.0))
     assert track.counted
+
+
+def test_a_row_that_is_not_seen_as_a_whole_has_no_count():
+    """Nobody knows how many stalks stand where no pair looked; a mean of widths that few pairs measured says so."""
+    find = Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.4, height_m=0.3048)
+    track = Track(((0, 0),), 0.4, 0.8, True, "")
+    origin = Origin("plot", "strip", "0")
+    for seen, count, flag in ((1.0, 1, "few frames"), (0.97, 1, "few frames"), (0.9, "", "part of the row not seen")):
+        stalks, row = plot_rows([[find]], [track], Path(np.zeros(1), 0.5, seen), 0, origin)
+        assert len(stalks) == 1 and stalks[0]["width_mm"] == "14.000"
+        assert row["stalks"] == count and row["flag"] == flag and (row["stalks_per_m"] == "") == (count == "")
 
 
 # --- borders ---

@@ -81,7 +81,7 @@ def run(options: Run) -> int:
     enable_compilation_cache()
     from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
-    from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND, NO_WIDTHS
+    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS
 
     if options.masks == "truth":
         from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import find_truth
@@ -122,6 +122,8 @@ def run(options: Run) -> int:
             print(
                 f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
             )
+        if row["flag"] == FEW_FRAMES:
+            print(f"{row['plot']}: most widths were measured in fewer than three pairs: take more of them", file=sys.stderr)
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
     counts = f"plots: {len(plots)}, pairs skipped: {len(skipped)}"

@@ -36,6 +36,7 @@ from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
 from jaxrl_vis.stalks.phenotyping.report.qc import Page, PlotResult
 from jaxrl_vis.stalks.phenotyping.report.tables import (
     NO_ROW,
+    PARTLY_SEEN,
     PLOT_COLUMNS,
     STALK_COLUMNS,
     Origin,
@@ -177,6 +178,8 @@ def _why_no_count(flag: str, frames: list[list[Sighting]], plot: PlotFolder, dri
     """Return more words than a plot's flag has on why it has no count; empty where there is no more to say."""
     if flag == NO_ODOMETRY:
         return why_no_odometry(plot, driven, plot.pairs) or ""
+    if flag == PARTLY_SEEN:
+        return "its pairs do not show all of the row that the robot passed: take some before its beginning and beyond its end"
     if flag == NO_FIT:
         return "its distances, or the baseline of the calibration, may be in another unit"
     if flag != NO_ROW:
