@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ledger.records import RESULTS
+from benchmarks.ledger.stalks_table import LENSES, lens_rows
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.provenance import device_name, revision
@@ -26,7 +27,6 @@ from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match
 from jaxrl_vis.stalks.phenotyping.evaluation.synth import plot_name, write_plots
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import read_image
-from jaxrl_vis.stalks.phenotyping.measure.lens import lens_fault
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
 from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, view_pair
@@ -36,7 +36,6 @@ from jaxrl_vis_envs.plants.truth import StalkInView
 
 FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.66, 2.0)
 SEED, WIDTH, PAIRS = 5, 1055, 12
-TARGET = Path("phenotyping") / "lenses.json"
 
 
 def draw(folder: Path, factor: float) -> Path:
@@ -95,43 +94,7 @@ def look(plot: Path, finder: Finder) -> dict[str, Any]:
         "false": false,
         "ground": grounds / len(rows),
         "errors_mm": errors,
-        "refused": lens_fault(calibration, USUAL_DISTANCE, calibration.height) is not None,
     }
-
-
-def table(record: dict[str, Any]) -> str:
-    """Write the record as a table in Markdown."""
-    lenses = record["lenses"]
-    usual = lenses["1"]["errors_mm"]
-    lines = [
-        "| focal length | pixels per metre | height of the view | counted | found of clear sightings | false finds "
-        "| ground seen | widths | error, median | against the usual lens | `phenotype run` |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
-    for factor, lens in lenses.items():
-        errors = lens["errors_mm"]
-        beside = [errors[stalk] - usual[stalk] for stalk in errors.keys() & usual.keys()]
-        error, against = (f"{np.median(values):+.2f} mm" if values else "" for values in (list(errors.values()), beside))
-        cells = (
-            f"x {factor}",
-            f"{lens['density']:.0f}",
-            f"{lens['view']:.2f} m",
-            f"{lens['counted']} of {lens['true']}",
-            f"{lens['found']} of {lens['clear']}",
-            f"{lens['false']}",
-            f"{lens['ground']:.0%}".replace("%", " %"),
-            f"{len(errors)}",
-            error,
-            "" if factor == "1" else against,
-            "refuses" if lens["refused"] else "measures",
-        )
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def read_table(results: Path) -> str:
-    """Write the table of docs/phenotyping.md from the record."""
-    return table(json.loads((results / TARGET).read_text(encoding="utf-8")))
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -145,7 +108,7 @@ def main(words: Sequence[str] | None = None) -> int:
     finder = load_finder(SHIPPED, 0.5)
     about = {"synthetic": True, "seed": SEED, "width": WIDTH, "pairs": PAIRS, "finder": detector_name(SHIPPED)}
     lenses: dict[str, Any] = {}
-    target = None if options.results is None else options.results / TARGET
+    target = None if options.results is None else options.results / LENSES
     if target is not None and target.exists():
         record = read_json(target)
         lenses = record["lenses"] if about.items() <= record.items() else {}
@@ -156,7 +119,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if target is not None:
             write_atomically(target, json.dumps(record, indent=1) + "\n")
         print(f"x {factor:g}: {figures['counted']} of {figures['true']} stalks", flush=True)
-    print(table(record), end="")
+    print(lens_rows(record["lenses"]), end="")
     return 0
 
 

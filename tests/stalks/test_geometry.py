@@ -70,6 +70,8 @@ def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, add
         (2168.0, (3376, 2704), 0.8, None),
         (678.0, (300, 845), 0.8, None),  # cropped at the sides
         (2 * 678.0, (2110, 1690), 0.8, None),
+        (0.8 * 678.0, (1055, 845), 0.8, None),
+        (1.4 * 678.0, (1055, 845), 0.8, None),
         (0.6 * 678.0, (1055, 845), 0.8, "508 pixels per metre of a row 0.80 m away"),
         (678.0, (1055, 845), 1.6, "424 pixels per metre of a row 1.60 m away"),
         (1.66 * 678.0, (1055, 845), 0.8, "show 0.60 m from top to bottom"),
@@ -84,7 +86,7 @@ def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
     if told is None:
         assert fault is None
     else:
-        assert fault is not None and told in fault and "least that was tried" in fault and "\n" not in fault
+        assert fault is not None and told in fault and "that were tried: use" in fault and "\n" not in fault
         assert f"{TRIED.density:.0f}" in fault or f"{TRIED.view:.2f} m" in fault
 
 
@@ -173,7 +175,11 @@ def test_a_row_that_is_not_seen_as_a_whole_has_no_count():
     find = Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.4, height_m=0.3048)
     track = Track(((0, 0),), 0.4, 0.8, True, "")
     origin = Origin("plot", "strip", "0")
-    for seen, count, flag in ((1.0, 1, "few frames"), (0.97, 1, "few frames"), (0.9, "", "part of the row not seen")):
+    for seen, count, flag in (
+        (1.0, 1, "few frames"),
+        (0.97, 1, "few frames"),
+        (0.9, "", "part of the row not seen; few frames"),
+    ):
         stalks, row = plot_rows([[find]], [track], Path(np.zeros(1), 0.5, seen), 0, origin)
         assert len(stalks) == 1 and stalks[0]["width_mm"] == "14.000"
         assert row["stalks"] == count and row["flag"] == flag and (row["stalks_per_m"] == "") == (count == "")

@@ -36,7 +36,7 @@ def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
     (plot / "left_001.png").write_bytes((plot / "left_001.png").read_bytes()[:200])
     assert run(plot, tmp_path / "two") == 3
     (row,) = table(tmp_path / "two" / "plots.csv")
-    assert row["pairs_skipped"] == "2" and row["flag"] == "pairs skipped" and int(row["stalks"]) > 0
+    assert row["pairs_skipped"] == "2" and row["flag"] == "pairs skipped; few frames" and int(row["stalks"]) > 0
     write_image(plot / "right_002.png", BLANK)
     assert run(plot, tmp_path / "out") == 3
     told = {row["pair"]: row["why"] for row in table(tmp_path / "out" / "skipped.csv")}

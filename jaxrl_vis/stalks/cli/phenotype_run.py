@@ -114,15 +114,15 @@ def run(options: Run) -> int:
         if calibrations[name] is not None:
             print(f"{name}: {why}, so no count", file=sys.stderr)
     for row in rows:
-        if row["flag"] == NO_WIDTHS:
+        if NO_WIDTHS in row["flag"]:
             print(
                 f"{row['plot']}: no width: none of its {row['stalks']} stalks could be measured, see qc.html", file=sys.stderr
             )
-        if row["flag"] == NO_GROUND:
+        if NO_GROUND in row["flag"]:
             print(
                 f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
             )
-        if row["flag"] == FEW_FRAMES:
+        if FEW_FRAMES in row["flag"]:
             print(f"{row['plot']}: most widths were measured in fewer than three pairs: take more of them", file=sys.stderr)
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)

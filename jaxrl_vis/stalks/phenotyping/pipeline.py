@@ -178,7 +178,7 @@ def _why_no_count(flag: str, frames: list[list[Sighting]], plot: PlotFolder, dri
     """Return more words than a plot's flag has on why it has no count; empty where there is no more to say."""
     if flag == NO_ODOMETRY:
         return why_no_odometry(plot, driven, plot.pairs) or ""
-    if flag == PARTLY_SEEN:
+    if PARTLY_SEEN in flag:
         return "its pairs do not show all of the row that the robot passed: take some before its beginning and beyond its end"
     if flag == NO_FIT:
         return "its distances, or the baseline of the calibration, may be in another unit"

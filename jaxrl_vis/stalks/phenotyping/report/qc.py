@@ -201,7 +201,7 @@ def _safe(value: Any) -> str:
 
 def _headline(row: dict[str, Any]) -> str:
     parts = [f"{row['stalks']} stalks"] if row["stalks"] != "" else []
-    where = "" if row["flag"] == NO_GROUND else " at 12 inches"
+    where = "" if NO_GROUND in row["flag"] else " at 12 inches"
     parts += [f"{float(row['width_mean_mm']):.1f} mm thick{where}"] if row["width_mean_mm"] != "" else []
     return ", ".join([*parts, *([] if row["flag"] == "ok" else [str(row["flag"])])])
 

@@ -61,6 +61,8 @@ PARTLY_SEEN = "part of the row not seen"
 """Flag of a plot of which no pair shows some part, so that nobody knows how many stalks stand there."""
 FEW_FRAMES = "few frames"
 """Flag of a width that fewer than three pairs measured, and of plots in which most are so."""
+SKIPPED = "pairs skipped"
+"""Flag of a plot of which some pairs could not be used."""
 NO_WIDTHS = "no widths"
 """Flag of a plot whose stalks were counted, but none of them measured."""
 
@@ -126,17 +128,11 @@ def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin:
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
     # Networks that know none of what images show find nothing in them, so that nothing is not a count.
     count = len(stalks) if path.seen >= _LEAST_SEEN and stalks else ""
-    mostly = [name for name in (NO_GROUND, FEW_FRAMES) if sum(row["flag"] == name for row in stalks) > len(stalks) / 2]
-    if not stalks:
-        flag = NO_ROW
-    elif count == "":
-        flag = PARTLY_SEEN
-    elif not widths.size:
-        flag = NO_WIDTHS
-    elif skipped:
-        flag = "pairs skipped"
-    else:
-        flag = mostly[0] if mostly else "ok"
+    doubts = [PARTLY_SEEN] if stalks and count == "" else []
+    doubts += [NO_WIDTHS] if stalks and not widths.size else []
+    doubts += [SKIPPED] if stalks and skipped else []
+    doubts += [name for name in (NO_GROUND, FEW_FRAMES) if sum(row["flag"] == name for row in stalks) > len(stalks) / 2]
+    flag = "; ".join(doubts or ["ok" if stalks else NO_ROW])
     return {
         "plot": origin.plot,
         "pairs": pairs,
