@@ -5,7 +5,15 @@ from pathlib import Path
 
 from benchmarks import target_decay
 from benchmarks.claims import pages as claims
-from benchmarks.ledger import ablations, comparison_table, pixels_table, render_table, result_tables, scaling_table
+from benchmarks.ledger import (
+    ablations,
+    comparison_table,
+    pixels_table,
+    render_table,
+    result_tables,
+    scaling_table,
+    stalks_table,
+)
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
@@ -38,6 +46,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/lab/renderer_speed.md": {"warp": render_table.warp_table, "mujoco": render_table.mujoco_table},
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
+    "docs/phenotyping.md": {"lenses": stalks_table.lens_table, "coverage": stalks_table.coverage_table},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table},
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},

@@ -9,14 +9,16 @@ import pytest
 from PIL import Image, ImageOps
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, _is_shown, _moved, _without_border, resize
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, _is_shown, _moved, _without_border, resize, usual_lines
 from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
 from jaxrl_vis.stalks.phenotyping.io.folders import SAMPLE
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
-from jaxrl_vis.stalks.phenotyping.track.follow import follow
+from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED, lens_fault
+from jaxrl_vis.stalks.phenotyping.report.tables import Origin, plot_rows
+from jaxrl_vis.stalks.phenotyping.track.follow import Path, Track, follow
 from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, measure_pair, view_pair
 from jaxrl_vis_envs.plants import Calibration
@@ -45,6 +47,47 @@ def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
     assert resize(whole, settings, 1.66 * density)[0].shape[:2] == (407, 508)
     # Networks that learned from images of unknown cameras know no density.
     assert resize(whole[:, :900], dataclasses.replace(settings, density=0.0), density)[0].shape[1] == 844
+
+
+@pytest.mark.parametrize(
+    ("lines", "kept", "added"), [(676, 676, 0), (620, 620, 0), (740, 740, 0), (1127, 676, -226), (407, 676, 134)]
+)
+def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, added):
+    """The middle of a wide lens's image; a long lens's image between black lines."""
+    image = np.repeat(np.arange(1, lines + 1)[:, None, None], 40, axis=1) * np.ones(3, int)
+    usual, above = usual_lines(image, Settings())
+    assert usual.shape == (kept, 40, 3) and above == added
+    middle = usual[kept // 2, 0, 0]
+    assert abs(middle - (lines // 2 + 1)) <= 1
+    shown = usual[max(above, 0) : kept - max(kept - lines - above, 0), 0, 0]
+    np.testing.assert_array_equal(np.diff(shown), 1)  # nothing is left out or twice
+
+
+@pytest.mark.parametrize(
+    ("focal", "size", "distance", "told"),
+    [
+        (678.0, (1055, 845), 0.8, None),
+        (2168.0, (3376, 2704), 0.8, None),
+        (678.0, (300, 845), 0.8, None),  # cropped at the sides
+        (2 * 678.0, (2110, 1690), 0.8, None),
+        (0.8 * 678.0, (1055, 845), 0.8, None),
+        (1.4 * 678.0, (1055, 845), 0.8, None),
+        (0.6 * 678.0, (1055, 845), 0.8, "508 pixels per metre of a row 0.80 m away"),
+        (678.0, (1055, 845), 1.6, "424 pixels per metre of a row 1.60 m away"),
+        (1.66 * 678.0, (1055, 845), 0.8, "show 0.60 m from top to bottom"),
+        (678.0, (1055, 400), 0.8, "show 0.47 m from top to bottom"),
+    ],
+)
+def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
+    """By pixels per metre and the view, whatever camera or distance they come from."""
+    width, height = size
+    camera = Calibration(width, height, focal, (0.5 * (width - 1), 0.5 * (height - 1)), 0.1)
+    fault = lens_fault(camera, distance, camera.height)
+    if told is None:
+        assert fault is None
+    else:
+        assert fault is not None and told in fault and "that were tried: use" in fault and "\n" not in fault
+        assert f"{TRIED.density:.0f}" in fault or f"{TRIED.view:.2f} m" in fault
 
 
 def test_widths_do_not_depend_on_crops_borders_and_lenses():
@@ -115,15 +158,31 @@ def test_the_field_of_a_crop_is_its_own():
     narrow = dataclasses.replace(CAMERA, width=200, centre=(-300.0, 199.5))
     frames = [[Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.54)]]
     frames += [[] for _ in range(8)]
-    (track,), _ = follow(frames, np.arange(9) * 0.1, narrow)
+    (track,), path = follow(frames, np.arange(9) * 0.1, narrow)
     assert track.counted
+    assert path.seen == pytest.approx(0.51, abs=0.01)  # it begins 0.39 m to the right of where the robot did
     # The whole image, of which it may be a part, would have shown it in more pairs; what is letterboxed shows no more.
     whole = dataclasses.replace(narrow, width=800, centre=(300.0, 199.5))
     frames[0][0] = dataclasses.replace(frames[0][0], column=700.0)
-    (track,), _ = follow(frames, np.arange(9) * 0.1, whole)
-    assert track.reason.startswith("seen in 1 of")
+    (track,), path = follow(frames, np.arange(9) * 0.1, whole)
+    assert path.seen == 1.0 and track.reason.startswith("seen in 1 of")
     (track,), _ = follow(frames, np.arange(9) * 0.1, whole, columns=(600.0, 800.0))
     assert track.counted
+
+
+def test_a_row_that_is_not_seen_as_a_whole_has_no_count():
+    """Nobody knows how many stalks stand where no pair looked; a mean of widths that few pairs measured says so."""
+    find = Sighting((0, 0, 1, 1), (0, 0), 1.0, 200.0, 100.0, diameter_mm=14.0, depth_m=0.8, along_m=0.4, height_m=0.3048)
+    track = Track(((0, 0),), 0.4, 0.8, True, "")
+    origin = Origin("plot", "strip", "0")
+    for seen, count, flag in (
+        (1.0, 1, "few frames"),
+        (0.97, 1, "few frames"),
+        (0.9, "", "part of the row not seen; few frames"),
+    ):
+        stalks, row = plot_rows([[find]], [track], Path(np.zeros(1), 0.5, seen), 0, origin)
+        assert len(stalks) == 1 and stalks[0]["width_mm"] == "14.000"
+        assert row["stalks"] == count and row["flag"] == flag and (row["stalks_per_m"] == "") == (count == "")
 
 
 # --- borders ---

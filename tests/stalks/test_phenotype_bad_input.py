@@ -15,7 +15,13 @@ from phenotype_plots import run, table
 
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import find_truth
+from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import read_image, write_image
+from jaxrl_vis.stalks.phenotyping.measure.lens import LensRange
+from jaxrl_vis.stalks.phenotyping.pipeline import Request
+from jaxrl_vis.stalks.phenotyping.pipeline import run as pipeline_run
 from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
 from jaxrl_vis.stalks.phenotyping.track.sightings import measure_pair
 from jaxrl_vis_envs.plants import Calibration
@@ -30,7 +36,7 @@ def test_bad_files_are_listed_and_skipped(plots, tmp_path, capsys):
     (plot / "left_001.png").write_bytes((plot / "left_001.png").read_bytes()[:200])
     assert run(plot, tmp_path / "two") == 3
     (row,) = table(tmp_path / "two" / "plots.csv")
-    assert row["pairs_skipped"] == "2" and row["flag"] == "pairs skipped" and int(row["stalks"]) > 0
+    assert row["pairs_skipped"] == "2" and row["flag"] == "pairs skipped; few frames" and int(row["stalks"]) > 0
     write_image(plot / "right_002.png", BLANK)
     assert run(plot, tmp_path / "out") == 3
     told = {row["pair"]: row["why"] for row in table(tmp_path / "out" / "skipped.csv")}
@@ -272,6 +278,26 @@ def test_nothing_seen_is_no_count(plots, tmp_path, capsys):
     assert "nothing like a row seen" in (tmp_path / "out" / "qc.html").read_text()
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("plot_0000: ")]
     assert line.startswith("plot_0000: nothing like a row seen (0 finds in 4 pairs") and line.endswith(", so no count")
+
+
+def test_a_lens_that_was_not_tried_gives_no_numbers(plots, tmp_path):
+    """Neither a count nor a width, and a line that says why, in the page, too; where masks are true, any lens will do."""
+    (plot,) = find_plots(plots / "plot_0000")
+    calibration = {plot.name: read_calibration(plots / "plot_0000" / "calibration.yaml")}
+    said = {}
+
+    def count(tried: LensRange | None) -> str:
+        request = Request(tmp_path / "out", "strip", "truth", calibration, tried=tried)
+        (row,), _ = pipeline_run([plot], find_truth, request, say=said.__setitem__)
+        assert (row["width_mean_mm"] == "") == (row["stalks"] == "") and (row["stalks"] == "") == (row["flag"] != "ok")
+        return row["flag"]
+
+    assert count(LensRange(density=300.0, view=0.9)) == "ok" and not said
+    assert count(LensRange(density=400.0, view=0.9)) == "untried lens"
+    assert said[plot.name].startswith("untried lens (339 pixels per metre of a row 0.8") and "400" in said[plot.name]
+    assert "No count: 339 pixels per metre" in (tmp_path / "out" / "qc.html").read_text()
+    assert len((tmp_path / "out" / "stalks.csv").read_text().splitlines()) == 1
+    assert count(None) == "ok"
 
 
 def test_disparities_of_ones_own_take_the_right_images_place(plots, results, tmp_path):

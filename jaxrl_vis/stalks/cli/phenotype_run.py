@@ -79,8 +79,9 @@ def run(options: Run) -> int:
         share_accelerator()
     check_devices()
     enable_compilation_cache()
+    from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
-    from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND, NO_WIDTHS
+    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS
 
     if options.masks == "truth":
         from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import find_truth
@@ -94,7 +95,8 @@ def run(options: Run) -> int:
         name = f"{detector_name(weights)}, least score {options.least_score:g}"
         find = functools.partial(find_stalks, weights, options.least_score)
 
-    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale)
+    tried = TRIED if options.masks == "network" else None
+    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried)
     for plot in plots:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
@@ -112,14 +114,16 @@ def run(options: Run) -> int:
         if calibrations[name] is not None:
             print(f"{name}: {why}, so no count", file=sys.stderr)
     for row in rows:
-        if row["flag"] == NO_WIDTHS:
+        if NO_WIDTHS in row["flag"]:
             print(
                 f"{row['plot']}: no width: none of its {row['stalks']} stalks could be measured, see qc.html", file=sys.stderr
             )
-        if row["flag"] == NO_GROUND:
+        if NO_GROUND in row["flag"]:
             print(
                 f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
             )
+        if FEW_FRAMES in row["flag"]:
+            print(f"{row['plot']}: most widths were measured in fewer than three pairs: take more of them", file=sys.stderr)
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
     counts = f"plots: {len(plots)}, pairs skipped: {len(skipped)}"

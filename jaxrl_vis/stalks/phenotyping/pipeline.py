@@ -14,7 +14,7 @@ processes look at pairs. Each of them has one pair in memory at a time.
 import dataclasses
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +30,13 @@ from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, known_disparity, read_pair, read_side
 from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.measure.lens import UNTRIED, LensRange, lens_fault
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
 from jaxrl_vis.stalks.phenotyping.report.qc import Page, PlotResult
 from jaxrl_vis.stalks.phenotyping.report.tables import (
     NO_ROW,
+    PARTLY_SEEN,
     PLOT_COLUMNS,
     STALK_COLUMNS,
     Origin,
@@ -46,7 +48,7 @@ from jaxrl_vis.stalks.phenotyping.report.tables import (
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.pairing import pair_fault
-from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, Sighting, view_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import NO_CALIBRATION, USUAL_DISTANCE, Sighting, row_distance, view_pair
 from jaxrl_vis.stalks.results_folder import claim, is_current, pair_state, write_record
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
@@ -69,14 +71,16 @@ class Request:
         calibrations: Calibration of each plot by its name; None where there is none.
         speed: Speed of the robot, m/s, where only times are known.
         disparity_scale: Divisor of disparities in 16-bit images.
+        tried: Range of lenses that the detector was tried on; None if any will do.
     """
 
     out: Path
     method: Method
     finder: str
-    calibrations: dict[str, Calibration | None]
+    calibrations: Mapping[str, Calibration | None]
     speed: float | None = None
     disparity_scale: float = 256.0
+    tried: LensRange | None = None
 
 
 def run(
@@ -160,8 +164,7 @@ def _run(
         ]
         result = _finish(plot, records, driven[plot.name], request, run_all)
         if result.row["stalks"] == "":
-            why = _why_no_count(result, plot, driven[plot.name])
-            say(plot.name, result.row["flag"] + ("" if why is None else f" ({why})"))
+            say(plot.name, result.row["flag"] + (f" ({result.why})" if result.why else ""))
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
@@ -171,29 +174,45 @@ def _run(
     return rows, skipped
 
 
-def _why_no_count(result: PlotResult, plot: PlotFolder, driven: dict[str, float] | None) -> str | None:
-    """Return more words than the flag has on why a plot has no count; None where there is no more to say."""
-    flag = result.row["flag"]
+def _why_no_count(flag: str, frames: list[list[Sighting]], plot: PlotFolder, driven: dict[str, float] | None) -> str:
+    """Return more words than a plot's flag has on why it has no count; empty where there is no more to say."""
     if flag == NO_ODOMETRY:
-        return why_no_odometry(plot, driven, plot.pairs)
+        return why_no_odometry(plot, driven, plot.pairs) or ""
+    if PARTLY_SEEN in flag:
+        return "its pairs do not show all of the row that the robot passed: take some before its beginning and beyond its end"
     if flag == NO_FIT:
         return "its distances, or the baseline of the calibration, may be in another unit"
     if flag != NO_ROW:
-        return None
-    finds = sum(map(len, result.frames))
+        return ""
+    finds = sum(map(len, frames))
     return (
-        f"{finds} finds in {len(result.frames)} pairs, none of which counts: unless the plot is empty, its images are not "
+        f"{finds} finds in {len(frames)} pairs, none of which counts: unless the plot is empty, its images are not "
         "such as the networks know, see its overlays"
     )
+
+
+def _lens_fault(request: Request, frames: list[list[Sighting]], records: list[dict[str, Any]], name: str) -> str | None:
+    """Say in words why the lens of a plot is outside the range that was tried; None if it is within, or nothing is known."""
+    calibration = request.calibrations[name]
+    if request.tried is None or calibration is None or not records:
+        return None
+    first, last = np.median([record["lines"] for record in records], axis=0)
+    distance = row_distance([sighting for frame in frames for sighting in frame]) or USUAL_DISTANCE
+    return lens_fault(calibration, distance, round(last - first), request.tried)
 
 
 def _is_whole(record: dict[str, Any]) -> bool:
     """Return True for a record of sightings; a pair that was skipped is tried again."""
     lines, columns = record["size"]
-    first, last = record["columns"]
     for values in record["sightings"]:
         Sighting.read(values)
-    return all(isinstance(count, int) for count in (lines, columns, first, last))
+    return all(isinstance(count, int) for count in (lines, columns, *_span(record["lines"]), *_span(record["columns"])))
+
+
+def _span(values: Any) -> tuple[Any, Any]:
+    """Return the first line or column of a record that shows anything, and one past the last."""
+    first, last = values
+    return first, last
 
 
 def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
@@ -226,7 +245,8 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
         return {"skipped": wrong}
     return {
         "size": list(left.shape[:2]),
-        "columns": list(view.columns),
+        "lines": list(view.frame.lines),
+        "columns": list(view.frame.columns),
         "camera_height_m": None if view.ground is None else round(view.ground.camera_height, 4),
         "sightings": [dataclasses.asdict(sighting) for sighting in view.sightings],
     }
@@ -242,16 +262,19 @@ def _finish(
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
     known = driven is not None and all(pair.name in driven for pair, _ in usable)
-    why, tracks, start = _what_is_missing(len(usable), calibration), [], 0.0
+    flag, tracks, start = _what_is_missing(len(usable), calibration), [], 0.0
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     drive = None
-    if calibration is not None and driven is not None and known and len(usable) >= 2:
+    why = _lens_fault(request, frames, [record for _, record in usable], plot.name)
+    if why is not None:
+        flag = UNTRIED
+    elif calibration is not None and driven is not None and known and len(usable) >= 2:
         first, last = np.median([record["columns"] for _, record in usable], axis=0)
         driven_at = np.array([driven[pair.name] for pair, _ in usable])
         drive = follow_either_way(frames, driven_at, calibration, (float(first), float(last)))
-        why = NO_FIT
+        flag = NO_FIT
     if drive is None or not drive.fits:
-        stalks, row = rows_without_path(frames, skipped, origin, why, metric=why != NO_FIT)
+        stalks, row = rows_without_path(frames, skipped, origin, flag, metric=flag not in (NO_FIT, UNTRIED))
     else:
         tracks, path = drive.tracks, drive.path
         labels = sighting_labels(frames, tracks)
@@ -259,7 +282,8 @@ def _finish(
         stalks, row = plot_rows(frames, tracks, path, skipped, origin)
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
     width = usable[0][1]["size"][1] if usable else 0
-    return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width)
+    why = why or (_why_no_count(row["flag"], frames, plot, driven) if row["stalks"] == "" else "")
+    return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why)
 
 
 def _draw_overlays(

@@ -23,8 +23,8 @@ class Settings:
     Attributes:
         density: Pixels per metre at the row that an image is resized to before stalks are looked for; 0 for networks that
             learned from images of unknown cameras, which are reduced to `width`.
-        width: Width of such an image of the cameras of `density`, pixels. Images of unknown cameras are reduced to it;
-            narrower ones stay as they are.
+        width, lines: Size of such an image of the cameras of `density`, pixels. Images of unknown cameras are reduced to the
+            width; narrower ones stay as they are.
         full_width: Width in pixels of the images in which snips have `snip_lines` and `snip_columns`; in images with fewer
             pixels per metre they are smaller in proportion.
         snip_lines, snip_columns: Size of a snip.
@@ -43,6 +43,7 @@ class Settings:
 
     density: float = 677.5
     width: int = 844
+    lines: int = 676
     full_width: int = 3376
     snip_lines: int = 640
     snip_columns: int = 128

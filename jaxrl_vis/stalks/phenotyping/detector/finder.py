@@ -20,6 +20,7 @@ from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 _BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # snips that go through the network together
 _SHOWN = 0.5  # of a stalk's axis that must not lie on a border of the image
 _MAX_ENLARGED = 3.0  # beyond that, a stalk is three pixels wide and nothing tells it from others
+_STRETCH = 1.12  # by which images were stretched in training: so much taller or lower ones are nothing new to the networks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +84,25 @@ def resize(image: np.ndarray, settings: Settings, density: float | None) -> tupl
     return cv2.resize(image, (columns, lines), interpolation=how), (height / lines, across / columns)
 
 
+def usual_lines(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
+    """Cut or fill an image to the lines that the networks know; also return the number of lines added above, negative if cut.
+
+    Where stalks are looked for, they know the band by its place in the image, too. Through a lens of another field of view the
+    middle of the image is what the cameras of `Settings.width` show, so lines go or come above and below in equal parts.
+
+    Args:
+        image: [H, W, 3] uint8 with the pixels per metre of the settings.
+        settings: Settings of the networks.
+    """
+    beyond = settings.lines - image.shape[0]
+    if 1.0 / _STRETCH <= image.shape[0] / settings.lines <= _STRETCH:
+        return image, 0
+    above = beyond // 2
+    if beyond < 0:
+        return image[-above : settings.lines - above], above
+    return np.pad(image, ((above, beyond - above), (0, 0), (0, 0))), above
+
+
 def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
     """Stalks [N, 6] of a reduced image in the coordinates of the whole one."""
     return stalks * np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
@@ -135,9 +155,13 @@ class Finder:
         settings = self._settings
         reduced, scale = resize(image, settings, density)
         share = settings.width / settings.full_width / settings.resizing(image.shape[1], density)
+        added = 0
+        if density and settings.density:
+            reduced, added = usual_lines(reduced, settings)
         stalks_found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
         selected = np.flatnonzero(stalks_found.valid & (stalks_found.scores >= self._least))
-        stalks, scores = in_image(stalks_found.stalks[selected], scale), stalks_found.scores[selected]
+        moved = stalks_found.stalks[selected] - np.array([0, added, 0, added, 0, 0], np.float32)
+        stalks, scores = in_image(moved, scale), stalks_found.scores[selected]
         inside = np.array([_is_shown(stalk, frame) for stalk in stalks], bool)
         stalks, scores = stalks[inside], scores[inside]
         on_device = jnp.asarray(image)

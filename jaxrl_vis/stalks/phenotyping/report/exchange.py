@@ -42,8 +42,9 @@ class Trait:
     whole: bool = False
 
 
-# The term of diameters is that of the Plant Trait Ontology for the thickness of stems. No term is known to us for the number of
-# stalks in a plot, neither there nor in the Crop Ontology of sorghum (CO_324): `--term` names what a programme uses.
+# The term of diameters is that of the Plant Trait Ontology for the thickness of stems. Numbers of stalks have none: the Crop
+# Ontology of sorghum (CO_324) counts plants, hills, panicles and the tillers of a plant, and the Plant Trait Ontology tillers
+# (TO:0000346), but neither main stems and tillers of a plot together. `--term` names what a programme uses.
 _DIAMETER = "TO:0000339"
 TRAITS = (
     Trait("stalks", "stalk number", "1", "count in the plot", whole=True),

@@ -86,6 +86,7 @@ class PlotResult:
         tracks: Stalks, and what does not count; empty where pairs could not be put together.
         start: Place of the first pair, which positions count from, m.
         image_width: Width of its images, pixels.
+        why: More words than its flag has on why it has no count; empty where there is one, or no more to say.
     """
 
     row: dict[str, Any]
@@ -95,6 +96,7 @@ class PlotResult:
     tracks: list[Track]
     start: float
     image_width: int
+    why: str = ""
 
 
 class Page:
@@ -147,6 +149,8 @@ class Page:
         finds = [{"why": why, "finds": count} for why, count in _grouped(reasons).most_common()]
         write = self._file.write
         write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
+        if plot.why:
+            write(f'<p class="doubt">No count: {_safe(plot.why)}.</p>')
         if plot.stalks:
             write(_chart(plot, rejected))
             write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + table({"picture": "", **_STALK_COLUMNS}, tables))
@@ -197,7 +201,7 @@ def _safe(value: Any) -> str:
 
 def _headline(row: dict[str, Any]) -> str:
     parts = [f"{row['stalks']} stalks"] if row["stalks"] != "" else []
-    where = "" if row["flag"] == NO_GROUND else " at 12 inches"
+    where = "" if NO_GROUND in row["flag"] else " at 12 inches"
     parts += [f"{float(row['width_mean_mm']):.1f} mm thick{where}"] if row["width_mean_mm"] != "" else []
     return ", ".join([*parts, *([] if row["flag"] == "ok" else [str(row["flag"])])])
 

@@ -14,7 +14,7 @@ th button:focus-visible { outline: 2px solid; }
 th[aria-sort=ascending] button::after { content: " \\25B2"; }
 th[aria-sort=descending] button::after { content: " \\25BC"; }
 td:has(img) { padding: .1rem .6rem; }
-td.doubt { color: var(--doubt); font-weight: 600; }
+td.doubt, p.doubt { color: var(--doubt); font-weight: 600; }
 details { border: 1px solid var(--line); border-radius: 6px; margin: .6rem 0; padding: .4rem .8rem; }
 summary { cursor: pointer; font-weight: 600; }
 img.stalk { height: 96px; display: block; } img.stalk:hover { height: 240px; }

@@ -51,11 +51,18 @@ PLOT_COLUMNS = (
     "version",
 )
 Row = dict[str, Any]
+_LEAST_SEEN = 0.95  # of the row, that pairs must show before its stalks are counted
 _MAX_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
 NO_GROUND = "no visible ground"
 """Flag of widths at a height that is not known."""
 NO_ROW = "nothing like a row seen"
 """Flag of a plot in which no stalk was seen: it is empty, or its images are not such as networks know."""
+PARTLY_SEEN = "part of the row not seen"
+"""Flag of a plot of which no pair shows some part, so that nobody knows how many stalks stand there."""
+FEW_FRAMES = "few frames"
+"""Flag of a width that fewer than three pairs measured, and of plots in which most are so."""
+SKIPPED = "pairs skipped"
+"""Flag of a plot of which some pairs could not be used."""
 NO_WIDTHS = "no widths"
 """Flag of a plot whose stalks were counted, but none of them measured."""
 
@@ -101,7 +108,7 @@ def plot_rows(
                 "version": origin.version,
             }
         )
-    return stalks, _plot_row(stalks, len(frames), path.length, skipped, origin)
+    return stalks, _plot_row(stalks, len(frames), path, skipped, origin)
 
 
 def _flag(widths: StalkWidths, confidence: float) -> str:
@@ -111,31 +118,28 @@ def _flag(widths: StalkWidths, confidence: float) -> str:
     if not widths.height_known:
         return NO_GROUND
     if widths.lower.count < 3:
-        return "few frames"
+        return FEW_FRAMES
     if confidence < 0.3 or widths.lower.scatter > _MAX_ERROR * widths.lower.mm:
         return "uncertain"
     return "corrected for taper" if widths.lower.corrected else "ok"
 
 
-def _plot_row(stalks: list[Row], pairs: int, length: float, skipped: int, origin: Origin) -> Row:
+def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin: Origin) -> Row:
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
-    unknown = [row for row in stalks if row["flag"] == NO_GROUND]
-    if not stalks:
-        flag = NO_ROW
-    elif not widths.size:
-        flag = NO_WIDTHS
-    elif skipped:
-        flag = "pairs skipped"
-    else:
-        flag = NO_GROUND if len(unknown) > len(stalks) / 2 else "ok"
+    # Networks that know none of what images show find nothing in them, so that nothing is not a count.
+    count = len(stalks) if path.seen >= _LEAST_SEEN and stalks else ""
+    doubts = [PARTLY_SEEN] if stalks and count == "" else []
+    doubts += [NO_WIDTHS] if stalks and not widths.size else []
+    doubts += [SKIPPED] if stalks and skipped else []
+    doubts += [name for name in (NO_GROUND, FEW_FRAMES) if sum(row["flag"] == name for row in stalks) > len(stalks) / 2]
+    flag = "; ".join(doubts or ["ok" if stalks else NO_ROW])
     return {
         "plot": origin.plot,
         "pairs": pairs,
         "pairs_skipped": skipped,
-        "length_m": _text(length, 4),
-        # Networks that know none of what images show find nothing in them, so that nothing is not a count.
-        "stalks": len(stalks) or "",
-        "stalks_per_m": _text(len(stalks) / length, 3) if stalks and length > 0 else "",
+        "length_m": _text(path.length, 4),
+        "stalks": count,
+        "stalks_per_m": _text(count / path.length, 3) if count != "" and path.length > 0 else "",
         **_widths(widths),
         **_higher(stalks),
         "flag": flag,

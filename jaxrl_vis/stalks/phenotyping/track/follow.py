@@ -73,10 +73,12 @@ class Path:
     Attributes:
         places: [F] float64, of each pair along the row, m: odometry, corrected by what stereo saw.
         length: Length of the row that it passed, m: half a step more at each end.
+        seen: Share of that length which any pair shows.
     """
 
     places: np.ndarray
     length: float
+    seen: float = 1.0
 
 
 @dataclasses.dataclass
@@ -148,12 +150,28 @@ def follow(
             track.rays.append((float(places[frame]) - view.half, float(view.rays[new])))
             track.feet.append(float(along + places[frame] - view.over[new]))
     step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
-    path = Path(places, abs(float(places[-1] - places[0]) + step) if len(places) else 0.0)
     field = tuple(
         (column - 0.5 - calibration.centre[0]) / calibration.focal for column in columns or (0.0, float(calibration.width))
     )
+    length = abs(float(places[-1] - places[0]) + step) if len(places) else 0.0
+    path = Path(places, length, _seen(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
     closed = [_closed(track, path, step, field, usual, gates) for track in _merged(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
+
+
+def _seen(places: np.ndarray, step: float, field: list[float]) -> float:
+    """Return the share of the row beside the path that any pair shows.
+
+    Args:
+        places: [F] float64, of each pair along the row, m.
+        step: Distance between two pairs, m.
+        field: Both ends of what a pair shows of the row, from the pair's place, m.
+    """
+    if not len(places):
+        return 0.0
+    points = np.linspace(places[0] - 0.5 * step, places[-1] + 0.5 * step, 201)
+    beside = points[:, None] - places
+    return float(((beside >= field[0]) & (beside <= field[1])).any(axis=1).mean())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
-from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
+from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure
 from jaxrl_vis.stalks.phenotyping.measure.width import strip_width
@@ -152,13 +152,13 @@ class PairView:
         detections: In its left image.
         sightings: Of each of them.
         ground: Origin of heights; None where it shows none.
-        columns: First column of the left image that shows anything, and one past the last.
+        frame: Part of the left image that shows anything.
     """
 
     detections: list[Detection]
     sightings: list[Sighting]
     ground: Ground | None
-    columns: tuple[int, int]
+    frame: Frame
 
 
 def view_pair(
@@ -182,10 +182,10 @@ def view_pair(
         disparity: See `measure_pair`.
     """
     detections, ground = find_with_ground(find, left, right, calibration, disparity)
-    columns = find_frame(left).columns
+    frame = find_frame(left)
     sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
-    usual = PairView(detections, sightings, ground, columns)
-    there = _row_distance(usual.sightings)
+    usual = PairView(detections, sightings, ground, frame)
+    there = row_distance(usual.sightings)
     if calibration is None or (there is not None and abs(there / USUAL_DISTANCE - 1.0) <= _SAME_DISTANCE):
         return usual
     if there is None and len(detections) >= _AT_DISTANCE:
@@ -193,14 +193,14 @@ def view_pair(
     for distance in _OTHER_DISTANCES if there is None else (there,):
         detections = find(left, calibration.focal / distance)
         sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
-        there = _row_distance(sightings)
+        there = row_distance(sightings)
         if there is not None and abs(there / distance - 1.0) <= _SAME_DISTANCE:
-            return PairView(detections, sightings, ground, columns)
+            return PairView(detections, sightings, ground, frame)
     return usual
 
 
-def _row_distance(sightings: list[Sighting]) -> float | None:
-    """Return the distance at which most stalks of a pair were measured, m; None where too few were."""
+def row_distance(sightings: list[Sighting]) -> float | None:
+    """Return the distance at which most stalks of a pair, or of several, were measured, m; None where too few were."""
     depths = [sighting.depth_m for sighting in sightings if sighting.diameter_mm is not None and sighting.depth_m is not None]
     return float(np.median(depths)) if len(depths) >= _AT_DISTANCE else None
 

@@ -1,0 +1,127 @@
+"""Counts and widths of one synthetic row through lenses of other focal lengths: `python -m benchmarks.stalks.lenses FOLDER`.
+
+The pairs of each lens are drawn into FOLDER, which takes minutes on a GPU and much longer without, and not again if they are
+there. Nothing is refused here: what `phenotype run` refuses follows from this table. With `--results benchmarks/results` the
+figures go into the record that docs/phenotyping.md quotes, each lens in place of what the record had of it.
+"""
+
+import argparse
+import csv
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.ledger.records import RESULTS
+from benchmarks.ledger.stalks_table import LENSES, lens_rows
+from jaxrl_vis.host.devices import enable_compilation_cache
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.host.provenance import device_name, revision
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
+from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
+from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import match
+from jaxrl_vis.stalks.phenotyping.evaluation.synth import plot_name, write_plots
+from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
+from jaxrl_vis.stalks.phenotyping.io.images import read_image
+from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
+from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sighting, view_pair
+from jaxrl_vis_envs.documents import read_json
+from jaxrl_vis_envs.plants import Family, read
+from jaxrl_vis_envs.plants.truth import StalkInView
+
+FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.66, 2.0)
+SEED, WIDTH, PAIRS = 5, 1055, 12
+
+
+def draw(folder: Path, factor: float) -> Path:
+    """Draw the row through a lens of a ``factor`` of the usual focal length, unless it is there; return its folder."""
+    out = folder / f"{factor:g}"
+    spec = folder / f"{factor:g}.toml"
+    folder.mkdir(parents=True, exist_ok=True)
+    spec.write_text(f'base = "training"\nname = "lens"\n[rig]\nfocal = {Family().rig.focal * factor}\n', encoding="utf-8")
+    family = read(spec).at_width(WIDTH)
+    family = dataclasses.replace(family, rig=dataclasses.replace(family.rig, frames=PAIRS))
+    write_plots(out, family, range(SEED, SEED + 1))
+    return out / plot_name(SEED)
+
+
+def look(plot: Path, finder: Finder) -> dict[str, Any]:
+    """Find, measure and count the stalks of a drawn row; return figures, and the width of each stalk by its index.
+
+    Returns:
+        Pixels per metre and height of the view in m; numbers of stalks, true and counted, of clear sightings, found ones and
+        false finds; share of pairs in which the ground is seen; errors of widths in mm by the index of the stalk.
+    """
+    truth, calibration = read_json(plot / "plot.json"), read_calibration(plot / "calibration.yaml")
+    with (plot / "odometry.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = {field.name for field in dataclasses.fields(StalkInView)}
+    frames: list[list[Sighting]] = []
+    owners: list[list[int | None]] = []
+    clear = found = false = grounds = 0
+    for row in rows:
+        left, right = (read_image(plot / row[side]) for side in ("left", "right"))
+        seen = [each for each in truth["seen"] if each["pair"] == int(row["pair"])]
+        stalks = [StalkInView(**{name: each[name] for name in names}) for each in seen]
+        view = view_pair(finder, left, right, calibration)
+        matched, scored = match(view.detections, stalks)
+        clear += sum(stalk.band_box is not None and stalk.band_visible >= 0.3 for stalk in stalks)
+        found += sum(hit > 0 for _, hit in scored)
+        false += sum(not hit for _, hit in scored)
+        grounds += view.ground is not None
+        frames.append(view.sightings)
+        owners.append(matched)
+    tracks = follow_either_way(frames, np.array([float(row["distance_m"]) for row in rows]), calibration).tracks
+    counted = [track for track in tracks if track.counted]
+    errors = {}
+    for track, widths in zip(counted, stalk_widths(frames, counted)):
+        known = [name for frame, place in track.sightings if (name := owners[frame][place]) is not None]
+        owner = max(sorted(set(known)), key=known.count) if known else len(truth["stalks"])
+        if owner < len(truth["stalks"]) and widths.lower is not None and widths.height_known:
+            errors[owner] = widths.lower.mm - truth["stalks"][owner]["12in"]["diameter_mm"]
+    return {
+        "density": calibration.focal / USUAL_DISTANCE,
+        "view": calibration.height * USUAL_DISTANCE / calibration.focal,
+        "true": truth["count"],
+        "counted": len(counted),
+        "clear": clear,
+        "found": found,
+        "false": false,
+        "ground": grounds / len(rows),
+        "errors_mm": errors,
+    }
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Draw, measure, print the table, and keep the record where it is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("folder", type=Path, help="where the pairs are drawn")
+    parser.add_argument("--factors", type=float, nargs="+", default=FACTORS)
+    parser.add_argument("--results", type=Path, help=f"folder of records, such as {RESULTS.name}")
+    options = parser.parse_args(words)
+    enable_compilation_cache()
+    finder = load_finder(SHIPPED, 0.5)
+    about = {"synthetic": True, "seed": SEED, "width": WIDTH, "pairs": PAIRS, "finder": detector_name(SHIPPED)}
+    lenses: dict[str, Any] = {}
+    target = None if options.results is None else options.results / LENSES
+    if target is not None and target.exists():
+        record = read_json(target)
+        lenses = record["lenses"] if about.items() <= record.items() else {}
+    for factor in options.factors:
+        figures = look(draw(options.folder, factor), finder)
+        lenses[f"{factor:g}"] = {**figures, "device": device_name(), "revision": revision()}
+        record = json.loads(json.dumps({**about, "lenses": dict(sorted(lenses.items(), key=lambda lens: float(lens[0])))}))
+        if target is not None:
+            write_atomically(target, json.dumps(record, indent=1) + "\n")
+        print(f"x {factor:g}: {figures['counted']} of {figures['true']} stalks", flush=True)
+    print(lens_rows(record["lenses"]), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
