@@ -1,14 +1,18 @@
 """Tasks that `benchmarks.pixels.train` trains from images, with the settings of each.
 
-CartpoleBalance   MuJoCo Playground's, with the settings that it published for its images by Madrona (its release 0.0.4). An
-                  observation is the last three RGB images, where theirs is in grey.
+CartpoleBalance   MuJoCo Playground's, with the settings and the networks that it has for images (its release 0.2.0), but for
+                  the task itself: rewards, time step and episodes of 1,000 steps are those of its state task, so that a return
+                  is "of 1,000". An observation is the last three RGB images, where theirs is in grey.
 FetchReach        a manipulation task of this project, through its adapter to brax: move the gripper of a Fetch robot to the
                   goal in an image. Observations are an RGB-D image and one of the goal, the reward the negative distance.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
+
+import jax
 
 from benchmarks.pixels import playground
 from jaxrl_vis_envs import pixels
@@ -91,16 +95,33 @@ TASKS = {
         _playground_wrapper,
         {
             **_COMMON,
-            "num_timesteps": 1_000_000,
-            "num_evals": 6,
+            "num_timesteps": 5_000_000,
+            "num_evals": 11,
             "episode_length": 1000,
             "num_envs": 1024,
             "batch_size": 256,
+            "unroll_length": 20,
             "num_updates_per_batch": 8,
-            "discounting": 0.97,
-            "reward_scaling": 0.1,
+            "discounting": 0.99,
+            "learning_rate": 1e-3,
+            "entropy_cost": 0.02,
+            "reward_scaling": 1.0,
         },
-        _HIDDEN_LAYERS,
+        {
+            "policy_hidden_layer_sizes": (128, 64),
+            "value_hidden_layer_sizes": (128, 64),
+            "normalise_channels": True,
+            "cnn_output_channels": (16, 32),
+            "cnn_kernel_size": (5, 3),
+            "cnn_stride": (2, 2),
+            "cnn_activation": jax.nn.elu,
+            "cnn_max_pool": True,
+            "cnn_global_pool": "none",
+            "cnn_kernel_init_fn": jax.nn.initializers.orthogonal,
+            "cnn_kernel_init_kwargs": {"scale": math.sqrt(2.0)},
+            "output_kernel_init_fn": jax.nn.initializers.orthogonal,
+            "output_kernel_init_kwargs": {"scale": 0.2},
+        },
         "return",
         lambda metrics: round(float(metrics["eval/episode_reward"]), 1),
         "of 1,000",
