@@ -19,8 +19,8 @@ from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.resolved import resolve
-from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.types import Episodes, Statistics
+from jaxrl_vis.weighting import make_weighting
 
 SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 ACTIONS, HORIZON, EPISODES, BATCH = 2, 6, 4, 16

@@ -29,8 +29,8 @@ from weighting_problem import (
 )
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.weighting import MAIN, WEIGHTINGS, Weighting, loss_gradients, make_weighting, measure, weighted_grad
-from jaxrl_vis.learner.weighting.base import log_loss, log_slope
+from jaxrl_vis.weighting import MAIN, WEIGHTINGS, Weighting, loss_gradients, make_weighting, measure, weighted_grad
+from jaxrl_vis.weighting.base import log_loss, log_slope
 
 # -- OL-AUX
 

@@ -17,8 +17,8 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
-from jaxrl_vis.learner.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, make_weighting
 from jaxrl_vis.types import Batch, Episodes, Params
+from jaxrl_vis.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, make_weighting
 
 _EPISODES_AT_ONCE = 10  # whose arrays are computed together: some 500 images fill a GPU, and more would fill its memory
 

@@ -29,8 +29,8 @@ from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.learner.resolved import Resolved
-from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
 from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
+from jaxrl_vis.weighting import MAIN, Weighted, WeightingState
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
 _HEADS = 0x686473

@@ -25,8 +25,8 @@ from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import Shards
 from jaxrl_vis.learner.resolved import Resolved
-from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Params
+from jaxrl_vis.weighting import MAIN, Weighted, WeightingState, weighted_grad
 
 
 class ComputeCopies(NamedTuple):

@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.base import (
     MAIN,
     Heads,
     Losses,
@@ -30,7 +31,6 @@ from jaxrl_vis.learner.weighting.base import (
     scaled,
     start,
 )
-from jaxrl_vis.types import Metrics, Params
 
 
 def ol_aux(

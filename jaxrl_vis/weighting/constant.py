@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.base import (
     MAIN,
     Heads,
     Losses,
@@ -19,7 +20,6 @@ from jaxrl_vis.learner.weighting.base import (
     report,
     start,
 )
-from jaxrl_vis.types import Metrics, Params
 
 
 def none() -> Weighting:

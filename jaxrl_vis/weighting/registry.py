@@ -5,10 +5,10 @@ from collections.abc import Callable
 from typing import Any
 
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.learner.weighting.base import Weighting
-from jaxrl_vis.learner.weighting.constant import balance, cosine, fixed, none, none_log, plain_sum
-from jaxrl_vis.learner.weighting.ol_aux import ol_aux
-from jaxrl_vis.learner.weighting.ol_aux_variants import ol_aux_ablation, ol_aux_window
+from jaxrl_vis.weighting.base import Weighting
+from jaxrl_vis.weighting.constant import balance, cosine, fixed, none, none_log, plain_sum
+from jaxrl_vis.weighting.ol_aux import ol_aux
+from jaxrl_vis.weighting.ol_aux_variants import ol_aux_ablation, ol_aux_window
 
 WEIGHTINGS: dict[str, Callable[..., Weighting]] = {
     "none": none,

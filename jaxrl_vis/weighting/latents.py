@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
-from jaxrl_vis.learner.weighting.base import MAIN, dot, split_result, to_float32, weighted_sum
 from jaxrl_vis.types import Params
+from jaxrl_vis.weighting.base import MAIN, dot, split_result, to_float32, weighted_sum
 
 _ALL = "all"  # the group of latents that were not given names
 

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.base import (
     MAIN,
     Heads,
     Losses,
@@ -25,8 +26,7 @@ from jaxrl_vis.learner.weighting.base import (
     start,
     weighted_sum,
 )
-from jaxrl_vis.learner.weighting.ol_aux import check_count, check_state, make_rule
-from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.ol_aux import check_count, check_state, make_rule
 
 MainGradient = Literal["main", "total"]
 

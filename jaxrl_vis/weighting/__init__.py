@@ -7,9 +7,9 @@ registry    all of them by name
 gradients   `weighted_grad`: anybody's losses and parameters, differentiated, weighted and added up
 """
 
-from jaxrl_vis.learner.weighting.base import MAIN, Weighting, WeightingState, weighted_sum
-from jaxrl_vis.learner.weighting.gradients import Way, Weighted, loss_gradients, measure, weighted_grad
-from jaxrl_vis.learner.weighting.registry import WEIGHTINGS, make_weighting
+from jaxrl_vis.weighting.base import MAIN, Weighting, WeightingState, weighted_sum
+from jaxrl_vis.weighting.gradients import Way, Weighted, loss_gradients, measure, weighted_grad
+from jaxrl_vis.weighting.registry import WEIGHTINGS, make_weighting
 
 __all__ = [
     "MAIN",

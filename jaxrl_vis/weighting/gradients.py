@@ -22,8 +22,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.learner.weighting import latents
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting import latents
+from jaxrl_vis.weighting.base import (
     MAIN,
     Losses,
     Weighting,
@@ -35,7 +36,6 @@ from jaxrl_vis.learner.weighting.base import (
     to_float32,
     weighted_sum,
 )
-from jaxrl_vis.types import Metrics, Params
 
 Way = Literal["per_loss", "latents"]
 LossesFunction = Callable[..., Any]
