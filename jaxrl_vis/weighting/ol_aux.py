@@ -20,6 +20,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.types import Metrics, Params
 from jaxrl_vis.weighting.base import (
     MAIN,
+    Eps,
     Heads,
     Losses,
     Weighting,
@@ -38,7 +39,7 @@ def ol_aux(
     learning_rate: float = 1e-3,
     beta: float | None = None,
     log: bool = True,
-    eps: float = 0.02,
+    eps: Eps = 0.02,
     main_eps: float = 1e-8,
     minimum: float | None = 0.0,
     maximum: float | None = None,

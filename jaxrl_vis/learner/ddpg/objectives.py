@@ -134,11 +134,11 @@ class Objectives:
     def reduces_early(self) -> bool:
         """True if the critic's gradients are averaged over the shards of a learner before they are weighted.
 
-        A weighting that takes logarithms of losses, or compares gradients, must see those of the whole learner. What others
+        A weighting that reads losses, or compares gradients, must see those of the whole learner. What others
         make of them is a sum, which may be averaged afterwards, together with all else.
         """
         weighting = self.auxiliary.weighting
-        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.log)
+        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.reads_losses)
 
     def critic_gradient(
         self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch
