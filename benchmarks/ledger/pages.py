@@ -5,7 +5,15 @@ from pathlib import Path
 
 from benchmarks import target_decay
 from benchmarks.claims import pages as claims
-from benchmarks.ledger import ablations, comparison_table, pixels_table, render_table, result_tables, scaling_table
+from benchmarks.ledger import (
+    ablations,
+    comparison_table,
+    pixels_table,
+    render_table,
+    result_tables,
+    scaling_table,
+    weighting_table,
+)
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
 from jaxrl_vis.errors import RequestError
@@ -39,6 +47,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table},
+    "docs/weighting.md": {"torchjd": weighting_table.torchjd_table},
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }

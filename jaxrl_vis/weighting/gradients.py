@@ -154,7 +154,8 @@ def weighted_grad(
         way: Method of the gradients, see above.
         has_aux: See ``losses_fn``.
         reduce: Applied to losses, gradients and dots before the weighting reads them, where each device has its own part of
-            the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
+            the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``. Inside `jax.shard_map` that needs
+            ``check_vma=False``, or gradients by what all devices share would be summed up before.
         forwards: Factory of the context for tracing forward-mode differentiation.
         encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
             through these alone. Way latents needs it; the other takes it, too. Or a dictionary of such functions, where latents

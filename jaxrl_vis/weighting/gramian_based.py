@@ -184,7 +184,8 @@ def imtl_g(**options: Unpack[Options]) -> Weighting:
     Rey, 2024).
 
     Weights are G^+ d / sum(G^+ d), d_i = |g_i|: they sum to 1 and may be negative. No gradient is favoured for its length or
-    for the company it keeps. Closed form. Where the sum is near 0, steps are long.
+    for the company it keeps. Closed form. Where gradients are opposed, as on the Pareto front, the pseudo-inverse jumps, and
+    the step with it.
 
     Args:
         options: See `Options`.
@@ -291,9 +292,11 @@ def config(**options: Unpack[Options]) -> Weighting:
         lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
         inverse = jnp.where(lengths > 0.0, 1.0 / jnp.where(lengths > 0.0, lengths, 1.0), 0.0)
         unit = gramian * inverse[:, None] * inverse[None, :]
-        raw = inverse * jnp.sum(solvers.pseudo_inverse(unit), axis=1)
+        of_unit = jnp.sum(solvers.pseudo_inverse(unit), axis=1)
+        raw = inverse * of_unit
         squared = solvers.quadratic(gramian, raw)
-        is_some = squared > 0.0
+        # Of length 1 / sqrt(K) or more, unless no direction has any cosine in common: then the step is 0.
+        is_some = solvers.quadratic(unit, of_unit) > 10.0 * len(gramian) * jnp.finfo(gramian.dtype).eps
         projections = jnp.sum(jnp.dot(gramian, raw, precision=jax.lax.Precision.HIGHEST))
         return jnp.where(is_some, projections / jnp.where(is_some, squared, 1.0), 0.0) * raw
 

@@ -89,7 +89,9 @@ def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, bet
         dots = jnp.matmul(changed, gramian, precision=jax.lax.Precision.HIGHEST)
         length = jnp.sqrt(jnp.maximum(jnp.sum(dots * changed, axis=1), 0.0))
         other = lengths[others]
-        is_pair = (others != rows) & (length > 0.0) & (other > 0.0)
+        # A gradient that has been turned to nothing is rounding, and has no direction.
+        is_some = length > 4.0 * jnp.finfo(gramian.dtype).eps ** 0.5 * lengths
+        is_pair = (others != rows) & is_some & (other > 0.0)
         safe = jnp.where(is_pair, other, 1.0)
         cosine = jnp.clip(jnp.where(is_pair, dots[rows, others] / (jnp.where(is_pair, length, 1.0) * safe), 0.0), -1.0, 1.0)
         wanted = usual[rows, others]

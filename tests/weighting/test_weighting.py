@@ -280,7 +280,7 @@ def test_parts_of_a_batch_on_several_devices_are_one_batch() -> None:
             assert_close(jax.tree.map(lambda leaf, place=place: leaf[place], each), whole)
 
 
-def test_a_batch_spread_over_devices_by_the_compiler(clean_environment: dict[str, str]) -> None:
+def test_a_batch_spread_over_devices_by_the_compiler_or_by_hand(clean_environment: dict[str, str]) -> None:
     code = """
 import jax, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -294,6 +294,16 @@ state = weighting.init(NAMES, encoder_of(params))
 gradient = jax.jit(weighted_grad(losses_of, weighting, encoder_of))
 assert len(spread["x"].devices()) == 2
 assert_close(gradient(params, state, spread), gradient(params, state, batch))
+
+upgrad = make_weighting("upgrad")
+options = {"shared": encoder_of, "encode": encode}
+of_part = weighted_grad(
+    losses_of_latents, upgrad, way="latents", reduce=lambda tree: jax.lax.pmean(tree, "data"), **options
+)
+specs = (PartitionSpec(), PartitionSpec(), PartitionSpec("data"))
+of_parts = jax.jit(jax.shard_map(of_part, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False))
+whole = jax.jit(weighted_grad(losses_of_latents, upgrad, **options))
+assert_close(of_parts(params, upgrad.init(NAMES), spread), whole(params, upgrad.init(NAMES), batch))
 """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     path = os.pathsep.join((str(Path(__file__).parents[1]), clean_environment["PYTHONPATH"]))

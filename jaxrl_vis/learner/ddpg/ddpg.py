@@ -165,7 +165,7 @@ def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward
         actor_optimizer=adam.init(actor),
         critic_optimizer=adam.init(critic),
         updates=jnp.zeros((), jnp.int32),
-        weighting=auxiliary.init_state(critic),
+        weighting=auxiliary.init_state(critic, key),
         autoencoder=None if latent_reward is None else latent_reward.init(jax.random.fold_in(key, _AUTOENCODER)),
     )
 
