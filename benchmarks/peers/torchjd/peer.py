@@ -4,6 +4,7 @@ Names as in `ours`: weights [n, K] of methods that give weights, directions [n, 
 the derivative of the scalarised loss, of those that read losses.
 """
 
+import multiprocessing
 import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
@@ -108,20 +109,32 @@ def paths(losses: torch.Tensor) -> Iterator[tuple[str, np.ndarray]]:
     yield "famo", np.stack(steps)
 
 
-def main() -> None:
-    """Read the file of Jacobians and write that of results."""
+def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
+    """Compute all results for one number of losses."""
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    arrays = dict(np.load(sys.argv[1]))
+    arrays = dict(np.load(path))
+    jacobians, is_full = torch.from_numpy(arrays[f"{prefix}/jacobians"]), arrays[f"{prefix}/ranks"] == int(prefix)
+    results: dict[str, np.ndarray] = {}
+    for name, method in METHODS.items():
+        # Seconds each, and where gradients depend on each other there may be no solution: full ranks alone.
+        chosen = is_full if name == "nash_mtl" else np.ones(len(jacobians), bool)
+        found = [method(jacobian) for jacobian in jacobians[torch.from_numpy(chosen)]]
+        results[f"{prefix}/{name}"] = np.full((len(jacobians), len(found[0])), np.nan)
+        results[f"{prefix}/{name}"][chosen] = np.stack(found)
+        print(prefix, name, flush=True)
+    results |= {f"{prefix}/{name}": value for name, value in drawn(arrays, prefix).items()}
+    by_path = [dict(paths(losses)) for losses in torch.from_numpy(arrays[f"{prefix}/losses"])]
+    return results | {f"{prefix}/{name}": np.stack([each[name] for each in by_path]) for name in by_path[0]}
+
+
+def main() -> None:
+    """Read the file of Jacobians and write that of results, with one process for each number of losses."""
+    prefixes = sorted({name.split("/")[0] for name in np.load(sys.argv[1])})
     results: dict[str, Any] = {"versions": np.array([f"torchjd {version('torchjd')}", f"torch {torch.__version__}"])}
-    for prefix in sorted({name.split("/")[0] for name in arrays}):
-        jacobians = torch.from_numpy(arrays[f"{prefix}/jacobians"])
-        for name, method in METHODS.items():
-            results[f"{prefix}/{name}"] = np.stack([method(jacobian) for jacobian in jacobians])
-            print(prefix, name, flush=True)
-        results |= {f"{prefix}/{name}": value for name, value in drawn(arrays, prefix).items()}
-        found = [dict(paths(losses)) for losses in torch.from_numpy(arrays[f"{prefix}/losses"])]
-        results |= {f"{prefix}/{name}": np.stack([each[name] for each in found]) for name in found[0]}
+    with multiprocessing.get_context("spawn").Pool(len(prefixes)) as pool:
+        for found in pool.starmap(compute, [(prefix, sys.argv[1]) for prefix in prefixes]):
+            results |= found
     np.savez(sys.argv[2], **results)
 
 
