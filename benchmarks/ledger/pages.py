@@ -47,7 +47,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table},
-    "docs/weighting.md": {"torchjd": weighting_table.torchjd_table},
+    "docs/weighting.md": {"torchjd": weighting_table.torchjd_table, "cost": weighting_table.cost_table},
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }
