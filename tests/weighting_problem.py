@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
+from jaxrl_vis.weighting import MAIN, Weighting, make_weighting, weighted_grad
 
 NAMES = (MAIN, "near", "far")
 OPTIONS: dict[str, dict[str, Any]] = {

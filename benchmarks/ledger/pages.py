@@ -13,6 +13,7 @@ from benchmarks.ledger import (
     result_tables,
     scaling_table,
     stalks_table,
+    weighting_table,
 )
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
@@ -48,6 +49,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/phenotyping.md": {"lenses": stalks_table.lens_table, "coverage": stalks_table.coverage_table},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table},
+    "docs/weighting.md": {"torchjd": weighting_table.torchjd_table, "cost": weighting_table.cost_table},
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }

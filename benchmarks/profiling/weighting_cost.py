@@ -25,8 +25,8 @@ from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.networks.normalizer import Scaling
-from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
-from jaxrl_vis.learner.weighting.gradients import Way
+from jaxrl_vis.weighting import MAIN, Weighting, make_weighting, weighted_grad
+from jaxrl_vis.weighting.gradients import Way
 
 STEPS = 40
 """Gradient steps of a timed call."""

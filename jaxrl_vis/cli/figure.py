@@ -15,7 +15,7 @@ from jaxrl_vis.report.outputs import check_figure, check_writable
 if TYPE_CHECKING:
     from jaxrl_vis.studies.figures.show import Request
 
-FigureName = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic"]
+FigureName = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic", "pareto"]
 UNFINISHED = 3
 """Exit status: finished, with something left out."""
 
@@ -29,15 +29,16 @@ class Figure:
     training. 5.7: what OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was
     begun, so they may be interrupted and started again at any time; the exit status is 3 where something is still missing.
 
-    quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane; nothing is trained, and --out is
-    its only option. Figures of stalks: `phenotype figure`, `grasp figure`.
+    quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane. pareto: paths to the Pareto front
+    of two losses, by twelve weightings. In these nothing is trained, and --out is the only option. Figures of stalks:
+    `phenotype figure`, `grasp figure`.
     """
 
     figure: Annotated[FigureName, tyro.conf.Positional]
     """Name of the figure."""
     out: Path | None = None
-    """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png) in the current folder if not given. Tables go beside it,
-    as .md and .csv."""
+    """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png, pareto.png) in the current folder if not given. Tables of
+    training runs go beside it, as .md and .csv."""
     preset: str | None = None
     """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given."""
     quick: bool = False
@@ -70,8 +71,8 @@ class Figure:
 
 def run(options: Figure) -> int:
     """Draw one figure; `UNFINISHED` where a run that belongs to it is not finished."""
-    if options.figure == "quadratic":
-        return _draw_quadratic(options)
+    if options.figure in ("quadratic", "pareto"):
+        return _draw_example(options)
     out = options.out or Path(f"figure_{options.figure}.png")
     check_figure(out)
     for file in (out.with_suffix(".md"), out.with_suffix(".csv")):
@@ -82,18 +83,19 @@ def run(options: Figure) -> int:
     return 0 if make.make_figure(_request(options, out)) else UNFINISHED
 
 
-def _draw_quadratic(options: Figure) -> int:
+def _draw_example(options: Figure) -> int:
+    """Draw a figure of a few losses in the plane."""
     for field in dataclasses.fields(options):
         if field.name not in ("figure", "out") and getattr(options, field.name) != field.default:
             raise RequestError(
                 f"--{field.name.replace('_', '-')} goes with figures of training runs, not with {options.figure}"
             )
-    out = options.out or Path("quadratic.png")
+    out = options.out or Path(f"{options.figure}.png")
     check_figure(out)
-    from jaxrl_vis.studies import quadratic
+    from jaxrl_vis.studies import pareto, quadratic
 
     check_devices()
-    quadratic.draw(out)
+    {"quadratic": quadratic, "pareto": pareto}[options.figure].draw(out)
     print(out)
     return 0
 

@@ -10,7 +10,16 @@ from typing import Annotated, Any, Literal, Self
 
 from jaxrl_vis.config import fields
 from jaxrl_vis.config.fields import Bounds
-from jaxrl_vis.config.methods import AlgorithmName, AuxTaskName, MethodName, WeightingName
+from jaxrl_vis.config.methods import (
+    EPS_WEIGHTINGS,
+    HEAD_WEIGHTINGS,
+    LIMITED_WEIGHTINGS,
+    LOG_WEIGHTINGS,
+    AlgorithmName,
+    AuxTaskName,
+    MethodName,
+    WeightingName,
+)
 from jaxrl_vis.errors import RequestError, nearest
 
 # Values that a field allows, for checks, the command line and its help.
@@ -251,15 +260,21 @@ class StudyOptions:
     that of the total loss."""
     weighting_window: Annotated[Count, OL_AUX] = 1
     """Gradient steps over which OL-AUX averages gradients before it compares them; 4 in the authors' release."""
-    weighting_log: Annotated[bool, OfWeighting(("cosine",))] = False
-    """Minimise the logarithms of the losses, with weighting cosine."""
-    weighting_heads: Annotated[Literal["weighted", "always"] | None, OfWeighting(("cosine", "ol_aux"))] = None
-    """Weights of the losses for the auxiliary tasks' heads: those of the encoder (weighted), or 1 (always). None: always with
-    cosine, as in the thesis, and weighted with OL-AUX."""
-    weighting_eps: Annotated[Positive | None, OfWeighting(("fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"))] = None
-    """Number added to auxiliary losses before their logarithm is taken. None: 0.02."""
-    weighting_maximum: Annotated[Positive | None, OfWeighting(("ol_aux",))] = None
-    """Greatest weight of an auxiliary loss in OL-AUX. None: unbounded."""
+    weighting_log: Annotated[bool, OfWeighting(LOG_WEIGHTINGS)] = False
+    """Minimise the logarithms of the losses, with a weighting that takes none by itself."""
+    weighting_heads: Annotated[Literal["weighted", "always"] | None, OfWeighting(HEAD_WEIGHTINGS)] = None
+    """Weights of the losses for the auxiliary tasks' heads: those of the encoder (weighted), or 1 (always). None: weighted with
+    OL-AUX and GradNorm, otherwise always, with cosine as in the thesis."""
+    weighting_eps: Annotated[Positive | None, OfWeighting(EPS_WEIGHTINGS)] = None
+    """Number added to auxiliary losses before their logarithm is taken. None: 0.02, and 1e-8 with db_mtl."""
+    weighting_task_eps: Annotated[tuple[Positive, ...], OfWeighting(EPS_WEIGHTINGS)] = ()
+    """The same for each auxiliary loss, in the order of aux_tasks, in place of weighting_eps."""
+    weighting_maximum: Annotated[Positive | None, OfWeighting(LIMITED_WEIGHTINGS)] = None
+    """Greatest weight of a loss; of an auxiliary one, where the main one's is 1. None: unbounded."""
+    weighting_total: Annotated[Positive | None, OfWeighting(LIMITED_WEIGHTINGS)] = None
+    """Sum to which the weights are scaled, without that of a main loss that is 1 by rule. None: not scaled."""
+    weighting_cosines: Annotated[bool, OfWeighting()] = False
+    """Log the cosines of the losses' gradients in the critic's encoder, for which all of them are compared."""
     aux_form: Annotated[Literal["thesis", "release"], OfWeighting()] = "thesis"
     """Form of the auxiliary tasks' targets, where the thesis and the authors' release differ (`auxtasks.Options`)."""
 

@@ -53,6 +53,31 @@ METHODS: dict[str, Method] = {
 }
 
 MethodName = Annotated[str, Names(tuple(METHODS))]
-WeightingName = Annotated[str, Names(("none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"))]
+# Weightings of losses by what they need (`jaxrl_vis.weighting`), and by the options that they have.
+MAIN_WEIGHTINGS = ("none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation")
+LOSS_WEIGHTINGS = ("uniform", "random", "uncertainty", "imtl_l", "dwa", "geometric_mean", "stch", "famo")
+GRAMIAN_WEIGHTINGS = (
+    "auxinash",
+    "mgda",
+    "upgrad",
+    "dualproj",
+    "cagrad",
+    "imtl_g",
+    "nash_mtl",
+    "fairgrad",
+    "aligned_mtl",
+    "config",
+    "pcgrad",
+    "gradvac",
+)
+DIRECTION_WEIGHTINGS = ("graddrop", "db_mtl", "moco")
+LOG_WEIGHTINGS = ("cosine", *GRAMIAN_WEIGHTINGS)
+HEAD_WEIGHTINGS = ("cosine", "ol_aux", "gradnorm", *GRAMIAN_WEIGHTINGS)
+EPS_WEIGHTINGS = ("fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation", *GRAMIAN_WEIGHTINGS, "db_mtl")
+LIMITED_WEIGHTINGS = ("ol_aux", "ol_aux_ablation", "gradnorm", *LOSS_WEIGHTINGS, *GRAMIAN_WEIGHTINGS)
+
+WeightingName = Annotated[
+    str, Names((*MAIN_WEIGHTINGS, *LOSS_WEIGHTINGS, "gradnorm", *GRAMIAN_WEIGHTINGS, *DIRECTION_WEIGHTINGS))
+]
 AuxTaskName = Annotated[str, Names(("forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"))]
 AlgorithmName = Annotated[str, Names(("ddpg",))]

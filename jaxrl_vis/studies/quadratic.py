@@ -18,8 +18,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxrl_vis.learner.weighting import MAIN, Weighting, make_weighting, weighted_grad
 from jaxrl_vis.report.plots import FAINT, INK
+from jaxrl_vis.weighting import MAIN, Weighting, make_weighting, weighted_grad
 
 STARTS = ((-0.8, -1.6), (1.8, 1.0), (-1.8, 1.0), (1.0, -1.0))
 STEPS = 1000

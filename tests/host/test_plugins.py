@@ -18,8 +18,8 @@ from jaxrl_vis.host import plugins
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.environment import locate_env
 from jaxrl_vis.learner.train_step import ALGORITHMS
-from jaxrl_vis.learner.weighting import WEIGHTINGS
 from jaxrl_vis.run import trust
+from jaxrl_vis.weighting import WEIGHTINGS
 
 PAGE = ROOT / "docs" / "extending.md"
 FILES = {match[1]: block.text for block in blocks(PAGE) if (match := re.match(r"# file: (\w+\.py)\n", block.text)) is not None}

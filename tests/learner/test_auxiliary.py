@@ -19,8 +19,8 @@ from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.resolved import resolve
-from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.types import Episodes, Statistics
+from jaxrl_vis.weighting import make_weighting
 
 SPEC = jax.ShapeDtypeStruct((2, 16, 16), jnp.uint8)
 ACTIONS, HORIZON, EPISODES, BATCH = 2, 6, 4, 16
@@ -102,7 +102,7 @@ def learner(way=None, **overrides):
     start = fresh(
         chosen.auxiliary.aux_tasks, chosen.network.encoders, chosen.network.target_encoder, chosen.network.encoder_filters
     )
-    start = start.replace(weighting=auxiliary.init_state(start.critic))
+    start = start.replace(weighting=auxiliary.init_state(start.critic, jax.random.key(3)))
     return algorithm, update, algorithm.begin(start, Statistics(normalizer.init(SPEC), None)), batch
 
 
@@ -250,12 +250,87 @@ def test_kept_flow_is_that_of_the_images():
             "weighting_interval (3) must divide updates_per_iteration (10)",
         ),
         ({"weighting": "balance", "aux_tasks": ("egomotion",), "n_step": 2}, "n_step and aux_tasks exclude"),
+        (
+            {"weighting": "balance", "aux_tasks": ("egomotion",), "weighting_task_eps": (0.1, 0.2)},
+            "weighting_task_eps has 2 values for 1 aux_tasks: give one for each",
+        ),
+        ({"weighting_cosines": True}, "weighting_cosines compares auxiliary losses, and there are none"),
+        (
+            {"weighting": "moco", "aux_tasks": ("egomotion",), "weighting_cosines": True},
+            "weighting moco needs whole gradients, and its cosines are not logged",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_refused(overrides, words):
     with pytest.raises(RequestError) as caught:
         make_auxiliary(config(**overrides), SPEC, ACTIONS, 1, jnp.float32)
     assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+TWO = ("inverse_dynamics", "forward_dynamics")
+
+
+@pytest.mark.parametrize("weighting", ["mgda", "famo", "gradnorm", "pcgrad", "moco"])
+def test_a_weighting_of_any_kind_trains_both_networks(weighting):
+    """By a Gramian, losses, learned lengths, drawn orders, and tracked gradients."""
+    _, update, working, batch = learner(aux_tasks=TWO, weighting=weighting)
+    for _ in range(2):
+        before, (working, gradients, metrics) = working, update(working, batch)
+    for network in (gradients.critic, gradients.actor):
+        assert all(size > 0 for size in sizes(network).values()) and all(np.isfinite(list(sizes(network).values())))
+    assert all(np.isfinite(value).all() for value in jax.tree.leaves(metrics))
+    assert {f"train/weight/{name}" for name in ("main", *TWO)} <= set(metrics)
+    assert jax.tree.structure(before.agent.weighting) == jax.tree.structure(working.agent.weighting)
+
+
+def test_both_ways_to_a_gramian_train_alike():
+    found = []
+    for way in ("per_loss", "latents"):
+        _, update, working, batch = learner(way=way, aux_tasks=TWO, weighting="upgrad")
+        found.append(update(working, batch)[1])
+    jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-5), *found)
+
+
+def test_a_main_loss_that_is_like_the_others_is_weighted_in_both_networks():
+    """A third of the plain sum, everywhere; and where weights are for encoders alone, heads learn as they do from the sum."""
+    found = {}
+    for weighting in ("sum", "uniform", "mgda"):
+        _, update, working, batch = learner(aux_tasks=TWO, weighting=weighting)
+        found[weighting] = update(working, batch)[1]
+
+    def assert_same(one, other):
+        """Up to the rounding of each array's largest numbers."""
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-5 * np.abs(one).max())
+
+    of_sum, uniform = ((found[name].critic, found[name].actor) for name in ("sum", "uniform"))
+    jax.tree.map(lambda one, other: assert_same(one, 3.0 * other), of_sum, uniform)
+    for part in ("head", "heads"):
+        for network in ("critic", "actor"):
+            one, other = (getattr(found[name], network)[part] for name in ("sum", "mgda"))
+            jax.tree.map(assert_same, one, other)
+    assert sizes(found["mgda"].actor)["encoder"] < sizes(found["sum"].actor)["encoder"]
+
+
+def test_learners_draw_apart():
+    auxiliary = make_auxiliary(config(aux_tasks=TWO, weighting="random"), SPEC, ACTIONS, 1, jnp.float32)
+    states = [auxiliary.init_state({"encoder": jnp.zeros(2)}, jax.random.key(seed)) for seed in (0, 1)]
+    losses = dict.fromkeys(("main", *TWO), jnp.ones(()))
+    one, other = (auxiliary.weighting.update(losses, None, state)[0]["main"] for state in states)
+    assert float(one) != float(other)
+
+
+def test_weights_are_bounded_and_scaled_and_cosines_logged_where_asked():
+    options = {"weighting_maximum": 0.5, "weighting_total": 2.0, "weighting_cosines": True, "weighting_log": True}
+    _, update, working, batch = learner(aux_tasks=TWO, weighting="nash_mtl", weighting_task_eps=(0.1, 0.2), **options)
+    _, _, metrics = update(working, batch)
+    weights = [float(metrics[f"train/weight/{name}"]) for name in ("main", *TWO)]
+    np.testing.assert_allclose(sum(weights), 2.0, rtol=1e-4)
+    assert -1.0 <= metrics["train/cosine/least"] <= metrics[f"train/cosine/{TWO[0]}"] <= 1.0
+    auxiliary = make_auxiliary(
+        config(aux_tasks=TWO, weighting="balance", weighting_task_eps=(0.1, 0.2)), SPEC, ACTIONS, 1, jnp.float32
+    )
+    slopes = auxiliary.weighting.slopes(dict.fromkeys(("main", *TWO), jnp.ones(())))
+    np.testing.assert_allclose([slopes[name] for name in TWO], [1 / 1.1, 1 / 1.2], rtol=1e-6)
 
 
 def test_states_have_no_auxiliary_tasks():

@@ -15,8 +15,8 @@ from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.networks.blocks import from_blocks
 from jaxrl_vis.learner.networks.kernels import decoder as decoder_kernel
 from jaxrl_vis.learner.networks.kernels.patches import to_patches
-from jaxrl_vis.learner.weighting import make_weighting
 from jaxrl_vis.types import Batch
+from jaxrl_vis.weighting import make_weighting
 
 LATENTS = ("latent_t", "latent_tp1", "latent_view")
 # The latents that each loss has a gradient to.

@@ -14,7 +14,7 @@ from test_replay import ENVS, HORIZON, encoded_rollout
 
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import make_replay
-from jaxrl_vis.learner.weighting import MAIN, make_weighting
+from jaxrl_vis.weighting import MAIN, make_weighting
 from jaxrl_vis_envs.physics.scalar import quaternions
 from jaxrl_vis_envs.render import Scene
 from jaxrl_vis_envs.render.camera import lens, pixel_rays

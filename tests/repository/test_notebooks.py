@@ -15,6 +15,7 @@ SHOWN = {
     "04_auxiliary_losses": (1, 0),  # errors and weights
     "05_phenotyping": (3, 0),  # a pair; its overlay; widths against the truth
     "06_grasping": (2, 0),  # a pair and its mask; stalks and grasp points from above
+    "07_weighting": (3, 0),  # pairs of digits; accuracies on two tasks, and on five
 }
 SAID = {
     "05_phenotyping": ("overlays (plots: 1, pairs skipped: 0)", "synthetic: 8 stalks were counted, 8 are there"),
@@ -22,6 +23,7 @@ SAID = {
     "02_new_environment": ("of goals reached at the end", "eval/success"),  # `eval` finds the task by what the run folder says
     "03_indicator_rewards": ("oracle  ", "indicator_balance_filter", "of goals reached"),
     "04_auxiliary_losses": ("OL-AUX-5           error on unseen inputs",),
+    "07_weighting": ("sum           upper 0.", "upgrad        digit 0."),
     "06_grasping": ("3 pairs of 256 x 256 pixels", "default                      stitches off by", "of the thesis"),
 }
 

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "host"),  # `host` itself is empty
     ("config", "types"),
+    ("weighting",),  # a library of its own: nothing of this project but `errors` and `types`
     ("host.cache_entries", "host.provenance", "host.spreadsheets", "host.streams"),
     ("host.files",),
     ("host.devices", "host.distributed", "host.plugins", "host.weights_file"),
@@ -176,9 +177,25 @@ from jaxrl_vis.learner.networks import networks
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.memory import relabel
 from jaxrl_vis.learner.memory import replay
-from jaxrl_vis.learner import weighting
 from jaxrl_vis_envs import goals
 assert not {"mujoco", "matplotlib", "orbax"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
+
+
+def test_the_library_of_weightings_loads_jax_and_optax_alone(clean_environment: dict[str, str]) -> None:
+    """No command line, physics, networks or import hook: people with losses of their own need none of these."""
+    code = """
+import sys
+import jax, jax.numpy, jax.extend.core, numpy, optax
+before, finders, hooks = set(sys.modules), list(sys.meta_path), list(sys.path_hooks)
+import jaxrl_vis.weighting as jw
+more = {name for name in set(sys.modules) - before if not name.startswith("jaxrl_vis.weighting")}
+ours = {"jaxrl_vis", "jaxrl_vis.errors", "jaxrl_vis.types", "jaxrl_vis_envs", "jaxrl_vis_envs.names"}
+assert {name for name in more if name.startswith("jaxrl")} == ours, more
+assert {name.split(".")[0] for name in more - ours} <= set(sys.stdlib_module_names) | {"jax", "jaxlib", "numpy", "optax"}, more
+assert (sys.meta_path, sys.path_hooks) == (finders, hooks)
+assert not {"mujoco", "flax", "orbax", "tyro", "rich", "matplotlib"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], env=clean_environment, check=True)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxrl_vis import cli
-from jaxrl_vis.learner.weighting import MAIN, make_weighting, weighted_grad
 from jaxrl_vis.studies import quadratic
+from jaxrl_vis.weighting import MAIN, make_weighting, weighted_grad
 
 HALF = np.array([0.5, 0.5])
 

@@ -13,13 +13,16 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.config.methods import LOG_WEIGHTINGS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
-from jaxrl_vis.learner.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, make_weighting
 from jaxrl_vis.types import Batch, Episodes, Params
+from jaxrl_vis.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, limited, make_weighting, with_cosines
 
+# Folded into a learner's key, for numbers that a weighting draws.
+_DRAWS = 0x647261
 _EPISODES_AT_ONCE = 10  # whose arrays are computed together: some 500 images fill a GPU, and more would fill its memory
 
 
@@ -52,13 +55,17 @@ class Auxiliary:
         """Initialise the parameters of all heads, by task."""
         return {name: task.init(task.fold(key)) for name, task in self.tasks.items()}
 
-    def init_state(self, critic: Params) -> WeightingState | None:
+    def init_state(self, critic: Params, key: jax.Array) -> WeightingState | None:
         """Initialise the weighting's state; None without a weighting.
 
         Args:
             critic: All parameters of the critic, in whose encoder gradients are compared.
+            key: [] typed key of the learner.
         """
-        return None if self.weighting.name == "none" else self.start(critic)
+        if self.weighting.name == "none":
+            return None
+        state = self.start(critic)
+        return state if state.key is None else state.replace(key=jax.random.fold_in(key, _DRAWS))
 
     def start(self, critic: Params) -> WeightingState:
         """Return the weighting's state before the first update."""
@@ -129,6 +136,17 @@ class Auxiliary:
         views = self._views(view, latents, batch)
         return {name: task.predict(heads[name], views[name]) for name, task in self.tasks.items()}
 
+    def main_latents(self, latents: jax.Array, weights: Mapping[str, jax.Array]) -> jax.Array:
+        """Scale the gradient of an actor's main loss in the latents by a weight that is not 1 by rule, and not for heads, too.
+
+        Args:
+            latents: [..., L].
+            weights: [] float32 by name, of the critic's losses.
+        """
+        if self.weighting.main or self.weighting.heads == "weighted":
+            return latents
+        return _scale_gradient(latents, weights[MAIN])
+
     def _views(self, view: View, latents: dict[str, jax.Array], batch: Batch) -> dict[str, View]:
         """Return the inputs of each task, with its target shifted like the batch's images."""
         views = {}
@@ -179,10 +197,14 @@ def make_auxiliary(
         RequestError: They do not go together, or not with the rest of the configuration.
     """
     if config.auxiliary.weighting in WEIGHTINGS:
-        weighting = make_weighting(config.auxiliary.weighting, **_options(config))
+        weighting = _bounded(config, make_weighting(config.auxiliary.weighting, **_options(config)))
     else:
         maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
         weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
+    if config.study.weighting_cosines:
+        if not config.auxiliary.aux_tasks:
+            raise RequestError("weighting_cosines compares auxiliary losses, and there are none: add --aux-tasks")
+        weighting = with_cosines(weighting)
     if config.auxiliary.aux_tasks and not weighting.auxiliary:
         raise RequestError(
             f"aux_tasks are given, but weighting {config.auxiliary.weighting} learns none: choose --weighting ol_aux, or leave "
@@ -207,12 +229,29 @@ def make_auxiliary(
     return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, way)
 
 
+def _bounded(config: Config, weighting: Weighting) -> Weighting:
+    """Bound and scale the weights as the configuration says. OL-AUX has a greatest weight in its own rule."""
+    maximum, total = config.study.weighting_maximum, config.study.weighting_total
+    if config.auxiliary.weighting == "ol_aux":
+        maximum = None
+    return weighting if maximum is None and total is None else limited(weighting, maximum=maximum, total=total)
+
+
 def _options(config: Config) -> dict[str, Any]:
-    """Return the arguments for the constructor of the configuration's weighting."""
+    """Return the arguments for the constructor of the configuration's weighting.
+
+    Raises:
+        RequestError: There are not as many values of eps as tasks.
+    """
     options: dict[str, Any] = {}
+    tasks, each = config.auxiliary.aux_tasks, config.study.weighting_task_eps
+    if each and len(each) != len(tasks):
+        raise RequestError(f"weighting_task_eps has {len(each)} values for {len(tasks)} aux_tasks: give one for each")
     if config.study.weighting_heads is not None:
         options["heads"] = config.study.weighting_heads
-    if config.study.weighting_eps is not None:
+    if each:
+        options["eps"] = dict(zip(tasks, each, strict=True))
+    elif config.study.weighting_eps is not None:
         options["eps"] = config.study.weighting_eps
     if config.auxiliary.weighting in ("ol_aux", "ol_aux_ablation"):
         options |= {
@@ -224,10 +263,10 @@ def _options(config: Config) -> dict[str, Any]:
             options["main_grad"] = config.study.weighting_main_grad
         if config.study.weighting_window != 1:
             options["window"] = config.study.weighting_window
-        if config.study.weighting_maximum is not None:
+        if config.study.weighting_maximum is not None and config.auxiliary.weighting == "ol_aux":
             options["maximum"] = config.study.weighting_maximum
     if config.auxiliary.weighting == "fixed":
         options["weights"] = config.auxiliary.weighting_fixed
-    if config.auxiliary.weighting == "cosine":
+    if config.auxiliary.weighting in LOG_WEIGHTINGS:
         options["log"] = config.study.weighting_log
     return options

@@ -29,8 +29,8 @@ from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.learner.resolved import Resolved
-from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
 from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
+from jaxrl_vis.weighting import MAIN, Weighted, WeightingState
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
 _HEADS = 0x686473
@@ -165,7 +165,7 @@ def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward
         actor_optimizer=adam.init(actor),
         critic_optimizer=adam.init(critic),
         updates=jnp.zeros((), jnp.int32),
-        weighting=auxiliary.init_state(critic),
+        weighting=auxiliary.init_state(critic, key),
         autoencoder=None if latent_reward is None else latent_reward.init(jax.random.fold_in(key, _AUTOENCODER)),
     )
 

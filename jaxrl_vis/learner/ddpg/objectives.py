@@ -25,8 +25,8 @@ from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Inputs, Networks
 from jaxrl_vis.learner.parallel.shards import Shards
 from jaxrl_vis.learner.resolved import Resolved
-from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState, weighted_grad
 from jaxrl_vis.types import Batch, Params
+from jaxrl_vis.weighting import MAIN, Weighted, WeightingState, weighted_grad
 
 
 class ComputeCopies(NamedTuple):
@@ -134,11 +134,11 @@ class Objectives:
     def reduces_early(self) -> bool:
         """True if the critic's gradients are averaged over the shards of a learner before they are weighted.
 
-        A weighting that takes logarithms of losses, or compares gradients, must see those of the whole learner. What others
+        A weighting that reads losses, or compares gradients, must see those of the whole learner. What others
         make of them is a sum, which may be averaged afterwards, together with all else.
         """
         weighting = self.auxiliary.weighting
-        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.log)
+        return self.shards.count > 1 and (weighting.needs != "losses" or weighting.reads_losses)
 
     def critic_gradient(
         self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch
@@ -158,8 +158,8 @@ class Objectives:
             others = self._auxiliary(critic, latents, inputs, image, batch)
             return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
 
-        # Where the main gradient is passed on by itself, the others' need not pass through all that it does.
-        passes_apart = way == "latents" and weighting.needs == "dots"
+        # Where gradients are passed on one by one, those of auxiliary losses need not pass through all that the main one does.
+        passes_apart = way == "latents" and weighting.needs in ("dots", "gramian")
         encoders = _encoders(networks, self.auxiliary, inputs) if passes_apart else encode
         options: dict[str, Any] = {"forwards": forward_mode.with_tangents, "encode": encoders, "has_aux": True}
         if self.reduces_early:
@@ -198,14 +198,17 @@ class Objectives:
             others = self._auxiliary(actor, latents, inputs, image, batch, weights)
         if self.auxiliary.weighting.log:
             others = {name: self.shards.whole(loss) for name, loss in others.items()}
-        action = self.networks.act(actor, latents.pair)
+        action = self.networks.act(actor, self.auxiliary.main_latents(latents.pair, weights) if has_encoder else latents.pair)
         value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
         loss = losses.actor_loss(
             value, action, self.config.ddpg.action_penalty, best, self.shards.whole, self.config.ddpg.actor_log
         )
         weighting = self.auxiliary.weighting
-        return loss + weighting.objective(weighting.head_weights(weights), others), action
+        of_heads = weighting.head_weights(weights)
+        if has_encoder and not weighting.main:
+            loss = of_heads[MAIN] * loss
+        return loss + weighting.objective(of_heads, others), action
 
     def _auxiliary(
         self,

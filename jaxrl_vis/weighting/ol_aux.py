@@ -17,8 +17,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.base import (
     MAIN,
+    Eps,
     Heads,
     Losses,
     Weighting,
@@ -30,7 +32,6 @@ from jaxrl_vis.learner.weighting.base import (
     scaled,
     start,
 )
-from jaxrl_vis.types import Metrics, Params
 
 
 def ol_aux(
@@ -38,7 +39,7 @@ def ol_aux(
     learning_rate: float = 1e-3,
     beta: float | None = None,
     log: bool = True,
-    eps: float = 0.02,
+    eps: Eps = 0.02,
     main_eps: float = 1e-8,
     minimum: float | None = 0.0,
     maximum: float | None = None,

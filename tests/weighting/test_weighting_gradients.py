@@ -23,8 +23,8 @@ from weighting_problem import (
 )
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.weighting import MAIN, make_weighting, weighted_grad
-from jaxrl_vis.learner.weighting.base import dot
+from jaxrl_vis.weighting import MAIN, make_weighting, weighted_grad
+from jaxrl_vis.weighting.base import dot
 
 
 @pytest.mark.parametrize("case", ["sum", "fixed", "cosine of logarithms", "ol_aux", "ol_aux total", "ol_aux as released"])

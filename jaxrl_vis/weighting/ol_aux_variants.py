@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.base import (
     MAIN,
+    Eps,
     Heads,
     Losses,
     Weighting,
@@ -24,9 +26,9 @@ from jaxrl_vis.learner.weighting.base import (
     scaled,
     start,
     weighted_sum,
+    zeros_for,
 )
-from jaxrl_vis.learner.weighting.ol_aux import check_count, check_state, make_rule
-from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.ol_aux import check_count, check_state, make_rule
 
 MainGradient = Literal["main", "total"]
 
@@ -36,7 +38,7 @@ def ol_aux_window(
     learning_rate: float = 1e-3,
     beta: float | None = None,
     log: bool = True,
-    eps: float = 0.02,
+    eps: Eps = 0.02,
     main_eps: float = 1e-8,
     main_grad: MainGradient = "main",
     window: int = 1,
@@ -64,9 +66,9 @@ def ol_aux_window(
     move = make_rule(label, interval, learning_rate, beta, minimum, maximum, multiplicative)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        others = _names(label, names, shared)
+        others = auxiliary_names(label, names)
         sums = {name: jnp.zeros(()) for name in others}
-        return start(others, dict.fromkeys(others, 1.0), sums=sums, window=_zeros((MAIN, *others), shared, window))
+        return start(others, dict.fromkeys(others, 1.0), sums=sums, window=zeros_for(label, (MAIN, *others), shared, window))
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         check_state(label, state)
@@ -91,7 +93,7 @@ def ol_aux_ablation(
     learning_rate: float = 1e-3,
     beta: float | None = None,
     log: bool = True,
-    eps: float = 0.02,
+    eps: Eps = 0.02,
     main_eps: float = 1e-8,
     main_grad: MainGradient = "main",
     window: int = 1,
@@ -120,11 +122,11 @@ def ol_aux_ablation(
     move = make_rule(label, interval, learning_rate, beta, minimum)
 
     def init(names: Iterable[str], shared: Params = None, params: Params = None) -> WeightingState:
-        others = _names(label, names, shared)
+        others = auxiliary_names(label, names)
         if params is None:
             raise RequestError(f"weighting {label} keeps parameters: give init all of them, too")
         sums = {name: jnp.zeros(()) for name in (MAIN, *others)}
-        sums = {"losses": sums, "gradients": _zeros((MAIN, *others), shared)}
+        sums = {"losses": sums, "gradients": zeros_for(label, (MAIN, *others), shared)}
         held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), params)
         return start(others, dict.fromkeys(others, 1.0), sums=sums, params=held)
 
@@ -157,14 +159,6 @@ def _check_main_grad(label: str, main_grad: str) -> None:
         )
 
 
-def _names(label: str, names: Iterable[str], shared: Params) -> tuple[str, ...]:
-    """Return the names of the auxiliary losses."""
-    others = auxiliary_names(label, names)
-    if shared is None:
-        raise RequestError(f"weighting {label} keeps gradients: give init the shared parameters, too")
-    return others
-
-
 def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
     """Convert gradients of the losses to those of the learned objective."""
     return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
@@ -173,12 +167,3 @@ def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Param
 def _direction(main_grad: MainGradient, gradients: Mapping[str, Params], weights: Weights) -> Params:
     """Return the gradient that the others are compared with."""
     return gradients[MAIN] if main_grad == "main" else weighted_sum(gradients, weights)
-
-
-def _zeros(names: Iterable[str], shared: Params, *leading: int) -> dict[str, Params]:
-    """Return a tree of zeros for each name, at least float32."""
-
-    def zeros(leaf: Any) -> jax.Array:
-        return jnp.zeros((*leading, *leaf.shape), jnp.promote_types(leaf.dtype, jnp.float32))
-
-    return {name: jax.tree.map(zeros, shared) for name in names}

@@ -1,4 +1,4 @@
-"""Interface of a weighting, which sets the weights of the auxiliary losses relative to the main one.
+"""Interface of a weighting, which combines several losses of the same parameters into one step.
 
 One gradient step with losses L_i, shared parameters theta and a weighting:
 
@@ -6,6 +6,10 @@ One gradient step with losses L_i, shared parameters theta and a weighting:
     gradient = sum over i of c_i grad L_i, over all parameters; the optimiser takes it. Where ``heads`` is always, weights apply
         to theta alone, and s_i takes the place of c_i for all other parameters
     statistics = what the weighting needs of the gradients with respect to theta alone
+
+Some weightings have a main loss, which the others are to help (`Weighting.main`); to the rest, all losses are alike. Arrays
+over the losses, such as the Gramian [K, K], are in the sorted order of their names (`loss_order`). A weighting that cannot be
+written as weights of the losses gives a `Direction` in the shared parameters instead.
 
 Losses, dots and gradients cross this interface as they are, without logarithms; the weighting multiplies them by s_i itself.
 So they can be averaged over devices or minibatches first, which would be wrong for logarithms.
@@ -23,12 +27,25 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.types import Metrics, Params, Replaceable
 
 MAIN = "main"
-"""Name of the loss that the others are to help. Its weight is always 1."""
+"""Name of the loss that the others are to help, for weightings that have such a one. Its weight is 1 there."""
 
-Needs = Literal["losses", "dots", "gradients"]
+Needs = Literal["losses", "dots", "gramian", "gradients"]
 Heads = Literal["weighted", "always"]
-Losses = Mapping[str, jax.Array]  # [] floats by name, `MAIN` among them
+Losses = Mapping[str, jax.Array]  # [] floats by name
 Weights = dict[str, jax.Array]
+Eps = float | Mapping[str, float]  # one for all auxiliary losses, or one for each by its name
+
+
+class Direction(NamedTuple):
+    """Step of a weighting that is no weighted sum of the current gradients.
+
+    Attributes:
+        shared: What takes the place of the gradient in the shared parameters: a tree like these, float32 or wider.
+        weights: [] float32 by name, weights of the losses for all other parameters, and for whatever can take only weights.
+    """
+
+    shared: Params
+    weights: Weights
 
 
 @jax.tree_util.register_dataclass
@@ -37,12 +54,14 @@ class WeightingState(Replaceable):
     """State of a weighting. All shapes are fixed, so it can be scanned, mapped, sharded and saved like parameters.
 
     Attributes:
-        weights: [] float32 by name, for all losses; `MAIN` is 1. The next gradients are combined with them, unless the
-            weighting decides by these gradients (`cosine`).
+        weights: [] float32 by name, for all losses; of a main loss, 1. The next gradients are combined with them, unless the
+            weighting decides by these gradients (`cosine`, and all that need a Gramian); then the latest.
         updates: [] int32, calls of `Weighting.update` so far.
         sums: Sums over the calls since the weights last moved; None where nothing is summed up.
         window: The latest gradients by name, [window, ...] each; None without a moving average.
         params: Parameters at which losses and gradients are compared; None: those of each step.
+        memory: What else the weighting remembers, such as the state of an optax rule; None for nothing.
+        key: [] typed key of a weighting that draws; None if it does not.
     """
 
     weights: Weights
@@ -50,6 +69,8 @@ class WeightingState(Replaceable):
     sums: Any = None
     window: Any = None
     params: Params = None
+    memory: Any = None
+    key: Any = None
 
 
 class Weighting(NamedTuple):
@@ -57,39 +78,45 @@ class Weighting(NamedTuple):
 
     Attributes:
         name: As in `make_weighting`.
-        init: (names of all losses, `MAIN` among them; shared parameters or their shapes, which are read where ``needs`` is
-            gradients; where there is ``hold``, also all parameters or their shapes) -> WeightingState. Raises RequestError
-            where names are missing or too many.
-        update: (losses, statistics, state) -> (weights of this step by name, state, metrics of [] float32). ``statistics`` is
+        init: (names of all losses; shared parameters or their shapes, which are read where ``needs`` is gradients; where there
+            is ``hold``, also all parameters or their shapes) -> WeightingState. Raises RequestError where names are missing or
+            too many.
+        update: (losses, statistics, state) -> (weights of this step by name, or a `Direction`; state; metrics of [] float32).
+            ``statistics`` is
 
             - for ``needs`` losses: not read, None will do;
             - dots: [] float32 for each auxiliary loss, <grad L_main, grad L_i>;
+            - gramian: [K, K] float32, <grad L_i, grad L_j>, in the sorted order of the names;
             - gradients: for every loss, grad L_i.
 
             Gradients are those of the losses as they are, with respect to the shared parameters alone.
         needs: Kind of ``statistics``.
         auxiliary: True if auxiliary losses are learned at all; if not, they weigh 0 and need not be computed.
         log: True if logarithms of the losses are learned.
-        eps: Added to auxiliary losses before their logarithm is taken.
+        eps: Added to auxiliary losses before their logarithm is taken: one number, or a number for each by its name.
         main_eps: Added to the main loss likewise.
         heads: Weights for parameters that are not shared. weighted: those of the shared ones, so that a head rests while its
             loss weighs nothing; always: 1.
         interval: N, calls of ``update`` from one change of the weights to the next.
         hold: (parameters of this step, WeightingState) -> WeightingState with the ``params`` that losses and statistics of
             this step must belong to; None: they are those of the step.
+        main: True if one of the losses must be called `MAIN`, and weighs 1.
+        reads_losses: True if the weights depend on the losses' values.
     """
 
     name: str
     init: Callable[..., WeightingState]
-    update: Callable[[Losses, Any, WeightingState], tuple[Weights, WeightingState, Metrics]]
+    update: Callable[[Losses, Any, WeightingState], tuple[Weights | Direction, WeightingState, Metrics]]
     needs: Needs = "losses"
     auxiliary: bool = True
     log: bool = False
-    eps: float = 0.02
+    eps: Eps = 0.02
     main_eps: float = 1e-8
     heads: Heads = "weighted"
     interval: int = 1
     hold: Callable[[Params, WeightingState], WeightingState] | None = None
+    main: bool = True
+    reads_losses: bool = True
 
     def slopes(self, losses: Losses) -> dict[str, jax.Array]:
         """Compute s_i, the objective's derivative by each loss, [] float32 by name; 1 without logarithms."""
@@ -113,7 +140,13 @@ class Weighting(NamedTuple):
         return {name: jnp.ones_like(weight) for name, weight in weights.items()} if self.heads == "always" else weights
 
     def _loss_eps(self, name: str) -> float:
-        return self.main_eps if name == MAIN else self.eps
+        if name == MAIN:
+            return self.main_eps
+        if not isinstance(self.eps, Mapping):
+            return self.eps
+        if name not in self.eps:
+            raise RequestError(f"weighting {self.name} has no eps for loss {name!r}; give one, or one number for all losses")
+        return self.eps[name]
 
 
 def log_loss(loss: jax.Array, eps: float) -> jax.Array:
@@ -197,6 +230,49 @@ def weighted_sum(gradients: Mapping[str, Params], coefficients: Mapping[str, jax
     return jax.tree.map(total, *gradients.values())
 
 
+def loss_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names in the order of arrays over the losses."""
+    return tuple(sorted(names))
+
+
+def to_vector(by_name: Mapping[str, jax.Array]) -> jax.Array:
+    """Stack a number for each loss: [K], float32 or wider."""
+    return jnp.stack([to_float32(jnp.asarray(by_name[name])) for name in loss_order(by_name)])
+
+
+def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
+    """Split a vector [K] into [] numbers by the names of the losses."""
+    return {name: vector[place] for place, name in enumerate(loss_order(names))}
+
+
+def settled(after: WeightingState, before: WeightingState) -> WeightingState:
+    """Cast a state to the dtypes of the one before, as the carry of a scan must be."""
+    return jax.tree.map(lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype), after, before)
+
+
+def all_names(weighting: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of losses that are alike, in the order of arrays over them.
+
+    Args:
+        weighting: Its name, for the message.
+        names: Names of all losses.
+
+    Raises:
+        RequestError: There are none, or a name is there twice.
+    """
+    names = tuple(names)
+    if not names:
+        raise RequestError(f"weighting {weighting} has no loss to weight; give init the names of all losses")
+    _check_unique(names)
+    return loss_order(names)
+
+
+def _check_unique(names: tuple[str, ...]) -> None:
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise RequestError(f"two losses are called {twice[0]!r}; give each a name of its own")
+
+
 def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -> tuple[str, ...]:
     """Return the names without `MAIN`.
 
@@ -209,9 +285,7 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
         RequestError: `MAIN` is missing, a name is there twice, or there are no others.
     """
     names = tuple(names)
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise RequestError(f"two losses are called {twice[0]!r}; give each a name of its own")
+    _check_unique(names)
     if MAIN not in names:
         raise RequestError(f"no loss is called {MAIN!r}, only {', '.join(names) or 'none at all'}; name the main one so")
     if needed and len(names) == 1:
@@ -226,9 +300,10 @@ def checked(weighting: Weighting) -> Weighting:
         RequestError: It adds nothing, or something negative, before it takes logarithms.
     """
     for field in ("eps", "main_eps"):
-        value = getattr(weighting, field)
-        if not (math.isfinite(value) and value > 0.0):
-            raise RequestError(f"{field} of weighting {weighting.name} must be greater than 0, not {value}")
+        values = getattr(weighting, field)
+        for value in values.values() if isinstance(values, Mapping) else [values]:
+            if not (math.isfinite(value) and value > 0.0):
+                raise RequestError(f"{field} of weighting {weighting.name} must be greater than 0, not {value}")
     return weighting
 
 
@@ -242,6 +317,52 @@ def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> We
     """
     filled = {MAIN: jnp.ones(())} | {name: jnp.asarray(weights[name], jnp.ones(()).dtype) for name in names}
     return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **more)
+
+
+def start_alike(label: str, names: Iterable[str], **more: Any) -> WeightingState:
+    """Return the initial state of a weighting to which all losses are alike: equal weights that sum to 1.
+
+    Args:
+        label: Its name, for messages.
+        names: Names of all losses.
+        more: Other fields.
+    """
+    ordered = all_names(label, names)
+    weights = {name: jnp.full((), 1.0 / len(ordered), jnp.ones(()).dtype) for name in ordered}
+    return WeightingState(weights=weights, updates=jnp.zeros((), jnp.int32), **more)
+
+
+def moved(state: WeightingState, weights: Weights, **more: Any) -> tuple[WeightingState, Metrics]:
+    """Return the state after an update, and metrics ``weight/NAME`` of all losses.
+
+    Args:
+        state: The state before.
+        weights: Those of this step, or of the next where the weighting does not decide by this step's gradients.
+        more: Other fields that change.
+    """
+    after = settled(state.replace(weights=weights, updates=state.updates + 1, **more), state)
+    return after, {f"weight/{name}": weight for name, weight in after.weights.items()}
+
+
+def zeros_for(label: str, names: Iterable[str], shared: Params, *leading: int) -> dict[str, Params]:
+    """Return a tree of zeros like the shared parameters for each loss, at least float32.
+
+    Args:
+        label: Name of the weighting, for the message.
+        names: Names of the losses.
+        shared: Arrays or their shapes.
+        leading: Sizes of axes before those of a parameter.
+
+    Raises:
+        RequestError: ``shared`` is not given.
+    """
+    if shared is None:
+        raise RequestError(f"weighting {label} keeps gradients: give init the shared parameters, too")
+
+    def zeros(leaf: Any) -> jax.Array:
+        return jnp.zeros((*leading, *leaf.shape), jnp.promote_types(leaf.dtype, jnp.float32))
+
+    return {name: jax.tree.map(zeros, shared) for name in names}
 
 
 def report(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:

@@ -7,8 +7,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.base import (
     MAIN,
+    Eps,
     Heads,
     Losses,
     Weighting,
@@ -18,8 +20,8 @@ from jaxrl_vis.learner.weighting.base import (
     checked,
     report,
     start,
+    start_alike,
 )
-from jaxrl_vis.types import Metrics, Params
 
 
 def none() -> Weighting:
@@ -33,16 +35,16 @@ def none_log(main_eps: float = 1e-8) -> Weighting:
 
 
 def plain_sum() -> Weighting:
-    """Add up all losses."""
-    return _constant("sum", 1.0)
+    """Add up all losses, of which none need be the main one."""
+    return _constant("sum", 1.0, main=False)
 
 
-def balance(eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
+def balance(eps: Eps = 0.02, main_eps: float = 1e-8) -> Weighting:
     """Add up the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing")."""
     return _constant("balance", 1.0, log=True, eps=eps, main_eps=main_eps)
 
 
-def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: float = 0.02, main_eps: float = 1e-8) -> Weighting:
+def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: Eps = 0.02, main_eps: float = 1e-8) -> Weighting:
     """Use constant weights, chosen by hand.
 
     Args:
@@ -59,7 +61,7 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: flo
     return _constant("fixed", weights, log=log, eps=eps, main_eps=main_eps)
 
 
-def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8, heads: Heads = "always") -> Weighting:
+def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: Heads = "always") -> Weighting:
     """Use an auxiliary loss in the shared parameters, with weight 1, only if its gradient does not oppose the main one's.
 
     Weight 1 where the cosine of the two gradients is at least 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine Similarity"). Only
@@ -90,6 +92,9 @@ def cosine(log: bool = False, eps: float = 0.02, main_eps: float = 1e-8, heads: 
 
 def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool = True, **more: Any) -> Weighting:
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        if not more.get("main", True):
+            ones = start_alike(name, names)
+            return ones.replace(weights={each: jnp.ones_like(share) for each, share in ones.weights.items()})
         others = auxiliary_names(name, names, needed=auxiliary)
         if not isinstance(weights, Mapping):
             return start(others, dict.fromkeys(others, weights))
@@ -102,4 +107,5 @@ def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool =
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         return state.weights, state.replace(updates=state.updates + 1), report(state.weights) if auxiliary else {}
 
-    return checked(Weighting(name, init, update, auxiliary=auxiliary, **more))
+    reads_losses = more.get("log", False)
+    return checked(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **more))

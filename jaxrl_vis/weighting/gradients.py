@@ -3,14 +3,15 @@
 `weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of two ways, which
 agree up to rounding:
 
-    per_loss   one `jax.grad` for each loss: the reference, and the default                    losses, dots, gradients
+    per_loss   one `jax.grad` for each loss: the reference, and the default                    losses, dots, gramian, gradients
     latents    where losses read the shared parameters through latents z alone: each loss is
                differentiated down to z, g_i, and only the main loss and the weighted sum
                farther; <grad L_main, grad L_i> = <J grad L_main, g_i>, where J grad L_main
-               is the tangent of z (`latents`)                                                 losses, dots
+               is the tangent of z (`latents`)                                                 losses, dots, gramian
 
-The `Weighting.needs` that each can serve are on the right. The second passes through the shared parameters as often for ten
-losses as for two, and differentiates no head forwards. What is differentiated forwards must have tangent rules, which
+The `Weighting.needs` that each can serve are on the right. For dots, the second passes through the shared parameters as often
+for ten losses as for two. For a Gramian it passes once back and once forth for each loss, one after the other, so that no [K,
+parameters] Jacobian is kept. It differentiates no head forwards. What is differentiated forwards must have tangent rules, which
 operations of `jax.custom_vjp` lack: ``forwards`` may be a context in which it is traced without those.
 """
 
@@ -22,20 +23,22 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.errors import RequestError, nearest
-from jaxrl_vis.learner.weighting import latents
-from jaxrl_vis.learner.weighting.base import (
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting import latents
+from jaxrl_vis.weighting.base import (
     MAIN,
+    Direction,
     Losses,
     Weighting,
     WeightingState,
     Weights,
     check_names,
     dot,
+    loss_order,
     split_result,
     to_float32,
     weighted_sum,
 )
-from jaxrl_vis.types import Metrics, Params
 
 Way = Literal["per_loss", "latents"]
 LossesFunction = Callable[..., Any]
@@ -51,7 +54,7 @@ class Weighted(NamedTuple):
         state: State of the weighting after this step.
         losses: [] float32 by name.
         metrics: [] float32 by name.
-        weights: Weight of each loss in ``gradient``, [] float32 by name.
+        weights: Weight of each loss in ``gradient``, [] float32 by name; of a `Direction`, those of all other parameters.
         extra: Further result of the losses' function; None without ``has_aux``.
     """
 
@@ -107,7 +110,26 @@ def measure(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params
         return None
     if weighting.needs == "gradients":
         return dict(gradients)
+    if weighting.needs == "gramian":
+        return gramian(gradients)
     return {name: dot(gradients[MAIN], gradient) for name, gradient in gradients.items() if name != MAIN}
+
+
+def gramian(gradients: Mapping[str, Params]) -> jax.Array:
+    """Compute the inner products of all pairs of gradients: [K, K] float32 or wider, in the sorted order of the names.
+
+    Args:
+        gradients: Trees of one structure, by name.
+    """
+
+    def products(*leaves: jax.Array) -> jax.Array:
+        rows = to_float32(jnp.stack(leaves)).reshape(len(leaves), -1)
+        # At the default precision, a matrix unit would round the factors to 10 bits or fewer.
+        return jnp.matmul(rows, rows.T, precision=jax.lax.Precision.HIGHEST)
+
+    names = loss_order(gradients)
+    parts = jax.tree.leaves(jax.tree.map(products, *(gradients[name] for name in names)))
+    return sum(parts, jnp.zeros((len(names), len(names))))
 
 
 def weighted_grad(
@@ -123,16 +145,17 @@ def weighted_grad(
     """Build the function that computes the weighted gradient of a dictionary of losses.
 
     Args:
-        losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN`; with ``has_aux``, followed by any
-            auxiliary output. A gradient is taken for each loss as a whole, heads and shared parameters alike. With ``encode``:
-            (params, latents, *args).
+        losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN` if the weighting has a main loss; with
+            ``has_aux``, followed by any auxiliary output. A gradient is taken for each loss as a whole, heads and shared
+            parameters alike. With ``encode``: (params, latents, *args).
         weighting: From `make_weighting`.
         shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
             may only pick: what it returns must be parts of its argument.
         way: Method of the gradients, see above.
         has_aux: See ``losses_fn``.
         reduce: Applied to losses, gradients and dots before the weighting reads them, where each device has its own part of
-            the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``.
+            the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``. Inside `jax.shard_map` that needs
+            ``check_vma=False``, or gradients by what all devices share would be summed up before.
         forwards: Factory of the context for tracing forward-mode differentiation.
         encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
             through these alone. Way latents needs it; the other takes it, too. Or a dictionary of such functions, where latents
@@ -169,12 +192,14 @@ def weighted_grad(
             state = weighting.hold(params, state)
             compared_losses, compared = reduce(loss_gradients(encoded_losses, state.params, *args, has_aux=has_aux)[:2])
         statistics = measure(weighting, compared_losses, {name: shared(tree) for name, tree in compared.items()})
-        weights, state, metrics = weighting.update(compared_losses, statistics, state)
+        step, state, metrics = weighting.update(compared_losses, statistics, state)
+        weights = step.weights if isinstance(step, Direction) else step
         combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
         if weighting.heads == "always":
             in_heads = weighted_sum(gradients, weighting.coefficients(weighting.head_weights(weights), losses))
-            is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(combined)))
-            combined = jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, combined, in_heads)
+            combined = _replaced(shared, params, combined, in_heads)
+        if isinstance(step, Direction):
+            combined = _replaced(shared, params, _embed(shared, params, step.shared), combined)
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def find_by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
@@ -188,10 +213,16 @@ def weighted_grad(
         statistics = of_main = None
         if weighting.needs == "dots":
             of_main = through.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
+            others = {name: at for name, at in differentiated.at_latents.items() if name != MAIN}
             with forwards():
-                dots = through.dots(reduce(of_main), differentiated.at_latents)
+                dots = through.dots(reduce(of_main), others)
             statistics = reduce(dots)
-        weights, state, metrics = weighting.update(losses, statistics, state)
+        elif weighting.needs == "gramian":
+            with forwards():
+                statistics = reduce(through.gramian(differentiated.at_latents, reduce))
+        step, state, metrics = weighting.update(losses, statistics, state)
+        assert not isinstance(step, Direction)  # only those that need whole gradients give one
+        weights = step
         coefficients = weighting.coefficients(weights, losses)
         rest = coefficients
         if of_main is not None:
@@ -204,6 +235,12 @@ def weighted_grad(
         return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
 
     return find_per_loss if way == "per_loss" else find_by_latents
+
+
+def _replaced(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
+    """Take the shared parameters from one tree like the parameters, and all others from another."""
+    is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(outside)))
+    return jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, inside, outside)
 
 
 def _embed(shared: Selector, params: Params, part: Params) -> Params:

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
-from jaxrl_vis.learner.weighting.base import MAIN, dot, split_result, to_float32, weighted_sum
 from jaxrl_vis.types import Params
+from jaxrl_vis.weighting.base import MAIN, dot, loss_order, split_result, to_float32, weighted_sum
 
 _ALL = "all"  # the group of latents that were not given names
 
@@ -63,16 +63,37 @@ class Through:
         return total
 
     def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
-        """Compute the inner product of each auxiliary loss's gradient and a direction in the shared parameters, [] float32."""
-        along, others = like(direction, self.picked), {name: at for name, at in at_latents.items() if name != MAIN}
-        read = {group for at in others.values() for group in at}
+        """Compute the inner product of each loss's gradient and a direction in the shared parameters, [] float32."""
+        along, read = like(direction, self.picked), {group for at in at_latents.values() for group in at}
         tangents = {
             group: jax.jvp(encode, (self.picked,), (along,))[1] for group, encode in self.functions.items() if group in read
         }
         return {
             name: sum((dot(tangents[group], gradient) for group, gradient in at.items()), jnp.zeros(()))
-            for name, at in others.items()
+            for name, at in at_latents.items()
         }
+
+    def gramian(self, at_latents: AtLatents, reduce: Callable[[Any], Any]) -> jax.Array:
+        """Compute the inner products of all pairs of losses' gradients in the shared parameters.
+
+        With a_i the gradient of loss i at the latents and J their Jacobian, G_ij = <a_i, J J^T a_j>: for each loss one pass
+        back, J^T a_j, and one forth. Only one such gradient is kept at a time.
+
+        Args:
+            at_latents: Of all losses.
+            reduce: Applied to each J^T a_j, as in `gradients.weighted_grad`; the result is left to be reduced.
+
+        Returns:
+            [K, K] float32 or wider, in the sorted order of the names.
+        """
+        names, rows = loss_order(at_latents), []
+        for name in names:
+            dots = self.dots(reduce(self.backward(at_latents, {name: jnp.ones(())})), at_latents)
+            rows.append(jnp.stack([dots[other] for other in names]))
+            # Ties the next loss's passes to the end of this one's, or a compiler may begin all of them at once.
+            at_latents, rows[-1] = jax.lax.optimization_barrier((at_latents, rows[-1]))
+        matrix = jnp.stack(rows)
+        return 0.5 * (matrix + matrix.T)
 
 
 def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], picked: Params, *args: Any) -> Through:
@@ -93,7 +114,7 @@ class Differentiated:
         losses: [] float32 by name.
         of_params: Loss -> place among the parameters' leaves -> gradient.
         at_latents: See `AtLatents`.
-        extra: Further result of the main loss's function.
+        extra: Further result of the losses' function.
     """
 
     losses: dict[str, jax.Array]
@@ -129,7 +150,8 @@ def differentiate(
     leaves, structure = jax.tree.flatten(params)
     program, results = traced
     losses, of_params, at_latents, extra = {}, {}, {}, None
-    for name, (places, groups) in _find_reads(program, split_result(results, has_aux)[0], len(leaves), through).items():
+    reads = _find_reads(program, split_result(results, has_aux)[0], len(leaves), through)
+    for name, (places, groups) in reads.items():
 
         def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
             now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
@@ -142,7 +164,7 @@ def differentiate(
         chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
         losses[name], pullback, beside = jax.vjp(one, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
-        extra = beside if name == MAIN else extra
+        extra = beside if name == MAIN or MAIN not in reads else extra
     return Differentiated(losses, of_params, at_latents, extra)
 
 

@@ -29,8 +29,8 @@ from weighting_problem import (
 )
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.weighting import MAIN, WEIGHTINGS, Weighting, loss_gradients, make_weighting, measure, weighted_grad
-from jaxrl_vis.learner.weighting.base import log_loss, log_slope
+from jaxrl_vis.weighting import MAIN, WEIGHTINGS, Weighting, loss_gradients, make_weighting, measure, weighted_grad
+from jaxrl_vis.weighting.base import log_loss, log_slope
 
 # -- OL-AUX
 
@@ -280,7 +280,7 @@ def test_parts_of_a_batch_on_several_devices_are_one_batch() -> None:
             assert_close(jax.tree.map(lambda leaf, place=place: leaf[place], each), whole)
 
 
-def test_a_batch_spread_over_devices_by_the_compiler(clean_environment: dict[str, str]) -> None:
+def test_a_batch_spread_over_devices_by_the_compiler_or_by_hand(clean_environment: dict[str, str]) -> None:
     code = """
 import jax, numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -294,6 +294,16 @@ state = weighting.init(NAMES, encoder_of(params))
 gradient = jax.jit(weighted_grad(losses_of, weighting, encoder_of))
 assert len(spread["x"].devices()) == 2
 assert_close(gradient(params, state, spread), gradient(params, state, batch))
+
+upgrad = make_weighting("upgrad")
+options = {"shared": encoder_of, "encode": encode}
+of_part = weighted_grad(
+    losses_of_latents, upgrad, way="latents", reduce=lambda tree: jax.lax.pmean(tree, "data"), **options
+)
+specs = (PartitionSpec(), PartitionSpec(), PartitionSpec("data"))
+of_parts = jax.jit(jax.shard_map(of_part, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False))
+whole = jax.jit(weighted_grad(losses_of_latents, upgrad, **options))
+assert_close(of_parts(params, upgrad.init(NAMES), spread), whole(params, upgrad.init(NAMES), batch))
 """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     path = os.pathsep.join((str(Path(__file__).parents[1]), clean_environment["PYTHONPATH"]))
@@ -339,7 +349,7 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("fixed", weights={"nera": 1.0}).init(NAMES), ["'nera'", "did you mean near"]),
         (lambda: make_weighting("fixed", weights={"near": 1.0}).init(NAMES), ["no weight for loss 'far'"]),
         (lambda: make_weighting("ol_aux").init((MAIN,)), ["no auxiliary loss", "none_log"]),
-        (lambda: make_weighting("sum").init(("near", "far")), ["no loss is called 'main'"]),
+        (lambda: make_weighting("balance").init(("near", "far")), ["no loss is called 'main'"]),
         (lambda: make_weighting("sum").init((MAIN, "near", "near")), ["two losses are called 'near'"]),
         (lambda: weighted_grad(losses_of, make_weighting("sum"), way="per_los"), ["'per_los'", "did you mean per_loss"]),
         (lambda: weighted_grad(losses_of, make_weighting("sum"), way="latents"), ["give encode"]),
@@ -376,6 +386,7 @@ def test_losses_of_another_form_get_one_line(way: Any) -> None:
         assert wrong in str(caught.value)
 
 
-def test_every_weighting_is_tried_here() -> None:
-    assert {case.split()[0] for case in OPTIONS} == set(WEIGHTINGS)
+def test_every_weighting_with_a_main_loss_is_tried_here() -> None:
+    """`test_weighting_contract` tries all."""
+    assert {case.split()[0] for case in OPTIONS} == {name for name in WEIGHTINGS if make_weighting(name).main} | {"sum"}
     assert make_weighting("none").init((MAIN,)).weights == {MAIN: 1}

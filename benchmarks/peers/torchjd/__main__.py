@@ -1,0 +1,86 @@
+"""Compares our weightings with TorchJD's: results (equality) or time (cost).
+
+    python -m benchmarks.peers.torchjd equality --python PYTHON [--jacobians 1000]
+    python -m benchmarks.peers.torchjd cost --python PYTHON [--losses 2 4 8 16] [--width 576] [--batch-size 256] [--repeats 20]
+
+PYTHON is that of an environment with torchjd[full] (see the package). Records: weighting_parity.json,
+weighting_cost-DEVICE.json. The exit status of equality is 1 if a method differs by more than it may.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxrl_vis.host import provenance
+from jaxrl_vis.host.files import write_atomically
+
+RESULTS = Path(__file__).resolve().parents[2] / "results"
+PARITY = "weighting_parity.json"
+
+
+def run_peer(python: Path, script: str, *arguments: str) -> None:
+    """Run a script of this folder in the peer's environment; its output passes through.
+
+    Raises:
+        subprocess.CalledProcessError: It failed.
+    """
+    subprocess.run([str(python), str(Path(__file__).with_name(script)), *arguments], check=True)
+
+
+def equality(python: Path, jacobians: int, results: Path) -> int:
+    """Compare the results of all methods, and write the record."""
+    import json
+
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from benchmarks.peers.torchjd import equality, ours
+    from benchmarks.peers.torchjd.jacobians import COUNTS, draw
+
+    arrays = draw(jacobians // len(COUNTS))
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder) / "jacobians.npz", Path(folder) / "results.npz"
+        np.savez(given, **arrays)  # pyright: ignore[reportArgumentType]
+        mine = ours.results(arrays)
+        run_peer(python, "peer.py", str(given), str(found))
+        theirs = dict(np.load(found))
+    peer_versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
+    rows = equality.compare(arrays, mine, theirs)
+    for row in rows:
+        print("  ".join(f"{name} {value:.2g}" if isinstance(value, float) else str(value) for name, value in row.items()))
+    record = {"versions": {**provenance.versions(), **peer_versions}, "jacobians": jacobians, "losses": COUNTS, "rows": rows}
+    write_atomically(results / PARITY, json.dumps(record, indent=1) + "\n")
+    wrong = equality.failures(rows)
+    print(f"beyond what is allowed: {', '.join(wrong)}" if wrong else "all within what is allowed")
+    return int(bool(wrong))
+
+
+def main() -> int:
+    """Read the command line and do what it asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    actions = parser.add_subparsers(dest="action", required=True)
+    commands = {name: actions.add_parser(name) for name in ("equality", "cost")}
+    for command in commands.values():
+        command.add_argument("--results", type=Path, default=RESULTS, help="folder of records")
+        command.add_argument("--python", type=Path, help="interpreter with TorchJD", required=command is commands["equality"])
+    commands["equality"].add_argument("--jacobians", type=int, default=1000)
+    cost_options = commands["cost"]
+    cost_options.add_argument("--losses", type=int, nargs="+", default=[2, 4, 8, 16], help="numbers of losses")
+    cost_options.add_argument("--width", type=int, default=576, help="of the trunk's three layers: 576 for 1 M parameters")
+    cost_options.add_argument("--batch-size", type=int, default=256)
+    cost_options.add_argument("--repeats", type=int, default=20)
+    options = parser.parse_args()
+    if options.action == "equality":
+        return equality(options.python, options.jacobians, options.results)
+    from benchmarks.peers.torchjd import cost
+
+    size = cost.Size(tuple(options.losses), options.width, options.batch_size, options.repeats)
+    return cost.measure_all(size, options.python, options.results)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""Time of our weightings for several numbers of losses on a trunk, alone and with the backward passes, beside TorchJD's.
+
+The trunk has three layers of tanh, 1 M parameters at the default width; each loss is the mean squared error of a linear head on
+it. Parameters and batch are float32. What is timed is one compiled function:
+
+    alone    from gradients of all losses, or their Gramian, to weights or a direction
+    step     from a batch to the gradient of all parameters: forward and backward passes, weighting, weighted sum
+"""
+
+import dataclasses
+import json
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import jaxrl_vis.weighting as jw
+from jaxrl_vis.bench.record import results_path
+from jaxrl_vis.host import provenance
+from jaxrl_vis.host.files import write_atomically
+
+TARGETS = 16
+"""Numbers that each head predicts."""
+PASSES = 10
+"""Calls of the function in one timing."""
+METHODS = tuple(name for name in jw.WEIGHTINGS if name not in ("none", "none_log", "fixed", "ol_aux_ablation"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """Sizes of the problem.
+
+    Attributes:
+        losses: Numbers of losses.
+        width: Of the trunk's layers and of the input.
+        batch_size: Examples.
+        repeats: Timings of each function, of which the median counts.
+    """
+
+    losses: tuple[int, ...]
+    width: int
+    batch_size: int
+    repeats: int
+
+
+def names_of(count: int) -> tuple[str, ...]:
+    """Names of K losses, the main one among them."""
+    return (jw.MAIN, *(f"other_{place}" for place in range(count - 1)))
+
+
+def problem(size: Size, count: int) -> tuple[dict[str, Any], dict[str, jax.Array]]:
+    """Return parameters, and a batch."""
+    keys = jax.random.split(jax.random.key(0), 3 + 2 * count)
+    width = size.width
+    layers = [jax.random.normal(key, (width, width)) / width**0.5 for key in keys[:3]]
+    names = names_of(count)
+    heads = {name: jax.random.normal(key, (width, TARGETS)) / width**0.5 for name, key in zip(names, keys[3:], strict=False)}
+    batch = {
+        name: jax.random.normal(key, (size.batch_size, TARGETS)) for name, key in zip(names, keys[3 + count :], strict=True)
+    }
+    inputs = jax.random.normal(keys[0], (size.batch_size, width))
+    return {"trunk": layers, "heads": heads}, {"inputs": inputs, **batch}
+
+
+def encode(trunk: list[jax.Array], batch: dict[str, jax.Array]) -> jax.Array:
+    """Features [B, width]."""
+    hidden = batch["inputs"]
+    for layer in trunk:
+        hidden = jnp.tanh(hidden @ layer)
+    return hidden
+
+
+def losses_of(params: Any, features: jax.Array, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Mean squared error of each head."""
+    return {name: jnp.mean(jnp.square(features @ head - batch[name])) for name, head in params["heads"].items()}
+
+
+def time_call(function: Callable[..., Any], arguments: tuple[Any, ...], repeats: int) -> float:
+    """Median seconds of a call."""
+    call = jax.jit(function)
+    jax.block_until_ready(call(*arguments))
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        result = None
+        for _ in range(PASSES):
+            result = call(*arguments)
+        jax.block_until_ready(result)
+        seconds.append((time.perf_counter() - started) / PASSES)
+    return statistics.median(seconds)
+
+
+def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
+    """Time one weighting for K losses: a row for itself alone, and one for a step by each way that it allows."""
+    weighting, (params, batch) = jw.make_weighting(name), problem(size, count)
+    state = weighting.init(names_of(count), params["trunk"])
+    losses = {each: jnp.float32(1.0) for each in names_of(count)}
+    gradients = {
+        each: [jax.random.normal(jax.random.key(place), layer.shape) for layer in params["trunk"]]
+        for place, each in enumerate(names_of(count))
+    }
+    statistics_of = jax.jit(lambda gradients: jw.measure(weighting, losses, gradients))(gradients)
+    base = {"method": name, "losses": count}
+    rows = [base | {"what": "alone", "seconds": time_call(weighting.update, (losses, statistics_of, state), size.repeats)}]
+    for way in ("per_loss", "latents") if weighting.needs != "gradients" else ("per_loss",):
+        gradient = jw.weighted_grad(losses_of, weighting, lambda params: params["trunk"], way, encode=encode)
+
+        def step(params: Any, state: Any, batch: Any, gradient: Any = gradient) -> Any:
+            result = gradient(params, state, batch)
+            return result.gradient, result.state, result.weights
+
+        rows.append(base | {"what": f"step, {way}", "seconds": time_call(step, (params, state, batch), size.repeats)})
+    return rows
+
+
+def measure_all(size: Size, python: Path | None, results: Path) -> int:
+    """Time all methods on both sides, print a table and write the record."""
+    from benchmarks.peers.torchjd.__main__ import run_peer
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = Path(folder) / "cost.json"
+        theirs: dict[str, Any] = {"rows": [], "versions": {}}
+        if python is not None:
+            settings = {**dataclasses.asdict(size), "targets": TARGETS, "passes": PASSES}
+            run_peer(python, "peer_cost.py", json.dumps(settings), str(found))
+            theirs = json.loads(found.read_text())
+    rows = []
+    for count in size.losses:
+        for name in METHODS:
+            rows += time_method(name, size, count)
+            print(
+                *(f"{row['method']:16}{row['losses']:4} {row['what']:16}{1e6 * row['seconds']:10.0f} us" for row in rows[-3:]),
+                sep="\n",
+            )
+    for row in theirs["rows"]:
+        print(f"TorchJD {row['method']:16}{row['losses']:4} {row['what']:16}{1e6 * row['seconds']:10.0f} us")
+    record = {"device": provenance.device_name(), "versions": {**provenance.versions(), **theirs["versions"]}}
+    record |= {"size": dataclasses.asdict(size), "ours": rows, "torchjd": theirs["rows"]}
+    write_atomically(results_path("weighting_cost", results), json.dumps(record, indent=1) + "\n")
+    return 0

@@ -1,0 +1,130 @@
+"""Differences between the results of both sides, and how well each solves the problem that a method's paper states."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.peers.torchjd.ours import CAGRAD_RADIUS, FAIR_ALPHA, SOLVED
+
+TOLERANCE = 1e-5
+"""Of closed forms and of random methods with given numbers."""
+_TINY = 1e-12
+_ROUNDING = 1e-6
+"""Length of a step, over that of the longest gradient, below which it counts as 0."""
+
+
+def relative(one: np.ndarray, other: np.ndarray, least: np.ndarray | float = _TINY) -> np.ndarray:
+    """Distance between rows over the length of the second's, which is ``least`` or more: steps that cancel out are rounding."""
+    axes = tuple(range(1, one.ndim))
+    length = np.sqrt((other**2).sum(axis=axes))
+    return np.sqrt(((one - other) ** 2).sum(axis=axes)) / np.maximum(length, least)
+
+
+def gap(jacobian: np.ndarray, weights: np.ndarray) -> float:
+    """Gap of MGDA's duality, over the greatest squared length: 0 at the shortest vector."""
+    step = weights @ jacobian
+    return float((step @ step - (jacobian @ step).min()) / _longest(jacobian) ** 2)
+
+
+def cagrad_loss(jacobian: np.ndarray, weights: np.ndarray) -> float:
+    """By how much the worst slope falls short of the bound by the dual, over that of the mean gradient's square.
+
+    The bound is that at the weights inside the hull; with weights of 0, for a stationary point, that at the hull's vector 0.
+    """
+    mean = jacobian.mean(axis=0)
+    radius, step = CAGRAD_RADIUS * np.linalg.norm(mean), weights @ jacobian
+    inside = weights - 1 / len(weights)
+    total = inside.sum()
+    if np.abs(weights).max() == 0.0 or abs(total) < _TINY:
+        return 0.0
+    hull = inside / total @ jacobian
+    outside = max(0.0, np.linalg.norm(step - mean) / radius - 1.0)
+    bound = hull @ mean + radius * np.linalg.norm(hull)
+    return float((bound - (jacobian @ step).min()) / (mean @ mean) + outside)
+
+
+def cone_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
+    """Greatest slope that is opposed, over the lengths of gradient and step."""
+    step = weights @ jacobian
+    lengths = np.linalg.norm(jacobian, axis=1) * max(np.linalg.norm(step), _ROUNDING * _longest(jacobian))
+    return float(max(0.0, -(jacobian @ step / lengths).min()))
+
+
+def dual_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
+    """Greatest violation of the conditions of DualProj's projection: opposed slopes, and complementary slackness."""
+    step, mean = weights @ jacobian, jacobian.mean(axis=0)
+    slack = abs((weights - 1 / len(weights)) @ (jacobian @ step)) / max(mean @ mean, (_ROUNDING * _longest(jacobian)) ** 2)
+    return max(cone_residual(jacobian, weights), float(slack))
+
+
+def fair_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
+    """Greatest relative error of G w = w^(-1 / alpha)."""
+    return float(np.abs(jacobian @ (weights @ jacobian) * weights ** (1 / FAIR_ALPHA) - 1.0).max())
+
+
+def nash_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
+    """Greatest relative error of G w = c / w, for the best c: TorchJD scales the Gramian."""
+    products = jacobian @ (weights @ jacobian) * weights
+    return float(np.abs(products / products.mean() - 1.0).max())
+
+
+def _longest(jacobian: np.ndarray) -> float:
+    return float(np.linalg.norm(jacobian, axis=1).max())
+
+
+RESIDUALS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
+    "mgda": gap,
+    "cagrad": cagrad_loss,
+    "fairgrad": fair_residual,
+    "upgrad": cone_residual,
+    "dualproj": dual_residual,
+    "nash_mtl": nash_residual,
+}
+_FULL_RANK = ("fairgrad", "nash_mtl")  # where gradients depend on each other, there may be no solution
+
+
+def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Compare all methods; one row for each.
+
+    Returns:
+        Rows of method, kind (closed form or solver), count of cases, the greatest and median relative difference of directions
+        (of weights, where only losses are read), and of solvers the greatest and median residual of both sides.
+    """
+    counts = sorted({int(name.split("/")[0]) for name in arrays})
+    rows = []
+    for method in dict.fromkeys(name.split("/")[1] for name in ours):
+        differences, residuals = [], {"ours": [], "theirs": []}
+        for count in counts:
+            jacobians, ranks = arrays[f"{count}/jacobians"], arrays[f"{count}/ranks"]
+            one, other = ours[f"{count}/{method}"], theirs[f"{count}/{method}"]
+            if method in SOLVED:
+                chosen = ranks == count if method in _FULL_RANK else np.ones(len(ranks), bool)
+                jacobians, one, other = jacobians[chosen], one[chosen], other[chosen]
+                for side, weights in (("ours", one), ("theirs", other)):
+                    residuals[side] += [RESIDUALS[method](*pair) for pair in zip(jacobians, weights, strict=True)]
+                one, other = (np.einsum("nk,nkp->np", weights, jacobians) for weights in (one, other))
+                if method == "nash_mtl":
+                    one, other = (step / np.linalg.norm(step, axis=1, keepdims=True) for step in (one, other))
+                # Steps that nearly vanish are compared with the gradients.
+                scale = np.linalg.norm(jacobians, axis=2).max(axis=1) if method != "nash_mtl" else 1.0
+                length = np.maximum(np.linalg.norm(other, axis=1), 1e-2 * scale)
+                differences += list(np.linalg.norm(one - other, axis=1) / length)
+            elif one.shape[1:] == jacobians.shape[2:]:
+                differences += list(relative(one, other, _ROUNDING * np.linalg.norm(jacobians, axis=2).max(axis=1)))
+            else:
+                differences += list(relative(one, other))
+        row = {"method": method, "kind": "solver" if method in SOLVED else "closed form", "cases": len(differences)}
+        row |= {"difference_max": max(differences), "difference_median": float(np.median(differences))}
+        for side, values in residuals.items():
+            if values:
+                row |= {f"residual_max_{side}": max(values), f"residual_median_{side}": float(np.median(values))}
+        rows.append({name: float(value) if isinstance(value, np.floating) else value for name, value in row.items()})
+    return rows
+
+
+def failures(rows: list[dict[str, Any]]) -> list[str]:
+    """List the rows that break what is asked: closed forms within `TOLERANCE`, residuals no greater than TorchJD's."""
+    wrong = [row["method"] for row in rows if row["kind"] == "closed form" and not row["difference_max"] <= TOLERANCE]
+    solved = [row for row in rows if row["kind"] == "solver"]
+    return wrong + [row["method"] for row in solved if not row["residual_max_ours"] <= max(row["residual_max_theirs"], 1e-9)]

@@ -1,0 +1,172 @@
+"""Weightings that give a direction in the shared parameters in place of weights, and need whole gradients.
+
+They keep or mask gradients, so that their step is no weighted sum of the current ones. All losses are alike to them. Memory and
+time grow with K times the shared parameters; all other parameters follow the plain sum, or that of logarithms
+(`Direction.weights`).
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting import solvers
+from jaxrl_vis.weighting.base import (
+    Direction,
+    Eps,
+    Losses,
+    Weighting,
+    WeightingState,
+    all_names,
+    by_name,
+    checked,
+    dot,
+    moved,
+    scaled,
+    start_alike,
+    to_float32,
+    to_vector,
+    weighted_sum,
+    zeros_for,
+)
+from jaxrl_vis.weighting.gradients import gramian
+
+Result = tuple[Direction, WeightingState, Metrics]
+
+
+def graddrop(leak: float = 0.0, seed: int = 0) -> Weighting:
+    """Keep, in each parameter, the gradients of one sign (GradDrop; Chen et al., 2020, "Just Pick a Sign", algorithm 1).
+
+    The positive ones with probability P = (1 + sum_i g_i / sum_i |g_i|) / 2, otherwise the negative ones. The paper masks
+    gradients of a layer's activations, with f = identity; this, like others, those of the parameters. Noise that vanishes where
+    losses agree.
+
+    Args:
+        leak: Share of each gradient that is kept whatever its sign.
+        seed: Of the key that the state begins with; replace ``state.key`` where several states should draw apart.
+
+    Raises:
+        RequestError: ``leak`` is not between 0 and 1.
+    """
+    _check_share("graddrop", "leak", leak)
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        state = start_alike("graddrop", names, key=jax.random.key(seed))
+        return state.replace(weights={name: jnp.ones_like(weight) for name, weight in state.weights.items()})
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        key = jax.random.fold_in(state.key, state.updates)
+        model = next(iter(statistics.values()))
+        leaves, structure = jax.tree.flatten(model)
+        keys = jax.tree.unflatten(structure, list(jax.random.split(key, len(leaves))))
+        drawn = jax.tree.map(lambda key, leaf: jax.random.uniform(key, leaf.shape, leaf.dtype), keys, model)
+        step = Direction(graddrop_direction(statistics, drawn, leak), state.weights)
+        return step, *moved(state, state.weights)
+
+    return Weighting("graddrop", init, update, needs="gradients", heads="always", main=False, reads_losses=False)
+
+
+def graddrop_direction(gradients: Mapping[str, Params], drawn: Params, leak: float = 0.0) -> Params:
+    """Compute the direction of `graddrop`: a tree like each gradient.
+
+    Args:
+        gradients: Trees of one structure, by name.
+        drawn: A tree like each of them, of uniform numbers between 0 and 1.
+        leak: As of `graddrop`.
+    """
+
+    def masked(drawn: jax.Array, *leaves: jax.Array) -> jax.Array:
+        rows = to_float32(jnp.stack(leaves))
+        total = jnp.sum(jnp.abs(rows), axis=0)
+        purity = 0.5 * (1.0 + jnp.where(total > 0.0, jnp.sum(rows, axis=0) / jnp.where(total > 0.0, total, 1.0), 0.0))
+        kept = jnp.where(purity > drawn, rows > 0.0, rows < 0.0)
+        return jnp.sum((leak + (1.0 - leak) * kept) * rows, axis=0)
+
+    return jax.tree.map(masked, drawn, *gradients.values())
+
+
+def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: float = 1e-8) -> Weighting:
+    """Balance losses by logarithms, and their averaged gradients by length (DB-MTL; Lin et al., 2023, "Dual-Balancing").
+
+    Each gradient of log(L_i + eps) is averaged over steps, m_i <- g_i + (beta / t^sigma) (m_i - g_i), at first 0; the direction
+    is the sum of all m_i, brought to the length of the longest. For losses of any units. Where one is close to its minimum, its
+    noise is brought to that length, too.
+
+    Args:
+        beta: Share of the past in the averages.
+        sigma: Decay of that share.
+        eps, main_eps: See `Weighting`.
+
+    Raises:
+        RequestError: ``beta`` is not between 0 and 1.
+    """
+    _check_share("db_mtl", "beta", beta)
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        names = all_names("db_mtl", names)
+        return start_alike("db_mtl", names, memory=zeros_for("db_mtl", names, shared))
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        slopes = weighting.slopes(losses)
+        past = beta / (state.updates + 1.0) ** sigma
+        averages = {
+            name: jax.tree.map(lambda new, old: new + past * (old - new), scaled(statistics[name], slope), state.memory[name])
+            for name, slope in slopes.items()
+        }
+        lengths = {name: jnp.sqrt(dot(average, average)) for name, average in averages.items()}
+        longest = jnp.max(to_vector(lengths))
+        weights = {
+            name: jnp.where(length > 0.0, longest / jnp.where(length > 0.0, length, 1.0), 0.0)
+            for name, length in lengths.items()
+        }
+        return Direction(weighted_sum(averages, weights), weights), *moved(state, weights, memory=averages)
+
+    weighting = checked(
+        Weighting("db_mtl", init, update, needs="gradients", log=True, eps=eps, main_eps=main_eps, heads="always", main=False)
+    )
+    return weighting
+
+
+def moco(beta: float = 0.5, gamma: float = 0.1, sigma: float = 0.5, rho: float = 0.0) -> Weighting:
+    """Descend towards the hull's shortest vector, of tracked gradients (MoCo; Fernando et al., 2023, algorithm 1).
+
+    Tracks y_i <- y_i - beta_t (y_i - g_i), at first 0, then moves weights l <- P(l - gamma_t (Y^T Y + rho I) l), P the
+    projection onto the simplex, at first 1 / K; the direction is Y l. MGDA for noisy gradients: its weights are those of a
+    minibatch, with a bias that does not vanish, and these are not.
+
+    Args:
+        beta: Step size of y, at first; it falls with t^-sigma.
+        gamma: Step size of l, at first; it falls likewise.
+        sigma: Of both.
+        rho: Pull of l towards equal weights.
+
+    Raises:
+        RequestError: ``beta`` is not between 0 and 1.
+    """
+    _check_share("moco", "beta", beta)
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        names = all_names("moco", names)
+        return start_alike("moco", names, memory=zeros_for("moco", names, shared))
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        decay = (state.updates + 1.0) ** -sigma
+        tracked = {
+            name: jax.tree.map(lambda old, new: old - beta * decay * (old - new), state.memory[name], statistics[name])
+            for name in state.memory
+        }
+        before = to_vector(state.weights)
+        slope = jnp.dot(gramian(tracked), before, precision=jax.lax.Precision.HIGHEST) + rho * before
+        weights = by_name(state.weights, solvers.to_simplex(before - gamma * decay * slope))
+        return Direction(weighted_sum(tracked, weights), weights), *moved(state, weights, memory=tracked)
+
+    return Weighting("moco", init, update, needs="gradients", heads="always", main=False, reads_losses=False)
+
+
+def _check_share(label: str, name: str, value: float) -> None:
+    """Raise a RequestError if a number is not between 0 and 1."""
+    if not 0.0 <= value <= 1.0:
+        raise RequestError(f"{name} of weighting {label} must be between 0 and 1, not {value}")

@@ -1,0 +1,265 @@
+"""Weightings that read the losses' values alone, and cost no more than the plain sum. All losses are alike to them.
+
+`uniform` and `random` do not even read these. `geometric_mean` and `stch` follow from the values of one step; `uncertainty`,
+`imtl_l`, `dwa` and `famo` learn, and use the weights from before this step's losses.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.types import Metrics, Params
+from jaxrl_vis.weighting.base import (
+    Direction,
+    Losses,
+    Weighting,
+    WeightingState,
+    Weights,
+    by_name,
+    moved,
+    start_alike,
+    to_vector,
+)
+
+_LARGEST = 1e6  # bound of ratios and slopes, so that no sum of squares is infinite
+Result = tuple[Weights | Direction, WeightingState, Metrics]
+
+
+def uniform() -> Weighting:
+    """Average all losses: weights 1 / K.
+
+    Needs nothing and costs nothing. The baseline, beside `sum`: with tuned learning rates, few methods beat it (Kurin et al.,
+    2022; Xin et al., 2022).
+    """
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        return state.weights, *moved(state, state.weights)
+
+    return Weighting("uniform", _begin("uniform"), update, main=False, reads_losses=False)
+
+
+def random(seed: int = 0) -> Weighting:
+    """Draw weights anew at every step (RLW; Lin et al., 2022, "Reasonable Effectiveness of Random Weighting", algorithm 2).
+
+    Weights are the softmax of K normal numbers, and so sum to 1. Needs nothing. A litmus test: a method that does no better
+    than this one has learned nothing about the losses.
+
+    Args:
+        seed: Of the key that the state begins with; replace ``state.key`` where several states should draw apart.
+    """
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        return start_alike("random", names, key=jax.random.key(seed))
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        drawn = jax.random.normal(jax.random.fold_in(state.key, state.updates), (len(losses),))
+        weights = by_name(losses, random_weights(drawn))
+        return weights, *moved(state, weights)
+
+    return Weighting("random", init, update, main=False, reads_losses=False)
+
+
+def random_weights(drawn: jax.Array) -> jax.Array:
+    """Compute the weights of `random` from K normal numbers: [K]."""
+    return jax.nn.softmax(drawn)
+
+
+def uncertainty(learning_rate: float = 1e-2) -> Weighting:
+    """Weigh losses by learned variances (UW; Kendall et al., 2018, section 3.2, with s = log sigma^2).
+
+    The objective is the sum of exp(-s_i) L_i / 2 + s_i / 2; weights are exp(-s_i) / 2, and s_i, at first 0, follows the
+    objective's gradient by Adam. At the optimum exp(s_i) = L_i, so that scaled losses are equal. For losses whose scales
+    differ, where no gradients can be spared.
+
+    Args:
+        learning_rate: Of Adam for s. The paper leaves s to the model's own optimiser.
+    """
+    return _learned("uncertainty", learning_rate, lambda s, losses: (1.0 - jnp.exp(-s) * losses) / 2, lambda s: jnp.exp(-s) / 2)
+
+
+def imtl_l(learning_rate: float = 1e-2) -> Weighting:
+    """Weigh losses by learned scales (IMTL-L; Liu et al., 2021, "Towards Impartial Multi-task Learning").
+
+    The objective is the sum of exp(s_i) L_i - s_i; weights are exp(s_i), and s_i, at first 0, follows the objective's gradient
+    by Adam. At the optimum all scaled losses are 1: twice the weights of `uncertainty`.
+
+    Args:
+        learning_rate: Of Adam for s. The paper leaves s to the model's own optimiser.
+    """
+    return _learned("imtl_l", learning_rate, lambda s, losses: jnp.exp(s) * losses - 1.0, jnp.exp)
+
+
+def geometric_mean(eps: float = 1e-8) -> Weighting:
+    """Minimise the geometric mean of the losses (GLS; Chennupati et al., 2019, "MultiNet++").
+
+    Weights are the derivatives of (prod_i L_i)^(1/K): that mean over K L_i. Scaling a loss scales all gradients alike, so that
+    units do not matter. For positive losses; those below 0 count as 0. A loss near 0 takes over: `balance`, the sum of the
+    logarithms, has the same minima and less of that.
+
+    Args:
+        eps: Added to the losses.
+    """
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        values = jnp.maximum(to_vector(losses), 0.0) + eps
+        mean = jnp.exp(jnp.mean(jnp.log(values)))
+        weights = by_name(losses, mean / (len(losses) * values))
+        return weights, *moved(state, weights)
+
+    return Weighting("geometric_mean", _begin("geometric_mean"), update, main=False)
+
+
+def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weighting:
+    """Minimise a smooth maximum of the losses (STCH; Lin et al., 2024, "Smooth Tchebycheff Scalarization").
+
+    The objective is mu log sum_i exp((L_i - z_i) / (K mu)); weights are its derivatives, which sum to 1 / K. For losses in one
+    unit of which the worst counts, such as errors of groups. The smaller mu, the closer to the maximum.
+
+    Args:
+        mu: Width of the smoothing, in units of L / K.
+        reference: z by name, bounds that the losses do not fall below (the ideal point); None, or where one is missing: 0.
+
+    Raises:
+        RequestError: mu is not positive.
+    """
+    _check_positive("stch", "mu", mu)
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        count = len(losses)
+        values = to_vector({name: loss - (reference or {}).get(name, 0.0) for name, loss in losses.items()})
+        # Less the greatest first: with a fused multiply and add, 1e15 / mu less itself may be -3e7.
+        weights = by_name(losses, jax.nn.softmax((values - jnp.max(values)) / (count * mu)) / count)
+        return weights, *moved(state, weights)
+
+    return Weighting("stch", _begin("stch"), update, main=False)
+
+
+def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
+    """Weigh losses by how slowly they fall (dynamic weight average; Liu et al., 2019, "End-to-End Multi-Task Learning with
+    Attention", eq. 7).
+
+    Weights are K times the softmax of r_i / T, with r_i the mean loss of the last epoch over that of the one before; 1 in the
+    first two epochs. For epochs of many minibatches: ratios of single ones are noise.
+
+    Args:
+        temperature: T; the greater, the more equal the weights.
+        epoch: Updates in an epoch.
+
+    Raises:
+        RequestError: An argument is not positive.
+    """
+    _check_positive("dwa", "temperature", temperature)
+    _check_positive("dwa", "epoch", epoch)
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        state = start_alike("dwa", names)
+        weights = {name: jnp.ones_like(weight) for name, weight in state.weights.items()}
+        zeros = jnp.zeros(len(weights), weights[next(iter(weights))].dtype)
+        return state.replace(weights=weights, memory={"sum": zeros, "last": jnp.zeros_like(zeros)})
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        total, last = state.memory["sum"] + to_vector(losses), state.memory["last"]
+        is_last = (state.updates + 1) % epoch == 0
+        mean = total / epoch
+        rate = jnp.where(last == 0.0, 1.0, mean / jnp.where(last == 0.0, 1.0, last))
+        later = jax.nn.softmax(jnp.clip(rate, -_LARGEST, _LARGEST) / temperature) * len(losses)
+        later = jnp.where(state.updates < epoch, 1.0, later)  # one epoch has no ratio
+        before = to_vector(state.weights)
+        memory = {"sum": jnp.where(is_last, 0.0, total), "last": jnp.where(is_last, mean, last)}
+        after, _ = moved(state, by_name(losses, jnp.where(is_last, later, before)), memory=memory)
+        return state.weights, after, {f"weight/{name}": weight for name, weight in state.weights.items()}
+
+    return Weighting("dwa", init, update, main=False)
+
+
+def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0.0, eps: float = 1e-8) -> Weighting:
+    """Let all losses fall at one rate (FAMO; Liu et al., 2023, "Fast Adaptive Multitask Optimization", algorithm 2).
+
+    With z the softmax of learned numbers w, weights are c z_i / L_i, c = 1 / sum_i z_i / L_i. w follows by Adam the gradient of
+    sum_i z_i log(L_i before / L_i after), so that losses that fall less gain. Needs one more reading of the losses per step,
+    for which those of the next update serve: on the same data as the paper's if this one and the next see the same, otherwise
+    with the noise of a minibatch more. Costs no gradients, while it aims at what MGDA of logarithms does.
+
+    Args:
+        learning_rate: Of Adam for w.
+        decay: Weight decay of w, added to its gradient (gamma).
+        reference: A bound that no loss falls below, the same for all.
+        eps: Added to the losses above it.
+
+    Raises:
+        RequestError: An argument is negative, or eps not positive.
+    """
+    _check_positive("famo", "eps", eps)
+    rule = optax.chain(optax.add_decayed_weights(decay), optax.adam(learning_rate))
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        state = start_alike("famo", names)
+        logits = jnp.zeros(len(state.weights), state.weights[next(iter(state.weights))].dtype)
+        return state.replace(memory={"logits": logits, "rule": rule.init(logits), "logs": jnp.zeros_like(logits)})
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        above = jnp.maximum(to_vector(losses) - reference, 0.0) + eps
+        memory = state.memory
+        _, pullback = jax.vjp(jax.nn.softmax, memory["logits"])
+        (gradient,) = pullback((memory["logs"] - jnp.log(above)).astype(memory["logits"].dtype))
+        changes, rule_state = rule.update(gradient, memory["rule"], memory["logits"])
+        learned = {"logits": optax.apply_updates(memory["logits"], changes), "rule": rule_state}
+        kept = {name: memory[name] for name in learned}
+        # The first losses have none before them.
+        now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, kept)
+        shares = jax.nn.softmax(now["logits"]) / above
+        weights = by_name(losses, shares / jnp.sum(shares))
+        return weights, *moved(state, weights, memory={**now, "logs": jnp.log(above)})
+
+    return Weighting("famo", init, update, main=False)
+
+
+def _begin(label: str) -> Callable[..., WeightingState]:
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        return start_alike(label, names)
+
+    return init
+
+
+def _learned(
+    label: str,
+    learning_rate: float,
+    slope: Callable[[jax.Array, jax.Array], jax.Array],
+    to_weights: Callable[[jax.Array], jax.Array],
+) -> Weighting:
+    """Build a weighting by numbers s [K] that follow an objective of theirs.
+
+    Args:
+        label: Name of the weighting.
+        learning_rate: Of Adam.
+        slope: (s, losses [K]) -> the objective's derivative by s.
+        to_weights: s -> weights.
+    """
+    _check_positive(label, "learning_rate", learning_rate)
+    rule = optax.adam(learning_rate)
+
+    def init(names: Iterable[str], shared: Params = None) -> WeightingState:
+        state = start_alike(label, names)
+        scales = jnp.zeros(len(state.weights), state.weights[next(iter(state.weights))].dtype)
+        weights = by_name(state.weights, to_weights(scales))
+        return state.replace(weights=weights, memory={"scales": scales, "rule": rule.init(scales)})
+
+    def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
+        scales = state.memory["scales"]
+        gradient = jnp.clip(slope(scales, to_vector(losses)), -_LARGEST, _LARGEST).astype(scales.dtype)
+        changes, rule_state = rule.update(gradient, state.memory["rule"])
+        scales: Any = optax.apply_updates(scales, changes)
+        after, _ = moved(state, by_name(losses, to_weights(scales)), memory={"scales": scales, "rule": rule_state})
+        return state.weights, after, {f"weight/{name}": weight for name, weight in state.weights.items()}
+
+    return Weighting(label, init, update, main=False)
+
+
+def _check_positive(label: str, name: str, value: float) -> None:
+    """Raise a RequestError if a number is not greater than 0."""
+    if not value > 0.0:
+        raise RequestError(f"{name} of weighting {label} must be greater than 0, not {value}")

@@ -1,0 +1,281 @@
+"""Small optimisation problems over the losses, K <= 32, from their Gramian: each a bounded loop of K x K linear systems.
+
+    nonnegative      quadratic programme with x >= 0, by block principal pivoting; the two below are cases of it
+    min_norm         weights of the shortest vector in the convex hull of the gradients
+    dual_cone        weights of a combination's projection onto the cone of directions that oppose no gradient
+    conflict_averse  weights of the hull's vector that CAGrad adds to the mean
+    bargain          positive solution of G a = p a^(-1/s)
+    to_simplex       projection onto the simplex
+
+All of them first scale the gradients to unit length (`unit_gramian`), so that a loss of small gradients is as exact as one of
+large ones. Gradients may depend on each other linearly. Everything can be mapped.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+_PIVOTS = 100  # more than any Gramian of 32 losses has been seen to need, by a factor of 4
+_PATIENCE = 3  # block exchanges without progress before single ones, which always end (Kim and Park, 2011)
+_ROOT_STEPS = 60
+_NEWTON_STEPS = 60
+_HALVINGS = 16
+
+
+def unit_gramian(gramian: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Scale gradients to unit length.
+
+    Args:
+        gramian: [K, K] float.
+
+    Returns:
+        [K, K] Gramian of the scaled gradients; [K] lengths of the gradients, in units of the greatest, and at
+        least the precision of a number. Both are those of any length where all gradients vanish.
+    """
+    eps = jnp.finfo(gramian.dtype).eps
+    lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
+    greatest = jnp.max(lengths)
+    greatest = jnp.where(greatest > 0.0, greatest, 1.0)
+    relative = jnp.maximum(lengths / greatest, eps)
+    # One factor at a time: the product of two small lengths may be too small for a number.
+    return gramian / greatest / greatest / relative[:, None] / relative[None, :], relative
+
+
+class _Pivots(NamedTuple):
+    free: jax.Array  # [K] bool, components that need not be 0
+    solution: jax.Array  # [K], may be negative until the end
+    wrong: jax.Array  # [K] bool, components on the wrong side
+    fewest: jax.Array  # [] int32, of them so far
+    patience: jax.Array  # [] int32
+    steps: jax.Array  # [] int32
+
+
+def nonnegative(
+    matrix: jax.Array, target: jax.Array, free: jax.Array | None = None, passes: int = 3
+) -> tuple[jax.Array, jax.Array]:
+    """Minimise x^T M x / 2 - b^T x over x >= 0, by block principal pivoting (Kim and Park, 2011, algorithm 3).
+
+    M may be singular: each pass minimises that plus r |x - x'|^2 / 2, where x' is the pass before's and at first 0, and r is
+    eps^(2/3) of the greatest M_ii, 2e-5 in float32 and 4e-11 in float64 (the proximal point method).
+
+    Args:
+        matrix: [K, K] float, M, positive semidefinite.
+        target: [K] float, b, in its range.
+        free: [K] bool, components that begin as positive; None for none.
+        passes: Of the proximal point method.
+
+    Returns:
+        [K] float, x; [K] bool, its components that are not held at 0.
+    """
+    ridge = jnp.finfo(matrix.dtype).eps ** (2 / 3) * jnp.max(jnp.diagonal(matrix))
+    raised = matrix + ridge * jnp.eye(len(matrix), dtype=matrix.dtype)
+    free = jnp.zeros(len(target), bool) if free is None else free
+    x = jnp.zeros_like(target)
+    for _ in range(passes):
+        x, free = _pivot(raised, target + ridge * x, free)
+    return x, free
+
+
+def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Minimise as `nonnegative`, for a positive definite matrix."""
+    count, eps = len(target), jnp.finfo(matrix.dtype).eps
+
+    def solve(free: jax.Array) -> tuple[jax.Array, jax.Array]:
+        both = free[:, None] & free[None, :]
+        system = jnp.where(both, matrix, jnp.eye(count, dtype=matrix.dtype))
+        x = jnp.where(free, jnp.linalg.solve(system, jnp.where(free, target, 0.0)), 0.0)
+        slack = jnp.dot(matrix, x, precision=jax.lax.Precision.HIGHEST) - target
+        rounding = 10.0 * eps * (jnp.dot(jnp.abs(matrix), jnp.abs(x)) + jnp.abs(target))
+        return x, jnp.where(free, x < -10.0 * eps * jnp.max(jnp.abs(x)), slack < -rounding)
+
+    def step(now: _Pivots) -> _Pivots:
+        number = jnp.sum(now.wrong, dtype=jnp.int32)
+        progress = number < now.fewest
+        last = jnp.arange(count) == jnp.max(jnp.where(now.wrong, jnp.arange(count), -1))
+        exchanged = jnp.where(progress | (now.patience > 0), now.wrong, last)
+        patience = jnp.where(progress, _PATIENCE, jnp.maximum(now.patience - 1, 0))
+        free = now.free ^ exchanged
+        return _Pivots(free, *solve(free), jnp.minimum(number, now.fewest), patience, now.steps + 1)
+
+    first = _Pivots(free, *solve(free), jnp.int32(count + 1), jnp.int32(_PATIENCE), jnp.int32(0))
+    last = jax.lax.while_loop(lambda now: jnp.any(now.wrong) & (now.steps < _PIVOTS), step, first)
+    return jnp.maximum(last.solution, 0.0), last.free
+
+
+def min_norm(gramian: jax.Array, free: jax.Array | None = None, passes: int = 3) -> tuple[jax.Array, jax.Array]:
+    """Compute the weights w >= 0, of sum 1, that minimise w^T G w.
+
+    On the ray through w, min over t of t^2 w^T G w + (t - 1)^2 is q / (1 + q), with q = w^T G w: so that x = t w minimises
+    x^T G x + (sum x - 1)^2 over x >= 0.
+
+    Args:
+        gramian: [K, K] float, positive semidefinite.
+        free, passes: As of `nonnegative`.
+
+    Returns:
+        [K] float, w; [K] bool, as of `nonnegative`.
+    """
+    unit, lengths = unit_gramian(gramian)
+    per_length = jnp.min(lengths) / lengths
+    x, free = nonnegative(unit + per_length[:, None] * per_length[None, :], per_length, free, passes)
+    weights = per_length * x
+    return weights / jnp.sum(weights), free
+
+
+def dual_cone(gramian: jax.Array, preferences: jax.Array) -> jax.Array:
+    """Compute the weights v of the projection of J^T u onto the dual cone, {d: J d >= 0}.
+
+    By Proposition 1 of Quinton and Rey (2024), v minimises v^T G v subject to v >= u.
+
+    Args:
+        gramian: [K, K] float, G = J J^T.
+        preferences: [K] float, u.
+
+    Returns:
+        [K] float, v.
+    """
+    unit, lengths = unit_gramian(gramian)
+    scaled = preferences * lengths
+    added, _ = nonnegative(unit, -jnp.dot(unit, scaled, precision=jax.lax.Precision.HIGHEST))
+    return preferences + added / lengths
+
+
+class _Bracket(NamedTuple):
+    low: jax.Array  # [] where the length of the hull's vector exceeds it
+    high: jax.Array  # [] where it does not
+    at_low: jax.Array  # [] by how much, halved where this end was kept twice
+    at_high: jax.Array
+    kept: jax.Array  # [] int32, -1 low end kept last, 1 high end
+    free: jax.Array  # [K] bool
+    error: jax.Array  # [] of the latest
+    steps: jax.Array
+
+
+def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.Array]:
+    """Minimise <g_w, g_0> + c |g_0| |g_w| over w in the simplex (CAGrad; Liu et al., 2021), g_0 the mean gradient.
+
+    |g_w| is the minimum over t > 0 of (|g_w|^2 / t + t) / 2, and for a given t the problem is that of the shortest vector in
+    the hull of g_i + (t / (c |g_0|)) g_0. What remains is the root of |g_w(t)| - t, which decreases: by regula falsi, with the
+    Illinois rule.
+
+    Args:
+        gramian: [K, K] float.
+        radius: c > 0.
+
+    Returns:
+        [K] float, w; [] float, |g_w|, both for gradients scaled so that the greatest has length 1.
+    """
+    eps = jnp.finfo(gramian.dtype).eps
+    greatest = jnp.max(jnp.diagonal(gramian))
+    scaled = gramian / jnp.where(greatest > 0.0, greatest, 1.0)
+    to_mean = jnp.mean(scaled, axis=1)
+    squared = jnp.maximum(jnp.mean(to_mean), 0.0)
+    ball = jnp.maximum(radius * jnp.sqrt(squared), eps)
+
+    def evaluate(t: jax.Array, free: jax.Array, passes: int = 1) -> tuple[jax.Array, jax.Array, jax.Array]:
+        share = t / ball
+        shifted = scaled + share * (to_mean[:, None] + to_mean[None, :]) + share**2 * squared
+        weights, free = min_norm(shifted, free, passes)
+        return weights, jnp.sqrt(jnp.maximum(quadratic(scaled, weights), 0.0)), free
+
+    def step(now: _Bracket) -> _Bracket:
+        t = (now.low * now.at_high - now.high * now.at_low) / (now.at_high - now.at_low)
+        t = jnp.where((t > now.low) & (t < now.high), t, 0.5 * (now.low + now.high))
+        _, length, free = evaluate(t, now.free)
+        above = length > t
+        error = length - t
+        at_low = jnp.where(above, error, jnp.where(now.kept == -1, 0.5 * now.at_low, now.at_low))
+        at_high = jnp.where(above, jnp.where(now.kept == 1, 0.5 * now.at_high, now.at_high), error)
+        low, high = jnp.where(above, t, now.low), jnp.where(above, now.high, t)
+        return _Bracket(low, high, at_low, at_high, jnp.where(above, 1, -1).astype(jnp.int32), free, error, now.steps + 1)
+
+    def is_open(now: _Bracket) -> jax.Array:
+        wide = now.high - now.low > 4.0 * eps * now.high
+        return wide & (jnp.abs(now.error) > 4.0 * eps * now.high) & (now.steps < _ROOT_STEPS)
+
+    zero, one = jnp.zeros((), scaled.dtype), jnp.ones((), scaled.dtype)
+    _, at_zero, free = evaluate(zero, jnp.zeros(len(gramian), bool))
+    _, at_one, free = evaluate(one, free)
+    first = _Bracket(zero, one, at_zero, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
+    last = jax.lax.while_loop(is_open, step, first)
+    # The last error is that of the end that moved last.
+    weights, length, _ = evaluate(jnp.where(last.kept == 1, last.low, last.high), last.free, passes=3)
+    return weights, length
+
+
+class _Newton(NamedTuple):
+    x: jax.Array  # [K], positive
+    residual: jax.Array  # [], relative
+    steps: jax.Array
+
+
+def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -> jax.Array:
+    """Solve G a = p a^(-1/s) for a > 0, by Newton's method on a convex function.
+
+    a minimises a^T G a / 2 - sum_i p_i phi(a_i), phi' = a^(-1/s): phi is the logarithm for s = 1.
+
+    Args:
+        gramian: [K, K] float.
+        preferences: [K] float, p > 0.
+        exponent: s > 0.
+
+    Returns:
+        [K] float, a.
+    """
+    eps, power = jnp.finfo(gramian.dtype).eps, 1.0 / exponent
+    unit, relative = unit_gramian(gramian)
+    unit = unit + len(unit) * eps * jnp.eye(len(unit), dtype=unit.dtype)  # no solution is infinite
+    greatest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(gramian)), 0.0))
+    lengths = relative * jnp.where(greatest > 0.0, greatest, 1.0)
+    # With a = x s / lengths, this is unit x = shares x^(-power), of which the greatest share is 1.
+    wanted = preferences * lengths ** (power - 1.0)
+    scale = jnp.max(wanted) ** (1.0 / (1.0 + power))
+    shares = wanted / jnp.max(wanted)
+
+    def objective(x: jax.Array) -> jax.Array:
+        utility = jnp.log(x) if power == 1.0 else x ** (1.0 - power) / (1.0 - power)
+        return 0.5 * quadratic(unit, x) - jnp.sum(shares * utility)
+
+    def step(now: _Newton) -> _Newton:
+        pull = shares * now.x**-power
+        slope = jnp.dot(unit, now.x, precision=jax.lax.Precision.HIGHEST) - pull
+        hessian = unit + jnp.diag(power * pull / now.x)
+        change = -jnp.linalg.solve(hessian, slope)
+        decrement = -jnp.dot(slope, change)
+        # Up to 0.99 of the way to the nearest x_i = 0.
+        farthest = jnp.minimum(1.0, 0.99 / jnp.maximum(jnp.max(-change / now.x), eps))
+        lengths = farthest * 0.5 ** jnp.arange(_HALVINGS, dtype=now.x.dtype)
+        values = jax.vmap(lambda length: objective(now.x + length * change))(lengths)
+        # Close to the minimum, its value no longer tells steps apart, and whole ones converge quadratically.
+        length = jnp.where(decrement < 1e-2, farthest, lengths[jnp.argmin(values)])
+        x = now.x + length * change
+        pull = shares * x**-power
+        slope = jnp.dot(unit, x, precision=jax.lax.Precision.HIGHEST) - pull
+        return _Newton(x, jnp.max(jnp.abs(slope) / pull), now.steps + 1)
+
+    first = _Newton(shares ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
+    last = jax.lax.while_loop(lambda now: (now.residual > 20.0 * eps) & (now.steps < _NEWTON_STEPS), step, first)
+    return last.x * scale / lengths
+
+
+def to_simplex(vector: jax.Array) -> jax.Array:
+    """Project a vector [K] onto the simplex, {w >= 0, sum w = 1}."""
+    ordered = jnp.sort(vector)[::-1]
+    excess = (jnp.cumsum(ordered) - 1.0) / jnp.arange(1, len(vector) + 1)
+    last = jnp.max(jnp.where(ordered > excess, jnp.arange(len(vector)), 0))
+    return jnp.maximum(vector - excess[last], 0.0)
+
+
+def quadratic(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """Compute x^T M x at full precision: []."""
+    precision: Any = jax.lax.Precision.HIGHEST
+    return jnp.dot(vector, jnp.dot(matrix, vector, precision=precision), precision=precision)
+
+
+def pseudo_inverse(gramian: jax.Array) -> jax.Array:
+    """Compute the pseudo-inverse of a Gramian, [K, K]; eigenvalues up to K eps of the greatest count as 0."""
+    values, vectors = jnp.linalg.eigh(gramian)
+    cut = len(gramian) * jnp.finfo(gramian.dtype).eps * jnp.max(jnp.abs(values))
+    inverse = jnp.where(values > cut, 1.0 / jnp.where(values > cut, values, 1.0), 0.0)
+    return jnp.matmul(vectors * inverse, vectors.T, precision=jax.lax.Precision.HIGHEST)

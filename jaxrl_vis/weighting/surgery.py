@@ -1,0 +1,109 @@
+"""Weightings that change each gradient by the others, one after another in a random order. All losses are alike to them.
+
+Each changed gradient is a combination of the original ones, so that the Gramian [K, K] is enough.
+"""
+
+from typing import Unpack
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.weighting.base import Weighting, WeightingState
+from jaxrl_vis.weighting.gramian_based import Options, of_gramian
+
+
+def pcgrad(seed: int = 0, **options: Unpack[Options]) -> Weighting:
+    """Remove from each gradient what opposes another (PCGrad; Yu et al., 2020, "Gradient Surgery", algorithm 1).
+
+    Where <g_i, g_j> < 0, g_i is projected onto the normal plane of g_j; the changed gradients are summed. With two losses the
+    sum opposes neither; with more it may. Cheap and common.
+
+    Args:
+        seed: Of the key that the state begins with, for the orders; replace ``state.key`` where several states should draw
+            apart.
+        options: See `Options`.
+    """
+
+    def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, None]:
+        return pcgrad_weights(gramian, _orders(state, len(gramian))), None
+
+    return of_gramian("pcgrad", solve, seed=seed, **options)
+
+
+def pcgrad_weights(gramian: jax.Array, orders: jax.Array) -> jax.Array:
+    """Compute the weights of `pcgrad`, [K].
+
+    Args:
+        gramian: [K, K] float.
+        orders: [K, K] int, in row i the losses in the order in which g_i meets them; itself is passed over.
+    """
+    rows, squares = jnp.arange(len(gramian)), jnp.diagonal(gramian)
+    changed = jnp.eye(len(gramian), dtype=gramian.dtype)  # row i: the combination of gradients that g_i has become
+    for place in range(len(gramian)):
+        others = orders[:, place]
+        dots = jnp.sum(gramian[others] * changed, axis=1)
+        opposes = (dots < 0.0) & (others != rows) & (squares[others] > 0.0)
+        removed = jnp.where(opposes, dots / jnp.where(opposes, squares[others], 1.0), 0.0)
+        changed = changed.at[rows, others].add(-removed)
+    return jnp.sum(changed, axis=0)
+
+
+def gradvac(beta: float = 0.01, seed: int = 0, **options: Unpack[Options]) -> Weighting:
+    """Turn each gradient towards the others, up to their usual cosine (GradVac; Wang et al., 2021, "Gradient Vaccine").
+
+    Where the cosine of g_i and g_j is less than its running mean, at first 0, g_i gains as much of g_j as makes it equal; the
+    changed gradients are summed. `pcgrad` is the same with a mean that stays at 0. For losses whose gradients usually agree,
+    such as those of many languages.
+
+    Args:
+        beta: Share of the latest cosine in the mean.
+        seed: As of `pcgrad`.
+        options: See `Options`.
+
+    Raises:
+        RequestError: ``beta`` is not between 0 and 1.
+    """
+    if not 0.0 <= beta <= 1.0:
+        raise RequestError(f"beta of weighting gradvac must be between 0 and 1, not {beta}")
+
+    def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, jax.Array]:
+        return gradvac_weights(gramian, state.memory, _orders(state, len(gramian)), beta)
+
+    return of_gramian("gradvac", solve, memory=lambda count, dtype: jnp.zeros((count, count), dtype), seed=seed, **options)
+
+
+def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, beta: float) -> tuple[jax.Array, jax.Array]:
+    """Compute the weights of `gradvac`, [K], and the new means of cosines, [K, K].
+
+    Args:
+        gramian: [K, K] float.
+        usual: [K, K] float, means of the cosines of changed gradients (rows) and original ones.
+        orders: As of `pcgrad_weights`.
+        beta: As of `gradvac`.
+    """
+    rows, lengths = jnp.arange(len(gramian)), jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
+    changed = jnp.eye(len(gramian), dtype=gramian.dtype)
+    for place in range(len(gramian)):
+        others = orders[:, place]
+        dots = jnp.matmul(changed, gramian, precision=jax.lax.Precision.HIGHEST)
+        length = jnp.sqrt(jnp.maximum(jnp.sum(dots * changed, axis=1), 0.0))
+        other = lengths[others]
+        # A gradient that has been turned to nothing is rounding, and has no direction.
+        is_some = length > 4.0 * jnp.finfo(gramian.dtype).eps ** 0.5 * lengths
+        is_pair = (others != rows) & is_some & (other > 0.0)
+        safe = jnp.where(is_pair, other, 1.0)
+        cosine = jnp.clip(jnp.where(is_pair, dots[rows, others] / (jnp.where(is_pair, length, 1.0) * safe), 0.0), -1.0, 1.0)
+        wanted = usual[rows, others]
+        sine, wanted_sine = jnp.sqrt(1.0 - cosine**2), jnp.sqrt(1.0 - jnp.minimum(wanted**2, 1.0))
+        gains = is_pair & (cosine < wanted) & (wanted_sine > 0.0)
+        gain = length * (wanted * sine - cosine * wanted_sine) / (safe * jnp.where(gains, wanted_sine, 1.0))
+        changed = changed.at[rows, others].add(jnp.where(gains, gain, 0.0))
+        usual = usual.at[rows, others].add(jnp.where(others != rows, beta * (cosine - wanted), 0.0))
+    return jnp.sum(changed, axis=0), usual
+
+
+def _orders(state: WeightingState, count: int) -> jax.Array:
+    """Draw an order of the losses for each loss: [K, K] int."""
+    keys = jax.random.split(jax.random.fold_in(state.key, state.updates), count)
+    return jax.vmap(lambda key: jax.random.permutation(key, count))(keys)
