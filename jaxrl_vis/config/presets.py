@@ -160,7 +160,16 @@ def preset(name: str, **overrides: Any) -> Config:
     env = str(overrides.get("env", config.environment.env))
     method = str(overrides.get("method", config.reward.method))
     values = TASKS.get((name, env.removeprefix("Visual")), TaskValues())
-    return config.replace(**{**values.choose(env.startswith("Visual"), method), **overrides})
+    config = config.replace(**values.choose(env.startswith("Visual"), method))
+    algorithm = str(overrides.get("algorithm", config.run.algorithm))
+    return config.replace(**{**_of_algorithm(config, algorithm), **overrides})
+
+
+def _of_algorithm(config: Config, algorithm: str) -> dict[str, Any]:
+    """Return the values that an algorithm has otherwise than DDPG."""
+    if algorithm == "td3":  # the actor and the targets wait
+        return {name: max(2, config.value(name)) for name in ("actor_interval", "target_update_interval")}
+    return {}
 
 
 def general_values(name: str, task: str) -> dict[str, Any]:

@@ -27,10 +27,11 @@ from jaxrl_vis.learner.ddpg import adam, diagnostics
 from jaxrl_vis.learner.ddpg.latent_reward import LatentReward, make_latent_reward
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
+from jaxrl_vis.learner.networks.policy import PolicyParams, make_policy
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.learner.weighting import MAIN, Weighted, WeightingState
-from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
+from jaxrl_vis.types import Batch, Metrics, Params, Replaceable, Statistics
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
 _HEADS = 0x686473
@@ -63,19 +64,6 @@ class Agent(Replaceable):
     autoencoder: Any = None
 
 
-class ActorParams(NamedTuple):
-    """Parameters of the policy.
-
-    Attributes:
-        actor: With an encoder, of its own or the critic's.
-        observations, goals: Statistics that these are normalised with.
-    """
-
-    actor: Params
-    observations: NormalizerState
-    goals: NormalizerState
-
-
 class Working(NamedTuple):
     """Agent between two gradient steps of one iteration.
 
@@ -100,11 +88,13 @@ class Prepared(NamedTuple):
         batch: With rewards.
         inputs: Its observations as the encoders read them.
         image: [B, C, H, W] its observations before the action, normalised, where an auxiliary task asks for them; else None.
+        noise: [B, A] float32, added to the next actions in the critic's targets; None: nothing.
     """
 
     batch: Batch
     inputs: Inputs
     image: jax.Array | None = None
+    noise: jax.Array | None = None
 
 
 class Gradients(NamedTuple):
@@ -268,7 +258,7 @@ def make_ddpg(
         return Prepared(batch, networks.prepare_batch(working.scaling, batch), image)
 
     def gradients(working: Working, prepared: Prepared, with_actor: bool = True) -> tuple[Gradients, Metrics]:
-        agent, (batch, inputs, image) = working.agent, prepared
+        agent, (batch, inputs, image, noise) = working.agent, prepared
         now = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
         if latent_reward is not None:
@@ -277,7 +267,7 @@ def make_ddpg(
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
         state = auxiliary.start(now.critic) if agent.weighting is None else agent.weighting
-        weighted = learning.critic_gradient(now, inputs, image, batch)(now.critic, state)
+        weighted = learning.critic_gradient(now, inputs, image, batch, noise)(now.critic, state)
         latents, value, keep = weighted.extra
         counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
@@ -321,8 +311,14 @@ def make_ddpg(
     )
 
 
-def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Agent, Metrics]]:
-    """Build `Algorithm.update` from gradient steps."""
+DrawNoise = Callable[[jax.Array, int], jax.Array]
+"""(key, U) -> `Prepared.noise` of U gradient steps, [U, B, A]."""
+
+
+def make_update(
+    config: Config, steps: GradientSteps, draw_noise: DrawNoise | None = None
+) -> Callable[..., tuple[Agent, Metrics]]:
+    """Build `Algorithm.update` from gradient steps; ``draw_noise`` None: no noise in targets."""
     interval = config.ddpg.actor_interval
 
     def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
@@ -345,15 +341,17 @@ def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Age
             metrics = jnp.stack([_mean([row[name] for row in rows if name in row]) for name in names])
             return (working, prepared), metrics
 
-        def read(working: Working, choice: Any) -> Prepared:
-            return steps.prepare(working, batches.read(choice))
+        def read(working: Working, row: tuple[Any, jax.Array | None]) -> Prepared:
+            choice, noise = row
+            return steps.prepare(working, batches.read(choice))._replace(noise=noise)
 
+        # Drawn for all gradient steps at once, as the choices are: one by one it would be kernels in each.
+        count = jax.tree.leaves(batches.choices)[0].shape[0]
+        rows = (batches.choices, None if draw_noise is None else draw_noise(key, count))
         working = steps.begin(agent, statistics)
-        prepared = read(working, jax.tree.map(lambda leaf: leaf[0], batches.choices))
+        prepared = read(working, jax.tree.map(lambda leaf: leaf[0], rows))
         # The last prefetch wraps around to the first batch and is discarded.
-        following = jax.tree.map(
-            lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), batches.choices
-        )
+        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), rows)
         (working, _), metrics = jax.lax.scan(take, (working, prepared), following)
         return steps.end(working), dict(zip(names, jnp.mean(metrics, axis=0), strict=True))
 
@@ -366,21 +364,25 @@ def _mean(values: list[jax.Array]) -> jax.Array:
 
 def make(setup: Setup) -> Algorithm:
     """Build DDPG."""
+    return build(setup)
+
+
+def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = None) -> Algorithm:
+    """Build an algorithm of DDPG's family.
+
+    Args:
+        setup: Configuration and sizes.
+        critic_heads: Heads of the critic, which learn the same target, the least of theirs (`Networks.critic_heads`).
+        draw_noise: Noise on the actions in targets; None: none.
+    """
     config, resolved = setup.config, setup.resolved
-    networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias)
+    networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias, critic_heads)
     steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards)
+    policy = make_policy(networks)
 
-    def policy_params(agent: Agent, statistics: Statistics) -> ActorParams:
-        return ActorParams(networks.with_encoder(agent.actor, agent.critic), statistics.observations, statistics.goals)
-
-    def encode(policy: ActorParams, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
-        return networks.encode(policy.actor, networks.prepare(networks.scaling(statistics), observations))
-
-    def aim(policy: ActorParams, goals: jax.Array) -> jax.Array:
-        return encode(policy, policy.goals, goals)
-
-    def act(policy: ActorParams, observations: jax.Array, aim: jax.Array) -> jax.Array:
-        return networks.act(policy.actor, jnp.stack([encode(policy, policy.observations, observations), aim]))
+    def policy_params(agent: Agent, statistics: Statistics) -> PolicyParams:
+        return policy.params(networks.with_encoder(agent.actor, agent.critic), statistics)
 
     diagnose = functools.partial(_value_at_goals, networks)
-    return Algorithm(steps.init, act, make_update(config, steps), policy_params, aim, diagnose, networks)
+    update = make_update(config, steps, draw_noise)
+    return Algorithm(steps.init, policy.act, update, policy_params, policy.aim, diagnose, networks)

@@ -34,6 +34,9 @@ _glorot = nn.initializers.glorot_uniform()
 # Inputs at most this wide are multiplied element by element: a GPU's matrix units would pad them.
 _NARROW = 16
 
+# Folded into a critic's key for heads after the first. Large, because small numbers give the keys of `jax.random.split`.
+_FURTHER_HEADS = 0x686473
+
 
 class _Encoder(nn.Module):
     """Encoder: [B, blocks, 4^levels * C] -> [B, latent]; results of several arrays are concatenated."""
@@ -175,13 +178,16 @@ class Networks:
             four networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
         act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
-        value: (critic, latents [2, B, latent], action [B, A]) -> [B] float32.
+        values: (critic, latents [2, B, latent], action [B, A]) -> [K, B] float32, of each head.
+        value: The same of the first head: [B] float32.
+        critic_heads: K, heads of the critic on one encoder. With several, their parameters have a leading axis [K].
     """
 
     config: Config
     observation_spec: jax.ShapeDtypeStruct
     action_size: int
     critic_output_bias: float
+    critic_heads: int = 1
 
     def __post_init__(self) -> None:
         """Check the image size, and the maximum shift against it.
@@ -263,7 +269,13 @@ class Networks:
 
     def init_critic(self, key: jax.Array) -> Params:
         """Initialise the critic."""
-        return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
+        head, width = self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size
+        critic = self._init(key, head, width)
+        if self.critic_heads == 1:
+            return critic
+        keys = jax.random.split(jax.random.fold_in(key, _FURTHER_HEADS), self.critic_heads - 1)
+        others = [head.init(own, jnp.zeros((1, width)))["params"] for own in keys]
+        return {**critic, "head": jax.tree.map(lambda *leaves: jnp.stack(leaves), critic["head"], *others)}
 
     def init_target(self, online: Params) -> Params:
         """Copy online parameters for a target network: the head alone if targets have no encoders."""
@@ -362,6 +374,16 @@ class Networks:
         """Compute actions [B, A] float32 in (-1, 1) from latents [2, B, latent] of observations and goals."""
         return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
+    def values(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
+        """Compute the values [K, B] float32 that each head has of actions [B, A]; latents [2, B, latent] as for `act`."""
+        if self.critic_heads == 1:
+            return self._value(critic["head"], latents, action)[None]
+        return jax.vmap(self._value, (0, None, None))(critic["head"], latents, action)
+
     def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        """Compute values [B] float32 of actions [B, A] from latents [2, B, latent] of observations and goals."""
-        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, latents, action)[..., 0]
+        """Compute the values [B] float32 that the first head has of actions [B, A]."""
+        head = critic["head"]
+        return self._value(head if self.critic_heads == 1 else jax.tree.map(lambda leaf: leaf[0], head), latents, action)
+
+    def _value(self, head: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
+        return self._head(1, self.critic_output_bias).apply({"params": head}, latents, action)[..., 0]
