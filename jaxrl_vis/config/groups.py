@@ -55,6 +55,17 @@ class OfWeighting:
     names: tuple[str, ...] = ()
 
 
+@dataclasses.dataclass(frozen=True)
+class OfAlgorithm:
+    """Property of a field that only some of the built-in algorithms read.
+
+    Attributes:
+        names: These algorithms.
+    """
+
+    names: tuple[str, ...]
+
+
 OL_AUX = OfWeighting(("ol_aux", "ol_aux_ablation"))
 
 
@@ -131,6 +142,8 @@ class GoalOptions:
     """p2: fraction of those whose goal is the next observation, a certain positive. None: 0.5 for balancing methods, else 0."""
     filter_threshold: float | None = None
     """q0: negatives with Q above it are dropped as false. None: the middle of its valid range, for filtering methods."""
+    future_goals: Literal["even", "geometric"] = "even"
+    """Distribution of relabelled goals over the rest of the episode: even, or falling with gamma^k for k further steps."""
     trivial_goals: Annotated[Share, NEEDS_STATES] = 1.0
     """Fraction kept of relabelled goals that are already reached before the action; the rest are replaced by observations from
     other episodes."""
@@ -177,6 +190,17 @@ class DDPGOptions:
     """Exploration: fraction of actions drawn uniformly."""
     action_noise: NotNegative = 0.2
     """Exploration: standard deviation of the Gaussian noise added to the other actions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ContrastiveOptions:
+    """Contrastive RL (docs/algorithms.md)."""
+
+    contrastive_form: Annotated[Literal["nce", "stable"], OfAlgorithm(("contrastive",))] = "stable"
+    """Form of the critic and its loss. nce: binary cross-entropy (Eysenbach et al., 2022). stable: symmetric InfoNCE with a
+    penalty on log-sum-exp, layer normalisation, and outputs near 0 at first."""
+    representation_size: Annotated[Count, OfAlgorithm(("contrastive",))] = 64
+    """Size of the representations whose inner product is the critic."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,6 +297,7 @@ class Config:
     goals: GoalOptions = GoalOptions()
     reward: RewardOptions = RewardOptions()
     ddpg: DDPGOptions = DDPGOptions()
+    contrastive: ContrastiveOptions = ContrastiveOptions()
     auxiliary: AuxiliaryOptions = AuxiliaryOptions()
     network: NetworkOptions = NetworkOptions()
     study: StudyOptions = StudyOptions()
@@ -313,6 +338,12 @@ def marked(mark: Mark) -> tuple[str, ...]:
 def of_weightings() -> dict[str, tuple[str, ...]]:
     """Return the fields that are read only by weightings, with the names of these; no names for any weighting."""
     marks = {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, OfWeighting)}
+    return {name: mark.names for name, mark in marks.items()}
+
+
+def of_algorithms() -> dict[str, tuple[str, ...]]:
+    """Return the fields that only some of the built-in algorithms read, with the names of these."""
+    marks = {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, OfAlgorithm)}
     return {name: mark.names for name, mark in marks.items()}
 
 

@@ -55,4 +55,6 @@ METHODS: dict[str, Method] = {
 MethodName = Annotated[str, Names(tuple(METHODS))]
 WeightingName = Annotated[str, Names(("none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation"))]
 AuxTaskName = Annotated[str, Names(("forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"))]
-AlgorithmName = Annotated[str, Names(("ddpg", "td3"))]
+ALGORITHMS = ("ddpg", "td3", "contrastive")
+"""Names of the built-in algorithms."""
+AlgorithmName = Annotated[str, Names(ALGORITHMS)]

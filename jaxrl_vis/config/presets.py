@@ -169,6 +169,8 @@ def _of_algorithm(config: Config, algorithm: str) -> dict[str, Any]:
     """Return the values that an algorithm has otherwise than DDPG."""
     if algorithm == "td3":  # the actor and the targets wait
         return {name: max(2, config.value(name)) for name in ("actor_interval", "target_update_interval")}
+    if algorithm == "contrastive":  # goals are future states, and the truth about them is not read
+        return {"future_goals": "geometric", "relabel_probability": 1.0, "balance_probability": 0.0, "trivial_goals": 1.0}
     return {}
 
 

@@ -14,9 +14,10 @@ from jaxrl_vis.config.groups import (
     Config,
     data_devices,
     marked,
+    of_algorithms,
     of_weightings,
 )
-from jaxrl_vis.config.methods import METHODS
+from jaxrl_vis.config.methods import ALGORITHMS, METHODS
 from jaxrl_vis.errors import RequestError
 
 _LARGEST_SEED = 2**32 - 1  # a random key uses 32 bits of it: larger seeds would repeat smaller ones
@@ -44,6 +45,11 @@ def validate(config: Config) -> Config:
         raise RequestError(
             f"n_step {study.n_step} with method {config.reward.method}: the filter's valid range assumes one step"
         )
+    for name, algorithms in of_algorithms().items():
+        if _is_changed(config, name) and run.algorithm in ALGORITHMS and run.algorithm not in algorithms:
+            raise RequestError(
+                f"{name} is an option of --algorithm {' and '.join(algorithms)}, and this is {run.algorithm}: leave it out"
+            )
     _validate_reward(config)
     _validate_auxiliary(config)
     environment = config.environment

@@ -111,7 +111,8 @@ class Sampler:
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
         """Choose goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
         shares = self.config.goals.relabel_probability, self.resolved.balance_probability
-        return choose_goal_slots(key, time, self.replay.horizon, *shares)
+        discount = self.resolved.discount if self.config.goals.future_goals == "geometric" else None
+        return choose_goal_slots(key, time, self.replay.horizon, *shares, discount)
 
     def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
         """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
