@@ -65,7 +65,7 @@ class TaskValues:
 
     Attributes:
         always: Values for every method.
-        images: Values for image observations, unless the method compares images in the latent space of an autoencoder.
+        images: Values for image observations, unless a model that is trained along compares them.
         oracle: Values for rewards from the true state: other methods cannot read it, and have a balance of their own.
         images_and_oracle: Values for images with rewards from the true state.
     """
@@ -87,8 +87,9 @@ class TaskValues:
             shows_images: True if observations are images.
             method_name: Method, built-in or ``module:Name``.
         """
-        reward = METHODS[method_name].reward if method_name in METHODS else None
-        oracle, images = reward == "oracle", shows_images and reward != "autoencoder"
+        method = METHODS.get(method_name)
+        oracle = method is not None and method.reward == "oracle"
+        images = shows_images and (method is None or not method.is_learned)
         return {
             **self.always,
             **(self.images if images else {}),

@@ -24,7 +24,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.learner.algorithm import Algorithm, Batches, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import adam, diagnostics
-from jaxrl_vis.learner.ddpg.latent_reward import LatentReward, make_latent_reward
+from jaxrl_vis.learner.ddpg.learned_reward import LearnedReward, make_learned_reward
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
 from jaxrl_vis.learner.networks.policy import PolicyParams, make_policy
@@ -35,8 +35,8 @@ from jaxrl_vis.types import Batch, Metrics, Params, Replaceable, Statistics
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
 _HEADS = 0x686473
-# The same for the autoencoder that makes rewards.
-_AUTOENCODER = 0x617574
+# The same for a model that makes rewards.
+_REWARD_MODEL = 0x617574
 
 
 @jax.tree_util.register_dataclass
@@ -50,7 +50,7 @@ class Agent(Replaceable):
         actor_optimizer, critic_optimizer: optax states.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
         weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
-        autoencoder: `latent_reward.AutoencoderState`; None where rewards come from elsewhere.
+        reward_model: `learned_reward.ModelState`; None where rewards come from elsewhere.
     """
 
     actor: Params
@@ -61,7 +61,7 @@ class Agent(Replaceable):
     critic_optimizer: Any
     updates: jax.Array
     weighting: Any = None
-    autoencoder: Any = None
+    reward_model: Any = None
 
 
 class Working(NamedTuple):
@@ -103,13 +103,13 @@ class Gradients(NamedTuple):
     Attributes:
         critic, actor: For the optimisers, float32; None if the actor is not updated.
         weighting: State of the weighting after this batch; None where there is nothing to remember.
-        autoencoder: For the optimiser of the autoencoder that makes rewards; None where there is none.
+        reward_model: For the optimiser of the model that makes rewards; None where there is none.
     """
 
     critic: Params
     actor: Params | None
     weighting: WeightingState | None = None
-    autoencoder: Params | None = None
+    reward_model: Params | None = None
 
 
 class GradientSteps(NamedTuple):
@@ -137,7 +137,7 @@ def _network_parameters(state: Agent) -> tuple[Params, ...]:
     return state.actor, state.critic, state.target_actor, state.target_critic
 
 
-def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, key: jax.Array) -> Agent:
+def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedReward | None, key: jax.Array) -> Agent:
     """Initialise an agent; its target networks equal the online networks."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
@@ -156,7 +156,7 @@ def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward
         critic_optimizer=adam.init(critic),
         updates=jnp.zeros((), jnp.int32),
         weighting=auxiliary.init_state(critic),
-        autoencoder=None if latent_reward is None else latent_reward.init(jax.random.fold_in(key, _AUTOENCODER)),
+        reward_model=None if learned_reward is None else learned_reward.init(jax.random.fold_in(key, _REWARD_MODEL)),
     )
 
 
@@ -246,7 +246,7 @@ def make_ddpg(
     """
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
-    latent_reward = make_latent_reward(networks, config, resolved)
+    learned_reward = make_learned_reward(networks, config, resolved)
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state = auxiliary.weighting.name != "none"
 
@@ -261,8 +261,8 @@ def make_ddpg(
         agent, (batch, inputs, image, noise) = working.agent, prepared
         now = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
-        if latent_reward is not None:
-            rewarded = latent_reward.of_batch(agent.autoencoder, working.scaling.observations, inputs, batch)
+        if learned_reward is not None:
+            rewarded = learned_reward.of_batch(agent.reward_model, working.scaling.observations, inputs, batch)
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
@@ -280,29 +280,29 @@ def make_ddpg(
             )
             actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
             metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))
-        if rewarded is not None:
-            metrics["train/autoencoder_loss"] = rewarded.loss
-        of_autoencoder = rewarded.gradient if rewarded is not None else None
+        if learned_reward is not None and rewarded is not None:
+            metrics[f"train/{learned_reward.name}_loss"] = rewarded.loss
+        of_model = rewarded.gradient if rewarded is not None else None
         # Of a learner in several parts, this is the one thing that an update waits for the others for.
         own_gradient = None if learning.reduces_early else weighted.gradient
-        own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts = shards.mean(
-            (own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts)
+        own_gradient, actor_gradient, of_model, metrics, mean_square, counts = shards.mean(
+            (own_gradient, actor_gradient, of_model, metrics, mean_square, counts)
         )
         if mean_square is not None:
             metrics["train/action_size"] = jnp.sqrt(mean_square)
         metrics |= {f"train/{name}": share for name, share in diagnostics.shares(counts, shards.count).items()}
         critic_gradient = weighted.gradient if own_gradient is None else own_gradient
-        return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_autoencoder), metrics
+        return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_model), metrics
 
     def apply(working: Working, chosen: Gradients) -> Working:
         counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])
         agent = _apply(working.agent, counts, chosen, config)
-        if latent_reward is not None:
-            agent = agent.replace(autoencoder=latent_reward.apply(agent.autoencoder, chosen.autoencoder))
+        if learned_reward is not None:
+            agent = agent.replace(reward_model=learned_reward.apply(agent.reward_model, chosen.reward_model))
         return working._replace(agent=agent, copies=_compute_copies(networks, agent), counts=counts)
 
     return GradientSteps(
-        init=lambda key: _start(networks, auxiliary, latent_reward, key),
+        init=lambda key: _start(networks, auxiliary, learned_reward, key),
         begin=functools.partial(_begin, networks),
         prepare=prepare,
         gradients=gradients,
