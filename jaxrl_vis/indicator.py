@@ -6,7 +6,8 @@
     Learner       all of these in a learner that is fed with episodes, recorded ones or those that it has just played
     learn         a learner trained on an .npz file of recorded episodes
 
-Observations are images [H, W, C] uint8 or vectors [S] float32, actions [A] lie in [-1, 1], and all episodes have equally many steps.
+Observations are images [H, W, C] uint8 or vectors [S] float32, actions [A] lie in [-1, 1], and all episodes have equally many
+steps.
 """
 
 import functools
@@ -131,7 +132,7 @@ class Learner:
         episode = Episodes(
             observations=_planar(np.concatenate([seen, aim[None]]))[None],  # type: ignore[arg-type]
             states=np.zeros((1, self._horizon + 2, 1), np.float32),  # type: ignore[arg-type]
-            actions=np.clip(done, -1.0, 1.0)[None],
+            actions=np.clip(done, -1.0, 1.0)[None],  # type: ignore[arg-type]
         )
         self._state, self._train = self._insert(self._state, self._train, episode, self.episodes)
         self.episodes += 1
