@@ -22,8 +22,9 @@ import numpy as np
 
 from jaxrl_vis.config import Config, preset, validate
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import train_step
-from jaxrl_vis.learner.algorithm import Setup
+from jaxrl_vis.learner.algorithm import Algorithm, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
 from jaxrl_vis.learner.ddpg.losses import keep_mask
 from jaxrl_vis.learner.iteration import choose_batches
@@ -98,7 +99,9 @@ class Learner:
         if auxiliary.tasks:
             raise RequestError("a learner on the host has no auxiliary losses: leave out aux_tasks")
         setup = Setup(self.config, resolved, self._spec, action_size, auxiliary)
-        self._algorithm = train_step.ALGORITHMS[self.config.run.algorithm](setup)
+        wanted = self.config.run.algorithm
+        maker = find("algorithm", wanted, train_step.ALGORITHMS, self.config.environment.env_folder)
+        self._algorithm = call("algorithm", wanted, maker, setup, of=Algorithm)
         self._replay = Replay(capacity, 1, horizon)
         self._sampler = Sampler(self.config, resolved, self._replay, threshold=0.0)
         self._key = jax.random.key(self.config.run.seed)

@@ -104,3 +104,16 @@ def test_mistakes_get_one_line(tmp_path):
     for name, message in (("text", "no recorded"), ("missing", "no recorded"), ("other", "no recorded"), ("short", "shape")):
         with pytest.raises(RequestError, match=message):
             indicator.learn(tmp_path / f"{name}.npz")
+
+
+def test_an_algorithm_of_ones_own_learns_from_recordings():
+    """Behaviour cloning: actions in these episodes lead where the next image shows, whatever came before."""
+    observations, actions, goals, _ = record(60)
+    algorithm = "benchmarks.tasks.behaviour_cloning:make"
+    learner = indicator.Learner((SIZE, SIZE, 1), 1, HORIZON, algorithm=algorithm, balance_probability=1.0, **OPTIONS)
+    for episode in zip(observations, actions, goals, strict=True):
+        learner.add(*episode)
+    first, last = (learner.update(100)["train/imitation_loss"] for _ in range(2))
+    assert last < 0.7 * first
+    with pytest.raises(RequestError, match="algorithm cannot be"):
+        indicator.Learner((2,), 1, 3, algorithm="cloning")
