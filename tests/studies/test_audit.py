@@ -87,6 +87,22 @@ def test_noise_breaks_equality(point: Path) -> None:
     assert exact["false_negative"] > 0.3 > tolerant["false_negative"]
 
 
+def test_a_model_that_a_run_has_trained_along_is_audited(point: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train = ["train", "VisualPoint", "--preset", "debug", "--pixels", "rgbd", "--image-size", "16", "--num-envs", "2"]
+    for method, name in (("classifier", "model"), ("indicator", "other")):
+        assert cli.main([*train, "--env-steps", "20", "--method", method, "--run-dir", name]) == 0
+    assert cli.main([*SMALL, "--rewards", "model", "--json", "a.json"]) == 0
+    (record,) = json.loads(Path("a.json").read_text())["rewards"].values()
+    assert all(0.0 <= record[name] <= 1.0 for name in ("false_positive", "false_negative", "calibration_error"))
+    capsys.readouterr()
+    for words, message in (
+        (["--rewards", "other"], "the run in other has no model of rewards: train with --method autoencoder or classifier"),
+        (["--rewards", "model", "--pixels", "rgb"], "sees images of (4, 16, 16), and these are of (3, 16, 16)"),
+    ):
+        assert cli.main([*SMALL, *words]) == 2
+        assert message in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -96,7 +112,7 @@ def test_noise_breaks_equality(point: Path) -> None:
         (["--rewards", "own:none"], "own has no none"),
         (
             ["--rewards", "indicater"],
-            "unknown reward 'indicater'; did you mean indicator or indicator_tolerance? (it is",
+            "unknown reward 'indicater'; did you mean indicator or indicator_tolerance? (run",
         ),
         (["--rewards", "features"], "method features needs an encoder"),
         (["--episodes", "1"], "other episodes' goals need at least 2"),

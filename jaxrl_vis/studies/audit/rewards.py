@@ -45,7 +45,11 @@ def _of_run(run_dir: Path, trust: bool) -> Reward:
     scaling = networks.batch_scaling(train.statistics)
     least, most = resolved.reward_negative, resolved.reward_positive
 
+    shape = networks.observation_spec.shape
+
     def reward(images: jax.Array, goals: jax.Array) -> jax.Array:
+        if images.shape[1:] != shape:
+            raise RequestError(f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}: audit those")
         batch = _as_batch(images, goals)
         inputs = networks.prepare_batch(scaling, batch)
         return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - least) / (most - least)
@@ -70,8 +74,8 @@ def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
     if (Path(name) / "config.json").exists():
         return _of_run(Path(name), trust)
     if ":" not in name:
-        choices = f"{', '.join(BUILT_IN)}, a run folder, or module:function"
-        raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} (it is one of {choices})")
+        others = "run folders and module:function are rewards, too"
+        raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} ({others})")
     found: Any = plugins.find("reward", name, {}, config.environment.env_folder)
     if not callable(found):
         raise RequestError(f"{name} is no reward: it must be a function of images and goal images")
