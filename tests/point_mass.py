@@ -46,7 +46,10 @@ class PointMass(MjxGoalEnv):
 
     def __init__(self, config: PointMassConfig):
         self._still = mjx_model.still_data(mujoco.MjModel.from_xml_string(XML))
-        super().__init__(config, mujoco.MjModel.from_xml_string(XML), lambda model: image_observer(model, self.camera, config))
+        super().__init__(config, mujoco.MjModel.from_xml_string(XML), self._observer(config))
+
+    def _observer(self, config: PointMassConfig) -> Any:
+        return lambda model: image_observer(model, self.camera, config)
 
     def sample_start(self, key: jax.Array) -> Any:
         return self.configuration(jnp.zeros(2))
@@ -65,3 +68,13 @@ class PointMass(MjxGoalEnv):
 
     def configuration(self, qpos: jax.Array) -> Any:
         return mjx_model.mjx.kinematics(self._model, self._still.replace(qpos=qpos))
+
+
+class StatePointMass(PointMass):
+    """The same, which observes position and velocity."""
+
+    def _observer(self, config: PointMassConfig) -> Any:
+        return None
+
+    def observe_state(self, data: Any) -> jax.Array:
+        return jnp.concatenate([data.qpos, data.qvel])

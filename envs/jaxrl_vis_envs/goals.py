@@ -59,7 +59,13 @@ def oracle_reward(
 
 
 def indicator_reward(
-    observation: jax.Array, goal: jax.Array, positive: float = 1.0, negative: float = -1.0, num_axes: int = 3
+    observation: jax.Array,
+    goal: jax.Array,
+    positive: float = 1.0,
+    negative: float = -1.0,
+    num_axes: int = 3,
+    tolerance: float = 0.0,
+    share: float = 1.0,
 ) -> jax.Array:
     """Compute the indicator reward (thesis, equation 5.4): ``positive`` where all elements of observation and goal are equal.
 
@@ -69,10 +75,18 @@ def indicator_reward(
         positive: R+.
         negative: R-.
         num_axes: Number of axes of one observation: 3 for images, 1 for state vectors.
+        tolerance: Difference up to which two elements count as equal, in their unit (grey levels for images).
+        share: Fraction of the elements that must be equal.
 
     Returns:
         [...] float32.
     """
     numpy = _namespace(observation, goal)
-    equal = numpy.all(observation == goal, axis=tuple(range(-num_axes, 0)))
+    axes = tuple(range(-num_axes, 0))
+    if tolerance == 0.0 and share == 1.0:
+        equal = numpy.all(observation == goal, axis=axes)
+    else:
+        difference = numpy.abs(observation.astype(numpy.float32) - goal.astype(numpy.float32))
+        allowed = int((1.0 - share) * np.prod(goal.shape[-num_axes:]) + 1e-6)  # a share of 0.99 is not exact
+        equal = numpy.sum(difference > tolerance, axis=axes) <= allowed
     return numpy.where(equal, positive, negative).astype(jnp.float32)

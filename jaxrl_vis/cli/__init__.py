@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jaxrl_vis
-from jaxrl_vis.cli import bench, doctor, envs, eval, figure, play, sweep, train, verify
+from jaxrl_vis.cli import audit, bench, doctor, encoder, envs, eval, figure, play, sweep, train, verify
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
 from jaxrl_vis.host import distributed
@@ -30,6 +30,8 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `
     "eval": (eval.Eval, eval.run),
     "play": (play.Play, play.run),
     "verify": (verify.Verify, verify.run),
+    "audit": (audit.Audit, audit.run),
+    "encoder": (encoder.Encoder, encoder.run),
     "envs": (envs.Envs, envs.run),
     "doctor": (doctor.Doctor, doctor.run),
     "bench": (bench.Bench, bench.run),
@@ -40,7 +42,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `
 # Exit statuses of errors reported in one line.
 _STATUS: dict[type[Exception], int] = {RequestError: 2, StorageError: 1, WorkerError: 1, NonFiniteError: 4}
 # Commands whose output is their result; the others write files, and print messages about them.
-_PRINT_RESULTS = ("eval", "envs", "doctor", "phenotype eval", "grasp eval")
+_PRINT_RESULTS = ("eval", "audit", "envs", "doctor", "phenotype eval", "grasp eval")
 _READER_LEFT = 141
 
 

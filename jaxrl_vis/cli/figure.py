@@ -15,7 +15,7 @@ from jaxrl_vis.report.outputs import check_figure, check_writable
 if TYPE_CHECKING:
     from jaxrl_vis.studies.figures.show import Request
 
-FigureName = Literal["5.1", "5.2", "estimators", "cameras", "5.4", "5.5", "5.6", "5.7", "quadratic", "pareto"]
+FigureName = Literal["5.1", "5.2", "estimators", "cameras", "goals", "5.4", "5.5", "5.6", "5.7", "quadratic", "pareto"]
 UNFINISHED = 3
 """Exit status: finished, with something left out."""
 
@@ -25,9 +25,10 @@ class Figure:
     """Draw a figure: train or compute its content, and write it to a file, with tables beside it.
 
     5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
-    varied images. 5.4: auxiliary losses, and how they are weighted. 5.5: single auxiliary tasks. 5.6: their weights over
-    training. 5.7: what OL-AUX-5 owes to looking ahead. These train what is missing, one process a GPU, and resume what was
-    begun, so they may be interrupted and started again at any time; the exit status is 3 where something is still missing.
+    varied images. goals: rewards of every kind, TD3 and contrastive RL, on one bench. 5.4: auxiliary losses, and how they
+    are weighted. 5.5: single auxiliary tasks. 5.6: their weights over training. 5.7: what OL-AUX-5 owes to looking ahead.
+    These train what is missing, one process a GPU, and resume what was begun, so they may be interrupted and started again
+    at any time; the exit status is 3 where something is still missing.
 
     quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane. pareto: paths to the Pareto front
     of two losses, by twelve weightings. In these nothing is trained, and --out is the only option. Figures of stalks:

@@ -39,7 +39,7 @@ _ELSEWHERE = {
     **dict.fromkeys(
         ("--capture-video", "--render", "--render-mode"), f"a run draws a video at its end; {PROGRAM} play draws more"
     ),
-    "--algo": "the option is --algorithm, ddpg or module:Name; --method says where rewards come from",
+    "--algo": "the option is --algorithm, such as ddpg or td3; --method says where rewards come from",
 }
 
 T = TypeVar("T")

@@ -117,14 +117,17 @@ def config_lines(config: Config, given: Collection[str]) -> list[str]:
     """
     name, environment = config.run.preset, config.environment
     of_preset, of_task = PRESETS[name], preset(name, env=environment.env, method=config.reward.method)
+    of_algorithm = preset(name, env=environment.env, method=config.reward.method, algorithm=config.run.algorithm)
     lines, group = [], ""
     for option, value in config.flat().items():
         if OPTIONS[option].group != group:
             group = OPTIONS[option].group
             lines += ["", f"[{group}]"]
         source = ""
-        if option in given or (value != of_task.value(option) and option != "preset"):
+        if option in given or (value != of_algorithm.value(option) and option not in ("preset", "algorithm")):
             source = "given"
+        elif value != of_task.value(option) and option != "algorithm":
+            source = f"preset {name}, for {config.run.algorithm}"
         elif value != of_preset.value(option):
             source = f"preset {name}, for {environment.env}"
         elif value != OPTIONS[option].default and option != "preset":

@@ -6,10 +6,23 @@ Imports no JAX, so that the command line can print its help at once.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from jaxrl_vis.config import fields
 from jaxrl_vis.config.fields import Bounds
+from jaxrl_vis.config.marks import (
+    DIVIDED,
+    FALSE_REWARD,
+    HOST,
+    NEEDS_STATES,
+    OL_AUX,
+    RESUMABLE,
+    UNMEASURED,
+    Mark,
+    OfAlgorithm,
+    OfMethod,
+    OfWeighting,
+)
 from jaxrl_vis.config.methods import (
     EPS_WEIGHTINGS,
     HEAD_WEIGHTINGS,
@@ -31,40 +44,8 @@ LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are 
 Count = Annotated[int, Bounds(1, LARGEST_COUNT)]
 Share = Annotated[float, Bounds(0.0, 1.0)]
 Positive = Annotated[float, Bounds(0.0, exclusive=True)]
+T = TypeVar("T")
 NotNegative = Annotated[float, Bounds(0.0)]
-
-
-@dataclasses.dataclass(frozen=True)
-class Mark:
-    """Property of a field, for its annotation; `marked` lists the fields that have it.
-
-    Attributes:
-        meaning: Its meaning.
-    """
-
-    meaning: str
-
-
-HOST = Mark("only the host reads it: no compiled program depends on it")
-RESUMABLE = Mark("may change when a run is resumed: it has no effect on learning")
-UNMEASURED = Mark("has no effect on the metrics up to the same number of environment steps")
-DIVIDED = Mark("must be divisible by the number of devices that share a learner")
-NEEDS_STATES = Mark("if changed, rewards must be computed from true states, as the oracle's are")
-FALSE_REWARD = Mark("fraction of rewards that are false")
-
-
-@dataclasses.dataclass(frozen=True)
-class OfWeighting:
-    """Property of a field that is read only if losses are weighted, or have logarithms.
-
-    Attributes:
-        names: Weightings that the field is an option of; empty for any.
-    """
-
-    names: tuple[str, ...] = ()
-
-
-OL_AUX = OfWeighting(("ol_aux", "ol_aux_ablation"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +121,8 @@ class GoalOptions:
     """p2: fraction of those whose goal is the next observation, a certain positive. None: 0.5 for balancing methods, else 0."""
     filter_threshold: float | None = None
     """q0: negatives with Q above it are dropped as false. None: the middle of its valid range, for filtering methods."""
+    future_goals: Literal["even", "geometric"] = "even"
+    """Distribution of relabelled goals over the rest of the episode: even, or falling with gamma^k for k further steps."""
     trivial_goals: Annotated[Share, NEEDS_STATES] = 1.0
     """Fraction kept of relabelled goals that are already reached before the action; the rest are replaced by observations from
     other episodes."""
@@ -150,12 +133,18 @@ class RewardOptions:
     """Source and values of rewards."""
 
     method: MethodName = "oracle"
-    """Source of the rewards: the true state (oracle), similarity in the latent space of an autoencoder trained alongside, or
-    equality of observations (indicator), without or with balancing and filtering; module:Name for your own."""
+    """Source of the rewards (docs/indicator_rewards.md): the true state (oracle), an autoencoder or a success classifier
+    trained alongside, a frozen encoder (features), or equality of observations (indicator); module:Name for your own."""
     reward_positive: float | None = None
     """R+. None: 0 for the oracle, 1 for other methods."""
     reward_negative: float | None = None
-    """R-. None: 0 for the autoencoder, -1 for other methods."""
+    """R-. None: 0 for autoencoder, classifier and features, -1 for other methods."""
+    tolerance: Annotated[NotNegative, OfMethod("indicator_tolerance")] = 8.0
+    """Difference up to which two elements count as equal, in the observation's unit (grey levels for images)."""
+    tolerance_share: Annotated[Share, OfMethod("indicator_tolerance")] = 0.99
+    """Fraction of the elements that must be equal."""
+    reward_encoder: Annotated[str | None, OfMethod("features")] = None
+    """File with the frozen encoder, from `jaxrl-vis encoder`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,6 +175,17 @@ class DDPGOptions:
     """Exploration: fraction of actions drawn uniformly."""
     action_noise: NotNegative = 0.2
     """Exploration: standard deviation of the Gaussian noise added to the other actions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ContrastiveOptions:
+    """Contrastive RL (docs/algorithms.md)."""
+
+    contrastive_form: Annotated[Literal["nce", "stable"], OfAlgorithm(("contrastive",))] = "stable"
+    """Form of the critic and its loss. nce: binary cross-entropy (Eysenbach et al., 2022). stable: symmetric InfoNCE with a
+    penalty on log-sum-exp, layer normalisation, and outputs near 0 at first."""
+    representation_size: Annotated[Count, OfAlgorithm(("contrastive",))] = 64
+    """Size of the representations whose inner product is the critic."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,6 +288,7 @@ class Config:
     goals: GoalOptions = GoalOptions()
     reward: RewardOptions = RewardOptions()
     ddpg: DDPGOptions = DDPGOptions()
+    contrastive: ContrastiveOptions = ContrastiveOptions()
     auxiliary: AuxiliaryOptions = AuxiliaryOptions()
     network: NetworkOptions = NetworkOptions()
     study: StudyOptions = StudyOptions()
@@ -329,6 +330,11 @@ def of_weightings() -> dict[str, tuple[str, ...]]:
     """Return the fields that are read only by weightings, with the names of these; no names for any weighting."""
     marks = {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, OfWeighting)}
     return {name: mark.names for name, mark in marks.items()}
+
+
+def read_by(kind: type[T]) -> dict[str, T]:
+    """Return the fields with an annotation of this class, `OfAlgorithm` or `OfMethod`, and the annotations."""
+    return {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, kind)}
 
 
 def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:

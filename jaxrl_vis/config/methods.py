@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from jaxrl_vis.config.fields import Names
 
-RewardName = Literal["oracle", "autoencoder", "indicator"]
+RewardName = Literal["oracle", "autoencoder", "classifier", "features", "indicator", "indicator_tolerance"]
 RewardFunction = Callable[..., Any]
 """(`types.Batch`; [B, ...] what was reached, as a goal would show it; R+; R-) -> rewards [B] float32."""
 
@@ -21,8 +21,9 @@ class Method:
 
     Attributes:
         reward: oracle: distance of the true states; autoencoder: cosine similarity of the latents of an autoencoder that is
-            trained along; indicator: equality of observations. Or a function. Rewards are computed anew at every sample, so it
-            must read nothing else than its arguments.
+            trained along; classifier: probability of a success classifier that is; features: cosine similarity in a frozen
+            encoder; indicator: equality of observations; indicator_tolerance: the same but for camera noise. Or a function.
+            Rewards are computed anew at every sample, so it must read nothing else than its arguments.
         filter: Whether negatives that the critic contradicts are dropped as false.
         reward_positive, reward_negative: Defaults of R+ and R-.
         balance_probability: Default of p2.
@@ -42,14 +43,22 @@ class Method:
     @property
     def needs_images(self) -> bool:
         """True if rewards are made from images, so that the environment must show some."""
-        return self.reward == "autoencoder"
+        return self.is_learned or self.reward == "features"
+
+    @property
+    def is_learned(self) -> bool:
+        """True if rewards are those of a model that is trained along."""
+        return self.reward in ("autoencoder", "classifier")
 
 
 METHODS: dict[str, Method] = {
     "oracle": Method(reward="oracle", filter=False, reward_positive=0.0),
     "autoencoder": Method(reward="autoencoder", filter=False, reward_positive=1.0, reward_negative=0.0),
+    "classifier": Method(reward="classifier", filter=False, reward_positive=1.0, reward_negative=0.0),
+    "features": Method(reward="features", filter=False, reward_positive=1.0, reward_negative=0.0),
     "indicator": Method(reward="indicator", filter=False, reward_positive=1.0),
     "indicator_balance_filter": Method(reward="indicator", filter=True, reward_positive=1.0, balance_probability=0.5),
+    "indicator_tolerance": Method(reward="indicator_tolerance", filter=True, reward_positive=1.0, balance_probability=0.5),
 }
 
 MethodName = Annotated[str, Names(tuple(METHODS))]
@@ -80,4 +89,6 @@ WeightingName = Annotated[
     str, Names((*MAIN_WEIGHTINGS, *LOSS_WEIGHTINGS, "gradnorm", *GRAMIAN_WEIGHTINGS, *DIRECTION_WEIGHTINGS))
 ]
 AuxTaskName = Annotated[str, Names(("forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"))]
-AlgorithmName = Annotated[str, Names(("ddpg",))]
+ALGORITHMS = ("ddpg", "td3", "contrastive")
+"""Names of the built-in algorithms."""
+AlgorithmName = Annotated[str, Names(ALGORITHMS)]

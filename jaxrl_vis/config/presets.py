@@ -65,7 +65,7 @@ class TaskValues:
 
     Attributes:
         always: Values for every method.
-        images: Values for image observations, unless the method compares images in the latent space of an autoencoder.
+        images: Values for image observations, unless a model that is trained along compares them.
         oracle: Values for rewards from the true state: other methods cannot read it, and have a balance of their own.
         images_and_oracle: Values for images with rewards from the true state.
     """
@@ -87,8 +87,9 @@ class TaskValues:
             shows_images: True if observations are images.
             method_name: Method, built-in or ``module:Name``.
         """
-        reward = METHODS[method_name].reward if method_name in METHODS else None
-        oracle, images = reward == "oracle", shows_images and reward != "autoencoder"
+        method = METHODS.get(method_name)
+        oracle = method is not None and method.reward == "oracle"
+        images = shows_images and (method is None or not method.is_learned)
         return {
             **self.always,
             **(self.images if images else {}),
@@ -160,7 +161,18 @@ def preset(name: str, **overrides: Any) -> Config:
     env = str(overrides.get("env", config.environment.env))
     method = str(overrides.get("method", config.reward.method))
     values = TASKS.get((name, env.removeprefix("Visual")), TaskValues())
-    return config.replace(**{**values.choose(env.startswith("Visual"), method), **overrides})
+    config = config.replace(**values.choose(env.startswith("Visual"), method))
+    algorithm = str(overrides.get("algorithm", config.run.algorithm))
+    return config.replace(**{**_of_algorithm(config, algorithm), **overrides})
+
+
+def _of_algorithm(config: Config, algorithm: str) -> dict[str, Any]:
+    """Return the values that an algorithm has otherwise than DDPG."""
+    if algorithm == "td3":  # the actor and the targets wait
+        return {name: max(2, config.value(name)) for name in ("actor_interval", "target_update_interval")}
+    if algorithm == "contrastive":  # goals are future states, and the truth about them is not read
+        return {"future_goals": "geometric", "relabel_probability": 1.0, "balance_probability": 0.0, "trivial_goals": 1.0}
+    return {}
 
 
 def general_values(name: str, task: str) -> dict[str, Any]:

@@ -12,11 +12,14 @@ from jaxrl_vis.config.groups import (
     NEEDS_STATES,
     OPTIONS,
     Config,
+    OfAlgorithm,
+    OfMethod,
     data_devices,
     marked,
     of_weightings,
+    read_by,
 )
-from jaxrl_vis.config.methods import METHODS
+from jaxrl_vis.config.methods import ALGORITHMS, METHODS
 from jaxrl_vis.errors import RequestError
 
 _LARGEST_SEED = 2**32 - 1  # a random key uses 32 bits of it: larger seeds would repeat smaller ones
@@ -44,6 +47,15 @@ def validate(config: Config) -> Config:
         raise RequestError(
             f"n_step {study.n_step} with method {config.reward.method}: the filter's valid range assumes one step"
         )
+    for name, algorithms in read_by(OfAlgorithm).items():
+        if _is_changed(config, name) and run.algorithm in ALGORITHMS and run.algorithm not in algorithms.names:
+            wanted = " or ".join(algorithms.names)
+            raise RequestError(f"{name} is an option of --algorithm {wanted}, and this is {run.algorithm}: leave it out")
+    for name, reader in read_by(OfMethod).items():
+        if _is_changed(config, name) and config.reward.method in METHODS and config.reward.method != reader.name:
+            raise RequestError(
+                f"{name} is an option of --method {reader.name}, and this is {config.reward.method}: leave it out"
+            )
     _validate_reward(config)
     _validate_auxiliary(config)
     environment = config.environment
@@ -117,5 +129,5 @@ def _validate_reward(config: Config) -> None:
             )
     unlike = {"random_shift": config.network.random_shift > 0, "normalizers separate": study.normalizers == "separate"}
     for option, is_set in unlike.items():
-        if is_set and kind == "autoencoder":
+        if is_set and name in METHODS and METHODS[name].is_learned:
             raise RequestError(f"{option} and method {name} exclude each other: it compares unmodified images")

@@ -5,8 +5,9 @@
     policy_params   the part of an agent that acting reads: small, and all that a policy is made of
     act             actions without exploration
 
-An algorithm is made by a function of a `Setup`, which has the configuration and the sizes of the task. DDPG is the one that is
-built in (`ddpg.make`); ``--algorithm module:Name`` names another one.
+An algorithm is made by a function of a `Setup`, which has the configuration and the sizes of the task. DDPG, TD3 and
+contrastive RL are built in (`train_step.ALGORITHMS`); ``--algorithm module:Name`` names another one. `networks.policy` has
+``act``, ``aim`` and ``policy_params`` for those whose actor is that of the shared networks.
 """
 
 import dataclasses

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config, validate
 from jaxrl_vis.host.plugins import call, find
+from jaxrl_vis.learner import contrastive, td3
 from jaxrl_vis.learner import iteration as iterations
 from jaxrl_vis.learner.acting.evaluate import Evaluation, make_evaluate
 from jaxrl_vis.learner.acting.rollout import Acting, Exploration, play
@@ -43,7 +44,7 @@ from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_defaul
 JIT_OPTIONS: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "learn": {"donate_argnums": 0}}
 """Arguments of `jaxrl_vis_envs.jit` for the programs that have some."""
 
-ALGORITHMS: dict[str, Callable[[Setup], Algorithm]] = {"ddpg": ddpg.make}
+ALGORITHMS: dict[str, Callable[[Setup], Algorithm]] = {"ddpg": ddpg.make, "td3": td3.make, "contrastive": contrastive.make}
 """Functions that make the built-in algorithms."""
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).

@@ -173,7 +173,7 @@ def test_defaults_follow_the_method() -> None:
     best = 1 / (1 - discount)
     assert resolved["indicator_balance_filter"].filter_threshold == pytest.approx((-1 + discount * best + best) / 2)
     assert METHODS["indicator_balance_filter"].balance and not METHODS["indicator"].balance
-    assert [name for name in METHODS if METHODS[name].needs_images] == ["autoencoder"]
+    assert [name for name in METHODS if METHODS[name].needs_images] == ["autoencoder", "classifier", "features"]
     autoencoder = resolved["autoencoder"]
     assert (autoencoder.reward_positive, autoencoder.reward_negative, autoencoder.balance_probability) == (1.0, 0.0, 0.0)
     assert (autoencoder.target_minimum, autoencoder.target_maximum) == (0.0, best)

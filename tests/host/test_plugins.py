@@ -50,6 +50,10 @@ def test_a_part_of_ones_own_is_one_file_and_trains(elsewhere: Path, kind: str) -
     assert expected.get(kind, "train/imitation_loss") in rows[-1]
     assert json.loads(Path("run", "config.json").read_text())["config"]["environment"]["env_folder"] == str(elsewhere)
     if kind == "algorithm":
+        assert cli.main(["train", "--resume", "--env-steps", "800", "--run-dir", "run"]) == 0
+        assert len(Path("run", "metrics.jsonl").read_text().splitlines()) > len(rows)
+        assert cli.main(["eval", "run", "--episodes", "2"]) == 0
+        assert cli.main(["play", "run", "--out", "played.gif", "--episodes", "1"]) == 0 and Path("played.gif").exists()
         policy = jaxrl_vis.load_policy("run")
         image = np.zeros(policy.observation_spec.shape, np.uint8)
         assert policy(image, image).shape == (policy.action_size,)

@@ -12,9 +12,10 @@ from jaxrl_vis.config import preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.acting.rollout import add_noise
 from jaxrl_vis.learner.ddpg import diagnostics
-from jaxrl_vis.learner.ddpg.latent_reward import cosine_reward, make_latent_reward
+from jaxrl_vis.learner.ddpg.learned_reward import make_learned_reward
 from jaxrl_vis.learner.memory import reward_errors
 from jaxrl_vis.learner.memory.replay import Replay
+from jaxrl_vis.learner.memory.rewards import cosine_reward
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.resolved import resolve
@@ -58,7 +59,7 @@ def test_the_return_of_an_autoencoder_is_in_q(with_autoencoder):
         images = [jax.vmap(probes.SeenGoWhereTold().see)(each) for each in (points, goals)]
         inputs = [networks.prepare(networks.scaling(train.normalizer), each) for each in images]
         latents = jnp.stack([networks.encode(train.agent.critic, each) for each in inputs])
-        rewards = cosine_reward(*(networks.encode(train.agent.autoencoder.params, each) for each in inputs))
+        rewards = cosine_reward(*(networks.encode(train.agent.reward_model.params, each) for each in inputs))
         return networks.value(train.agent.critic, latents, jnp.zeros((8, 1))), rewards
 
     values, rewards = values_and_rewards(train, points)
@@ -75,7 +76,7 @@ def test_an_autoencoder_learns_to_reconstruct(with_autoencoder):
     program, train, late = with_autoencoder
     _, early = train_iteration(program, begin(program, jax.random.key(7)[None]))
     assert late["train/autoencoder_loss"][0] < 0.5 * early["train/autoencoder_loss"][0]
-    assert set(train.agent.autoencoder.params) == {"encoder", "decoder"}
+    assert set(train.agent.reward_model.params) == {"encoder", "decoder"}
 
 
 def test_likeness_is_a_cosine_that_is_cut_off_at_a_right_angle():
@@ -99,8 +100,8 @@ def test_stacked_images_are_compared_as_goals():
     env, size = Stacked(), 3
     program = make_train_step(env, preset("debug", method="autoencoder"))
     networks, resolved = program.networks, program.resolved
-    latent_reward = make_latent_reward(networks, program.config, resolved)
-    assert latent_reward is not None
+    learned_reward = make_learned_reward(networks, program.config, resolved)
+    assert learned_reward is not None
     train = jax.tree.map(lambda leaf: leaf[0], begin(program, jax.random.key(0)[None]).train)
     moving = jax.random.bits(jax.random.key(1), (size, 2, 8, 8), jnp.uint8)
     reached = jax.vmap(env.as_goal)(moving)
@@ -112,7 +113,7 @@ def test_stacked_images_are_compared_as_goals():
         scaling = networks.batch_scaling(train.statistics)
         inputs = networks.prepare_batch(scaling, batch)
         both = batch.replace(reached=reached), batch
-        return [latent_reward.of_batch(train.agent.autoencoder, scaling.observations, inputs, each).reward for each in both]
+        return [learned_reward.of_batch(train.agent.reward_model, scaling.observations, inputs, each).reward for each in both]
 
     of_reached, of_moving = rewards(train, batch)
     np.testing.assert_allclose(of_reached, 1.0, atol=1e-5)
@@ -121,7 +122,7 @@ def test_stacked_images_are_compared_as_goals():
 
 def test_other_methods_carry_no_autoencoder():
     loop = jax.eval_shape(make_train_step(StaysPut(), preset("debug")).init, jax.random.key(0)[None])
-    assert loop.train.agent.autoencoder is None
+    assert loop.train.agent.reward_model is None
 
 
 @pytest.mark.parametrize(

@@ -215,7 +215,9 @@ def make_batch(config: Config) -> Batch:
     images = jax.random.randint(next(keys), (3, SIZE, 2, 16, 16), 0, 255).astype(jnp.uint8)
     success = jax.random.bernoulli(next(keys), 0.3, (SIZE,)).astype(jnp.float32)
     reward = (
-        jnp.where(jax.random.bernoulli(next(keys), 0.4, (SIZE,)), 1.0, -1.0) if config.reward.method != "autoencoder" else None
+        jnp.where(jax.random.bernoulli(next(keys), 0.4, (SIZE,)), 1.0, -1.0)
+        if config.reward.method not in ("autoencoder", "classifier")
+        else None
     )
     actions, states = (jax.random.uniform(next(keys), (SIZE, 2), minval=-1.0) for _ in range(2))
     batch = Batch(images, actions, states, states, reward=reward, success=success)
@@ -230,6 +232,7 @@ def make_batch(config: Config) -> Batch:
     [
         {"method": "indicator_balance_filter"},
         {"method": "autoencoder"},
+        {"method": "classifier"},
         {"method": "indicator", "weighting": "ol_aux", "aux_tasks": ("inverse_dynamics", "forward_dynamics")},
         {"method": "indicator", "weighting": "sum", "aux_tasks": ("forward_dynamics",)},
     ],

@@ -25,7 +25,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("host.files",),
     ("host.devices", "host.distributed", "host.plugins", "host.weights_file"),
     ("learner",),
-    ("report",),
+    ("indicator", "report"),
     ("run",),
     ("host.worker_pool", "studies"),
     ("bench", "host.doctor"),

@@ -4,7 +4,8 @@ Follows the release of the authors of "Adaptive Auxiliary Task Weighting for Rei
 from OpenAI Gym's FetchReach. The differences are deliberate, and each has an option that reverts it: the goal image shows the
 grip *site* at the goal (``goal_at="link"``: the gripper's link, which puts the grip 2 cm off); the mocap cross-hair, which
 stood at the goal in the first image, is not rendered (``cross_hair``); fingers are orange (``finger_colour``); depth is metric
-(``depth_encoding``).
+(``depth_encoding``). ``view="contrastive_rl"`` is the task of contrastive RL (Eysenbach et al., 2022): another camera, and goal
+images taken after ten steps towards the goal.
 
     VisualFetchReach   observes RGB-D from a camera facing the robot
     FetchReach         observes the grip's position and velocity
@@ -40,7 +41,12 @@ _TABLE_TOP = 0.4  # m
 _GREY = (0.356, 0.361, 0.376, 1.0)  # colour of the original's gripper
 # Half-sizes (m) and alpha of the boxes of the original's mocap body.
 _CROSS_HAIR = ((0.005, 0.005, 0.005, 0.7), (1.0, 0.005, 0.005, 0.1), (0.005, 1.0, 0.001, 0.1), (0.005, 0.005, 1.0, 0.1))
+# Camera of Eysenbach et al. (2022, arXiv 2206.07568): one that looks at a point, m, as MuJoCo's free camera; angles in degrees.
+_THEIR_CAMERA = "contrastive_rl"
+_LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION, _FOVY = (1.2, 0.8, 0.5), 0.8, 180.0, -30.0, 45.0
+_GOAL_STEPS, _GOAL_GAIN = 10, 10.0  # control steps towards the goal before their goal image is taken; actions per metre
 GoalAt = Literal["grip", "link"]
+View = Literal["front", "contrastive_rl"]
 FingerColour = Literal["orange", "grey"]
 
 
@@ -74,12 +80,18 @@ class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
     """Near and far clipping planes of the release, m."""
     cross_hair: bool = False
     """Renders the release's cross-hair at the mocap body that pulls the gripper; at the goal in an episode's first image."""
+    view: View = "front"
+    """Camera and goal images. front: facing the robot. contrastive_rl: those of contrastive RL's ``fetch_reach_image``, whose
+    goal images show where ten steps in proportion to the distance lead; its images are ``pixels="rgb"``."""
     finger_colour: FingerColour = "orange"
     """Orange fingers, which stand out, or grey ones as in the original."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.boolean(self, "cross_hair")
+        checks.choice(self, "view", get_args(View))
+        if self.view == "contrastive_rl" and (self.cross_hair or self.goal_at != "grip"):
+            raise ValueError('view="contrastive_rl" has goal images of its own: leave out cross_hair and goal_at')
         checks.choice(self, "finger_colour", get_args(FingerColour))
 
 
@@ -99,12 +111,19 @@ class FetchReach(PulledArm):
             observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         self._has_cross_hair = isinstance(config, VisualFetchReachConfig) and config.cross_hair
-        mj_model = mjx_model.load_model("fetch_reach.xml", _add_cross_hair if self._has_cross_hair else None)
+        self._is_their_view = self.select_camera(config) == _THEIR_CAMERA
+        change = _add_cross_hair if self._has_cross_hair else _add_their_camera if self._is_their_view else None
+        mj_model = mjx_model.load_model("fetch_reach.xml", change)
         if isinstance(config, VisualFetchReachConfig) and config.finger_colour == "grey":
             for name in ("left_finger", "right_finger"):
                 mj_model.geom(name).rgba = _GREY
         self._fingers = np.array([mj_model.joint(name).qposadr[0] for name in ("right_finger", "left_finger")])
         super().__init__(config, mj_model, "gripper", observer)
+
+    @classmethod
+    def select_camera(cls, config: FetchReachConfig) -> str:
+        is_theirs = isinstance(config, VisualFetchReachConfig) and config.view == "contrastive_rl"
+        return _THEIR_CAMERA if is_theirs else cls.camera
 
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
         """Pull the stretched arm to the setup point, as Gym does once at construction.
@@ -125,10 +144,21 @@ class FetchReach(PulledArm):
         return self._with_cross_hair(self._start, self._link_at(self._goal_point(key)))
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        return self.goal_configuration(self._goal_point(key))
+        goal = self._goal_point(key)
+        return self._driven_towards(goal) if self._is_their_view else self.goal_configuration(goal)
 
     def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
-        return self.achieved(goal_data) if self.config.goal_at == "grip" else self._goal_point(key)
+        is_shown = self.config.goal_at == "grip" and not self._is_their_view
+        return self.achieved(goal_data) if is_shown else self._goal_point(key)
+
+    def _driven_towards(self, goal: jax.Array) -> mjx.Data:
+        """Return the robot after actions in proportion to the distance of its grip from ``goal`` [3] (m, world)."""
+
+        def drive(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
+            towards = jnp.clip(_GOAL_GAIN * (goal - self.achieved(data)), -1.0, 1.0)
+            return self.act(data, jnp.append(towards, 0.0)), None
+
+        return jax.lax.scan(drive, self._start, length=_GOAL_STEPS)[0]
 
     def _goal_point(self, key: jax.Array) -> jax.Array:
         """Sample the goal position [3] (m, world) of an episode."""
@@ -180,6 +210,17 @@ def _add_cross_hair(spec: mujoco.MjSpec) -> None:
         spec.body("mocap").add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=(0.0, 0.5, 0.0, alpha), contype=0, conaffinity=0, mass=0.0
         )
+
+
+def _add_their_camera(spec: mujoco.MjSpec) -> None:
+    """Add the camera of contrastive RL's task, at rest in the world."""
+    azimuth, elevation = np.deg2rad([_AZIMUTH, _ELEVATION])
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    forward = np.cos(elevation) * level + [0.0, 0.0, np.sin(elevation)]
+    right = np.cross(forward, [0.0, 0.0, 1.0]) / np.cos(elevation)
+    camera = spec.worldbody.add_camera(name=_THEIR_CAMERA, pos=np.array(_LOOK_AT) - _DISTANCE * forward, fovy=_FOVY)
+    camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_XYAXES
+    camera.alt.xyaxes = np.concatenate([right, np.cross(right, forward)])
 
 
 register_task(FetchReach, FetchReachConfig, VisualFetchReachConfig)

@@ -24,18 +24,19 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.learner.algorithm import Algorithm, Batches, Setup
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary, make_auxiliary
 from jaxrl_vis.learner.ddpg import adam, diagnostics
-from jaxrl_vis.learner.ddpg.latent_reward import LatentReward, make_latent_reward
+from jaxrl_vis.learner.ddpg.learned_reward import LearnedReward, make_learned_reward
 from jaxrl_vis.learner.ddpg.objectives import ComputeCopies, Objectives
 from jaxrl_vis.learner.networks.networks import BatchScaling, Inputs, Networks
+from jaxrl_vis.learner.networks.policy import PolicyParams, make_policy
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.learner.resolved import Resolved
-from jaxrl_vis.types import Batch, Metrics, NormalizerState, Params, Replaceable, Statistics
+from jaxrl_vis.types import Batch, Metrics, Params, Replaceable, Statistics
 from jaxrl_vis.weighting import MAIN, Weighted, WeightingState
 
 # Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
 _HEADS = 0x686473
-# The same for the autoencoder that makes rewards.
-_AUTOENCODER = 0x617574
+# The same for a model that makes rewards.
+_REWARD_MODEL = 0x617574
 
 
 @jax.tree_util.register_dataclass
@@ -49,7 +50,7 @@ class Agent(Replaceable):
         actor_optimizer, critic_optimizer: optax states.
         updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
         weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
-        autoencoder: `latent_reward.AutoencoderState`; None where rewards come from elsewhere.
+        reward_model: `learned_reward.ModelState`; None where rewards come from elsewhere.
     """
 
     actor: Params
@@ -60,20 +61,7 @@ class Agent(Replaceable):
     critic_optimizer: Any
     updates: jax.Array
     weighting: Any = None
-    autoencoder: Any = None
-
-
-class ActorParams(NamedTuple):
-    """Parameters of the policy.
-
-    Attributes:
-        actor: With an encoder, of its own or the critic's.
-        observations, goals: Statistics that these are normalised with.
-    """
-
-    actor: Params
-    observations: NormalizerState
-    goals: NormalizerState
+    reward_model: Any = None
 
 
 class Working(NamedTuple):
@@ -100,11 +88,13 @@ class Prepared(NamedTuple):
         batch: With rewards.
         inputs: Its observations as the encoders read them.
         image: [B, C, H, W] its observations before the action, normalised, where an auxiliary task asks for them; else None.
+        noise: [B, A] float32, added to the next actions in the critic's targets; None: nothing.
     """
 
     batch: Batch
     inputs: Inputs
     image: jax.Array | None = None
+    noise: jax.Array | None = None
 
 
 class Gradients(NamedTuple):
@@ -113,13 +103,13 @@ class Gradients(NamedTuple):
     Attributes:
         critic, actor: For the optimisers, float32; None if the actor is not updated.
         weighting: State of the weighting after this batch; None where there is nothing to remember.
-        autoencoder: For the optimiser of the autoencoder that makes rewards; None where there is none.
+        reward_model: For the optimiser of the model that makes rewards; None where there is none.
     """
 
     critic: Params
     actor: Params | None
     weighting: WeightingState | None = None
-    autoencoder: Params | None = None
+    reward_model: Params | None = None
 
 
 class GradientSteps(NamedTuple):
@@ -147,7 +137,7 @@ def _network_parameters(state: Agent) -> tuple[Params, ...]:
     return state.actor, state.critic, state.target_actor, state.target_critic
 
 
-def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward | None, key: jax.Array) -> Agent:
+def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedReward | None, key: jax.Array) -> Agent:
     """Initialise an agent; its target networks equal the online networks."""
     actor_key, critic_key = jax.random.split(key)
     actor, critic = networks.init_actor(actor_key), networks.init_critic(critic_key)
@@ -166,7 +156,7 @@ def _start(networks: Networks, auxiliary: Auxiliary, latent_reward: LatentReward
         critic_optimizer=adam.init(critic),
         updates=jnp.zeros((), jnp.int32),
         weighting=auxiliary.init_state(critic, key),
-        autoencoder=None if latent_reward is None else latent_reward.init(jax.random.fold_in(key, _AUTOENCODER)),
+        reward_model=None if learned_reward is None else learned_reward.init(jax.random.fold_in(key, _REWARD_MODEL)),
     )
 
 
@@ -256,7 +246,7 @@ def make_ddpg(
     """
     if auxiliary is None:
         auxiliary = make_auxiliary(config, networks.observation_spec, networks.action_size, 1, networks.dtype)
-    latent_reward = make_latent_reward(networks, config, resolved)
+    learned_reward = make_learned_reward(networks, config, resolved)
     learning = Objectives(networks, config, resolved, auxiliary, shards)
     keeps_state = auxiliary.weighting.name != "none"
 
@@ -268,16 +258,16 @@ def make_ddpg(
         return Prepared(batch, networks.prepare_batch(working.scaling, batch), image)
 
     def gradients(working: Working, prepared: Prepared, with_actor: bool = True) -> tuple[Gradients, Metrics]:
-        agent, (batch, inputs, image) = working.agent, prepared
+        agent, (batch, inputs, image, noise) = working.agent, prepared
         now = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
-        if latent_reward is not None:
-            rewarded = latent_reward.of_batch(agent.autoencoder, working.scaling.observations, inputs, batch)
+        if learned_reward is not None:
+            rewarded = learned_reward.of_batch(agent.reward_model, working.scaling.observations, inputs, batch)
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
         state = auxiliary.start(now.critic) if agent.weighting is None else agent.weighting
-        weighted = learning.critic_gradient(now, inputs, image, batch)(now.critic, state)
+        weighted = learning.critic_gradient(now, inputs, image, batch, noise)(now.critic, state)
         latents, value, keep = weighted.extra
         counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
@@ -290,29 +280,29 @@ def make_ddpg(
             )
             actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
             metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))
-        if rewarded is not None:
-            metrics["train/autoencoder_loss"] = rewarded.loss
-        of_autoencoder = rewarded.gradient if rewarded is not None else None
+        if learned_reward is not None and rewarded is not None:
+            metrics[f"train/{learned_reward.name}_loss"] = rewarded.loss
+        of_model = rewarded.gradient if rewarded is not None else None
         # Of a learner in several parts, this is the one thing that an update waits for the others for.
         own_gradient = None if learning.reduces_early else weighted.gradient
-        own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts = shards.mean(
-            (own_gradient, actor_gradient, of_autoencoder, metrics, mean_square, counts)
+        own_gradient, actor_gradient, of_model, metrics, mean_square, counts = shards.mean(
+            (own_gradient, actor_gradient, of_model, metrics, mean_square, counts)
         )
         if mean_square is not None:
             metrics["train/action_size"] = jnp.sqrt(mean_square)
         metrics |= {f"train/{name}": share for name, share in diagnostics.shares(counts, shards.count).items()}
         critic_gradient = weighted.gradient if own_gradient is None else own_gradient
-        return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_autoencoder), metrics
+        return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_model), metrics
 
     def apply(working: Working, chosen: Gradients) -> Working:
         counts = working.counts + jnp.array([1, int(chosen.actor is not None), 1])
         agent = _apply(working.agent, counts, chosen, config)
-        if latent_reward is not None:
-            agent = agent.replace(autoencoder=latent_reward.apply(agent.autoencoder, chosen.autoencoder))
+        if learned_reward is not None:
+            agent = agent.replace(reward_model=learned_reward.apply(agent.reward_model, chosen.reward_model))
         return working._replace(agent=agent, copies=_compute_copies(networks, agent), counts=counts)
 
     return GradientSteps(
-        init=lambda key: _start(networks, auxiliary, latent_reward, key),
+        init=lambda key: _start(networks, auxiliary, learned_reward, key),
         begin=functools.partial(_begin, networks),
         prepare=prepare,
         gradients=gradients,
@@ -321,8 +311,14 @@ def make_ddpg(
     )
 
 
-def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Agent, Metrics]]:
-    """Build `Algorithm.update` from gradient steps."""
+DrawNoise = Callable[[jax.Array, int], jax.Array]
+"""(key, U) -> `Prepared.noise` of U gradient steps, [U, B, A]."""
+
+
+def make_update(
+    config: Config, steps: GradientSteps, draw_noise: DrawNoise | None = None
+) -> Callable[..., tuple[Agent, Metrics]]:
+    """Build `Algorithm.update` from gradient steps; ``draw_noise`` None: no noise in targets."""
     interval = config.ddpg.actor_interval
 
     def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
@@ -345,15 +341,17 @@ def make_update(config: Config, steps: GradientSteps) -> Callable[..., tuple[Age
             metrics = jnp.stack([_mean([row[name] for row in rows if name in row]) for name in names])
             return (working, prepared), metrics
 
-        def read(working: Working, choice: Any) -> Prepared:
-            return steps.prepare(working, batches.read(choice))
+        def read(working: Working, row: tuple[Any, jax.Array | None]) -> Prepared:
+            choice, noise = row
+            return steps.prepare(working, batches.read(choice))._replace(noise=noise)
 
+        # Drawn for all gradient steps at once, as the choices are: one by one it would be kernels in each.
+        count = jax.tree.leaves(batches.choices)[0].shape[0]
+        rows = (batches.choices, None if draw_noise is None else draw_noise(key, count))
         working = steps.begin(agent, statistics)
-        prepared = read(working, jax.tree.map(lambda leaf: leaf[0], batches.choices))
+        prepared = read(working, jax.tree.map(lambda leaf: leaf[0], rows))
         # The last prefetch wraps around to the first batch and is discarded.
-        following = jax.tree.map(
-            lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), batches.choices
-        )
+        following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, axis=0).reshape(-1, interval, *leaf.shape[1:]), rows)
         (working, _), metrics = jax.lax.scan(take, (working, prepared), following)
         return steps.end(working), dict(zip(names, jnp.mean(metrics, axis=0), strict=True))
 
@@ -366,21 +364,25 @@ def _mean(values: list[jax.Array]) -> jax.Array:
 
 def make(setup: Setup) -> Algorithm:
     """Build DDPG."""
+    return build(setup)
+
+
+def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = None) -> Algorithm:
+    """Build an algorithm of DDPG's family.
+
+    Args:
+        setup: Configuration and sizes.
+        critic_heads: Heads of the critic, which learn the same target, the least of theirs (`Networks.critic_heads`).
+        draw_noise: Noise on the actions in targets; None: none.
+    """
     config, resolved = setup.config, setup.resolved
-    networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias)
+    networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias, critic_heads)
     steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards)
+    policy = make_policy(networks)
 
-    def policy_params(agent: Agent, statistics: Statistics) -> ActorParams:
-        return ActorParams(networks.with_encoder(agent.actor, agent.critic), statistics.observations, statistics.goals)
-
-    def encode(policy: ActorParams, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
-        return networks.encode(policy.actor, networks.prepare(networks.scaling(statistics), observations))
-
-    def aim(policy: ActorParams, goals: jax.Array) -> jax.Array:
-        return encode(policy, policy.goals, goals)
-
-    def act(policy: ActorParams, observations: jax.Array, aim: jax.Array) -> jax.Array:
-        return networks.act(policy.actor, jnp.stack([encode(policy, policy.observations, observations), aim]))
+    def policy_params(agent: Agent, statistics: Statistics) -> PolicyParams:
+        return policy.params(networks.with_encoder(agent.actor, agent.critic), statistics)
 
     diagnose = functools.partial(_value_at_goals, networks)
-    return Algorithm(steps.init, act, make_update(config, steps), policy_params, aim, diagnose, networks)
+    update = make_update(config, steps, draw_noise)
+    return Algorithm(steps.init, policy.act, update, policy_params, policy.aim, diagnose, networks)

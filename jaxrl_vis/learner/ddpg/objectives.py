@@ -10,6 +10,7 @@ The actor's loss values its actions with the critic's latents from the critic's 
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -120,6 +121,11 @@ def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latent
     return of_actor, of_critic
 
 
+def _least(values: jax.Array) -> jax.Array:
+    """Return the least of the heads' values: [K, B] -> [B]."""
+    return values[0] if values.shape[0] == 1 else jnp.min(values, axis=0)
+
+
 @dataclasses.dataclass(frozen=True)
 class Objectives:
     """Losses of both networks and their weighted gradients, for one configuration."""
@@ -141,9 +147,12 @@ class Objectives:
         return self.shards.count > 1 and (weighting.needs != "losses" or weighting.reads_losses)
 
     def critic_gradient(
-        self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch
+        self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch, noise: jax.Array | None = None
     ) -> Callable[[Params, WeightingState], Weighted]:
-        """Build the function that computes the critic's losses and gradient; ``extra`` is (latents, values [B], keep [B])."""
+        """Build the function that computes the critic's losses and gradient; ``extra`` is (latents, values [B], keep [B]).
+
+        Several heads learn the same target; of their values, the least one counts. ``noise`` as for `_target`.
+        """
         networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
 
         def encode(encoder: Params) -> Latents:
@@ -152,11 +161,13 @@ class Objectives:
         def critic_losses(critic: Params, found: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
             latents = _together(self.auxiliary, found)
-            target = self._target(now, inputs, latents, batch)
-            value = networks.value(critic, latents.pair, batch.action)
+            target = self._target(now, inputs, latents, batch, noise)
+            values = networks.values(critic, latents.pair, batch.action)
+            value = _least(values)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
             others = self._auxiliary(critic, latents, inputs, image, batch)
-            return {MAIN: losses.critic_loss(value, target, keep, self._kept(keep)), **others}, (latents, value, keep)
+            errors = [losses.critic_loss(of_head, target, keep, self._kept(keep)) for of_head in values]
+            return {MAIN: functools.reduce(jnp.add, errors), **others}, (latents, value, keep)
 
         # Where gradients are passed on one by one, those of auxiliary losses need not pass through all that the main one does.
         passes_apart = way == "latents" and weighting.needs in ("dots", "gramian")
@@ -172,11 +183,15 @@ class Objectives:
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
 
-    def _target(self, now: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch) -> jax.Array:
+    def _target(self, now: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch, noise: jax.Array | None) -> jax.Array:
+        """Compute the critic's targets [B]; ``noise`` [B, A] is added to the next actions, None: nothing."""
         assert batch.reward is not None
         networks, resolved = self.networks, self.resolved
         of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
-        value_tp1 = networks.value(now.target_critic, of_critic, networks.act(now.target_actor, of_actor))
+        action = networks.act(now.target_actor, of_actor)
+        if noise is not None:
+            action = jnp.clip(action + noise, -1.0, 1.0)
+        value_tp1 = _least(networks.values(now.target_critic, of_critic, action))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 

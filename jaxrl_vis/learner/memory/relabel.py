@@ -5,6 +5,7 @@ For the transition from slot t to t+1:
 
     with p1 p2          slot t+1                     reached for certain: a positive even under the indicator reward
     with p1 (1 - p2)    a slot of t+1 ... T, evenly  hindsight experience replay's "future" (Andrychowicz et al., 2017)
+                        or slot t+k in proportion to gamma^k: states that contrastive RL contrasts (Eysenbach et al., 2022)
     with 1 - p1         slot T+1                     the goal that the policy was given
 
 What is observed in that slot becomes the goal in `sampling`.
@@ -16,8 +17,27 @@ import jax.numpy as jnp
 from jaxrl_vis.learner.memory.random_integers import scaled
 
 
+def geometric_offsets(fraction: jax.Array, remaining: jax.Array, discount: float) -> jax.Array:
+    """Map uniform numbers in [0, 1) to 0 ... remaining - 1, each k in proportion to discount^k: [B] int32.
+
+    Args:
+        fraction: [B] float32.
+        remaining: [B] int32, at least 1.
+        discount: gamma in (0, 1).
+    """
+    # The inverse of the cumulative distribution, (1 - gamma^(k+1)) / (1 - gamma^n).
+    tail = 1.0 - fraction * (1.0 - discount**remaining)
+    offsets = jnp.floor(jnp.log(tail) / jnp.log(discount)).astype(jnp.int32)
+    return jnp.clip(offsets, 0, remaining - 1)
+
+
 def choose_goal_slots(
-    key: jax.Array, time: jax.Array, horizon: int, relabel_probability: float, balance_probability: float
+    key: jax.Array,
+    time: jax.Array,
+    horizon: int,
+    relabel_probability: float,
+    balance_probability: float,
+    discount: float | None = None,
 ) -> jax.Array:
     """Choose a goal slot for every transition: [B] int32 in {t+1, ..., T+1}.
 
@@ -27,8 +47,11 @@ def choose_goal_slots(
         horizon: T.
         relabel_probability: p1.
         balance_probability: p2.
+        discount: gamma of geometrically distributed goals; None: they are even.
     """
     strategy, fraction = jax.random.uniform(key, (2, *time.shape))
-    future = time + 1 + scaled(fraction, horizon - time)
+    remaining = horizon - time
+    later = scaled(fraction, remaining) if discount is None else geometric_offsets(fraction, remaining, discount)
+    future = time + 1 + later
     slots = jnp.where(strategy < relabel_probability, future, horizon + 1)
     return jnp.where(strategy < relabel_probability * balance_probability, time + 1, slots).astype(jnp.int32)

@@ -7,6 +7,7 @@ Rewards are recomputed from the contents of the replay, by the same functions th
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,11 +15,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
+from jaxrl_vis.config.methods import RewardFunction
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.memory import reward_errors
 from jaxrl_vis.learner.memory.random_integers import scaled
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import Indices, Replay
+from jaxrl_vis.learner.memory.rewards import make_reward
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, ReplayState
@@ -111,7 +114,8 @@ class Sampler:
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
         """Choose goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
         shares = self.config.goals.relabel_probability, self.resolved.balance_probability
-        return choose_goal_slots(key, time, self.replay.horizon, *shares)
+        discount = self.resolved.discount if self.config.goals.future_goals == "geometric" else None
+        return choose_goal_slots(key, time, self.replay.horizon, *shares, discount)
 
     def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
         """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
@@ -148,8 +152,8 @@ class Sampler:
         if self.config.study.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
-        if self.resolved.method.reward == "autoencoder":
-            return batch  # the learner rewards it, with the encoder as it is by then (`latent_reward`)
+        if self.resolved.method.is_learned:
+            return batch  # the learner rewards it, with the model as it is by then (`learned_reward`)
         return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
     def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
@@ -178,9 +182,11 @@ class Sampler:
         method = self.resolved.method
         if method.reward == "oracle":
             return self._estimated_reward(batch, clutter_end)
-        if callable(method.reward):
-            return method.reward(batch, reached, values["positive"], values["negative"])
-        return goals.indicator_reward(reached, batch.goal, num_axes=reached.ndim - 1, **values)
+        return self._reward(batch, reached, values["positive"], values["negative"])
+
+    @functools.cached_property
+    def _reward(self) -> RewardFunction:
+        return make_reward(self.config, self.resolved.method)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
         """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""

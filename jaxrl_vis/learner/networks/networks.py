@@ -1,12 +1,4 @@
-"""Encoder, actor and critic (OL-AUX, appendix; hyper-parameters in `Config`). The only file that knows flax.
-
-The encoder is a stack of 2x2 convolutions with stride 2. Such windows never overlap, so each layer IS a matrix product of
-[pixels, 4 * channels in] with [4 * channels in, channels out]. If the pixels are put into nested 2x2 blocks once,
-
-    [B, C, H, W]  ->  [B, H/16, W/16, 2*2, 2*2, 2*2, 2*2 * C]      (four layers; the finest block last)
-
-every layer is one reshape and one matrix product over the last axis, with no copy between layers. The order is made on the
-uint8 image, where it is cheapest. Borders that do not fill a block are cropped, as a convolution without padding does.
+"""Encoder, actor and critic (OL-AUX, appendix; hyper-parameters in `Config`) as pure functions of parameters.
 
 Observation and goal go through the same encoder; actor and critic have one each.
 """
@@ -16,7 +8,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -25,71 +16,12 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.blocks import shifted, to_blocks
 from jaxrl_vis.learner.networks.kernels import encoder as encoder_kernel
-from jaxrl_vis.learner.networks.matmul import product
+from jaxrl_vis.learner.networks.modules import Encoder, Head
 from jaxrl_vis.learner.networks.normalizer import Scaling
 from jaxrl_vis.types import Batch, NormalizerState, Params, Statistics
 
-_glorot = nn.initializers.glorot_uniform()
-
-# Inputs at most this wide are multiplied element by element: a GPU's matrix units would pad them.
-_NARROW = 16
-
-
-class _Encoder(nn.Module):
-    """Encoder: [B, blocks, 4^levels * C] -> [B, latent]; results of several arrays are concatenated."""
-
-    filters: Sequence[int]
-    latent_size: int
-    dtype: Any
-
-    @nn.compact
-    def __call__(self, *pieces: jax.Array, first_layer: int = 0) -> jax.Array:
-        pieces = tuple(blocks.astype(self.dtype) for blocks in pieces)
-        count, size = pieces[0].shape[1:]
-        channels = size // 4 ** (len(self.filters) - first_layer)
-        for level, filters in list(enumerate(self.filters))[first_layer:]:
-            # Initialised as the convolution that it is: fan-out counts the window too.
-            kernel = self.param(
-                f"kernel_{level}",
-                lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape),
-                (4 * channels, filters),
-            )
-            bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,)).astype(self.dtype)
-            kernel = kernel.astype(self.dtype)
-            pieces = tuple(nn.relu(product(values.reshape(-1, 4 * channels), kernel) + bias) for values in pieces)
-            channels = filters
-        # Only here, where they are smallest, are the pieces put together.
-        features = [values.reshape(-1, count * channels) for values in pieces]
-        features = jnp.concatenate(features) if len(features) > 1 else features[0]
-        return _Dense(self.latent_size, self.dtype, name="latent")(features)
-
-
-class _Dense(nn.Module):
-    """Dense layer [B, inputs] -> [B, size], as `flax.linen.Dense`.
-
-    Inputs may be split into parts to be concatenated, arrays [B, part] or [parts, B, part]: nothing is put together first.
-    """
-
-    size: int
-    dtype: Any
-    bias_init: nn.initializers.Initializer = nn.initializers.zeros
-
-    @nn.compact
-    def __call__(self, *inputs: jax.Array) -> jax.Array:
-        inputs = tuple(values if values.ndim == 3 else values[None] for values in inputs)
-        width = sum(values.shape[0] * values.shape[-1] for values in inputs)
-        kernel = self.param("kernel", _glorot, (width, self.size)).astype(self.dtype)
-        total, first = self.param("bias", self.bias_init, (self.size,)).astype(self.dtype), 0
-        for values in inputs:
-            parts, _, part = values.shape
-            rows = kernel[first : first + parts * part].reshape(parts, part, self.size)
-            values = values.astype(self.dtype)
-            if part <= _NARROW:
-                total = total + jnp.sum(values[..., None] * rows[:, None], axis=(0, 2))
-            else:
-                total = total + jnp.sum(product(values, rows), axis=0)
-            first += parts * part
-        return total
+# Folded into a critic's key for heads after the first. Large, because small numbers give the keys of `jax.random.split`.
+_FURTHER_HEADS = 0x686473
 
 
 def compute_dtype(config: Config) -> Any:
@@ -148,23 +80,6 @@ class Inputs(NamedTuple):
         return pieces
 
 
-class _Head(nn.Module):
-    """Head: inputs as for `_Dense` -> [B, outputs] float32."""
-
-    hidden_sizes: Sequence[int]
-    outputs: int
-    output_bias: float
-    dtype: Any
-
-    @nn.compact
-    def __call__(self, *inputs: jax.Array) -> jax.Array:
-        for layer, size in enumerate(self.hidden_sizes):
-            inputs = (nn.relu(_Dense(size, self.dtype, name=f"hidden_{layer}")(*inputs)),)
-        # The last layer stays in float32: near Q = -50 neighbouring bfloat16 numbers lie 0.25 apart.
-        bias = nn.initializers.constant(self.output_bias)
-        return _Dense(self.outputs, jnp.float32, bias, name="output")(*inputs)
-
-
 @dataclasses.dataclass(frozen=True)
 class Networks:
     """Pure functions of parameters, for one task and one configuration.
@@ -175,13 +90,16 @@ class Networks:
             four networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
         act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
-        value: (critic, latents [2, B, latent], action [B, A]) -> [B] float32.
+        values: (critic, latents [2, B, latent], action [B, A]) -> [K, B] float32, of each head.
+        value: The same of the first head: [B] float32.
+        critic_heads: K, heads of the critic on one encoder. With several, their parameters have a leading axis [K].
     """
 
     config: Config
     observation_spec: jax.ShapeDtypeStruct
     action_size: int
     critic_output_bias: float
+    critic_heads: int = 1
 
     def __post_init__(self) -> None:
         """Check the image size, and the maximum shift against it.
@@ -235,16 +153,18 @@ class Networks:
 
     @property
     def _encoder(self) -> Any:
-        return _Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
+        return Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
 
-    def _head(self, outputs: int, output_bias: float) -> Any:
-        return _Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype)
+    def head(self, outputs: int, output_bias: float = 0.0, stabilised: bool = False) -> Any:
+        """Build a head of the configured hidden layers: a flax module, inputs as for `Dense` -> [B, outputs] float32."""
+        return Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype, stabilised)
 
     @property
-    def _latent_size(self) -> int:
+    def latent_size(self) -> int:
+        """Size of an encoded observation; a state vector is its own."""
         return self.config.network.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
 
-    def _init(self, key: jax.Array, head: _Head, head_inputs: int, has_encoder: bool = True) -> Params:
+    def _init(self, key: jax.Array, head: Head, head_inputs: int, has_encoder: bool = True) -> Params:
         encoder_key, head_key = jax.random.split(key)
         params = {"head": head.init(head_key, jnp.zeros((1, head_inputs)))["params"]}
         if self.sees_images and has_encoder:
@@ -259,11 +179,17 @@ class Networks:
     def init_actor(self, key: jax.Array) -> Params:
         """Initialise the actor: without an encoder if it shares the critic's."""
         has_encoder = self.config.network.encoders == "separate"
-        return self._init(key, self._head(self.action_size, 0.0), 2 * self._latent_size, has_encoder=has_encoder)
+        return self._init(key, self.head(self.action_size, 0.0), 2 * self.latent_size, has_encoder=has_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
         """Initialise the critic."""
-        return self._init(key, self._head(1, self.critic_output_bias), 2 * self._latent_size + self.action_size)
+        head, width = self.head(1, self.critic_output_bias), 2 * self.latent_size + self.action_size
+        critic = self._init(key, head, width)
+        if self.critic_heads == 1:
+            return critic
+        keys = jax.random.split(jax.random.fold_in(key, _FURTHER_HEADS), self.critic_heads - 1)
+        others = [head.init(own, jnp.zeros((1, width)))["params"] for own in keys]
+        return {**critic, "head": jax.tree.map(lambda *leaves: jnp.stack(leaves), critic["head"], *others)}
 
     def init_target(self, online: Params) -> Params:
         """Copy online parameters for a target network: the head alone if targets have no encoders."""
@@ -360,8 +286,18 @@ class Networks:
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
         """Compute actions [B, A] float32 in (-1, 1) from latents [2, B, latent] of observations and goals."""
-        return jnp.tanh(self._head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
+        return jnp.tanh(self.head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
+
+    def values(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
+        """Compute the values [K, B] float32 that each head has of actions [B, A]; latents [2, B, latent] as for `act`."""
+        if self.critic_heads == 1:
+            return self._value(critic["head"], latents, action)[None]
+        return jax.vmap(self._value, (0, None, None))(critic["head"], latents, action)
 
     def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        """Compute values [B] float32 of actions [B, A] from latents [2, B, latent] of observations and goals."""
-        return self._head(1, self.critic_output_bias).apply({"params": critic["head"]}, latents, action)[..., 0]
+        """Compute the values [B] float32 that the first head has of actions [B, A]."""
+        head = critic["head"]
+        return self._value(head if self.critic_heads == 1 else jax.tree.map(lambda leaf: leaf[0], head), latents, action)
+
+    def _value(self, head: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
+        return self.head(1, self.critic_output_bias).apply({"params": head}, latents, action)[..., 0]

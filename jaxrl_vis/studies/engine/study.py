@@ -16,7 +16,7 @@ class Variant:
 
     Attributes:
         label: Label in the figure.
-        changes: Fields of `Config` that define it.
+        changes: Fields of `Config` that define it; ``{task}`` in a word stands for the environment.
         colour: Colour of its line.
     """
 
@@ -120,7 +120,9 @@ def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
     config = preset(scope.preset, env=task, seed=scope.seed, seeds=scope.seeds)
     config = config.replace(**_OF_PRESET.get(scope.preset, {}), **study.family.of_task.get((scope.preset, task), {}))
     config = config.replace(env_steps=_budget(study, task, variant, scope, config))
-    changed = config.replace(**study.family.variants[variant].changes).replace(**scope.changes)
+    changes = study.family.variants[variant].changes
+    own = {name: value.format(task=task) if isinstance(value, str) else value for name, value in changes.items()}
+    changed = config.replace(**own).replace(**scope.changes)
     options = (re.sub(r"[^\w=.-]", "_", option) for option in changed.environment.env_options)  # for a folder's name
     family = "-".join((task, variant, scope.preset, *options))
     return split_seeds(Cell(family, validate(changed)), scope.seeds_per_run or scope.seeds)

@@ -4,7 +4,7 @@ FIGURE.png   the lines of finished cells; in figures 5.4 to 5.7 also, dashed, th
 FIGURE.md    the tables, and a description of the runs
 FIGURE.csv   the same numbers, for further computation
 
-`ol_aux` and `indicator` define the runs of a figure; `ol_aux_figures` and `indicator_figures` their presentation.
+`ol_aux`, `indicator` and `goals` define the runs of a figure; files of the same names here their presentation.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,18 +14,19 @@ from jaxrl_vis.host import streams
 from jaxrl_vis.host.devices import list_devices, shared
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.spreadsheets import to_csv
-from jaxrl_vis.studies import indicator, ol_aux
+from jaxrl_vis.studies import goals, indicator, ol_aux
 from jaxrl_vis.studies.engine.grid import run_cells
 from jaxrl_vis.studies.engine.results import Line, read_lines
 from jaxrl_vis.studies.engine.study import Study, make_cells
-from jaxrl_vis.studies.figures import indicator_figures, ol_aux_figures
+from jaxrl_vis.studies.figures import goals_figure, indicator_figures, ol_aux_figures
 from jaxrl_vis.studies.figures.drawing import draw_panels
 from jaxrl_vis.studies.figures.show import FigureContent, Request
 
-STUDIES: dict[str, Study] = {**indicator.STUDIES, **ol_aux.STUDIES}
+STUDIES: dict[str, Study] = {**indicator.STUDIES, **goals.STUDIES, **ol_aux.STUDIES}
 """Studies by figure."""
 
 _SHOW: dict[str, Callable[..., FigureContent]] = {
+    goals.FAMILY.name: goals_figure.show,
     indicator.FAMILY.name: indicator_figures.show,
     ol_aux.FAMILY.name: ol_aux_figures.show,
 }

@@ -1,0 +1,53 @@
+"""Behaviour cloning with relabelled goals as an algorithm: ``--algorithm benchmarks.tasks.behaviour_cloning:make``.
+
+The actor of the shared networks learns the action that was taken on the way to the goal that its episode has reached; the
+simplest learner from recordings, and one file against the same interface as the built-in algorithms.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.algorithm import Algorithm, Setup, scan_batches
+from jaxrl_vis.learner.ddpg import adam
+from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.learner.networks.policy import make_policy
+from jaxrl_vis.types import Batch, Metrics, Params, Statistics
+
+
+class Cloned(NamedTuple):
+    """Actor and its optimiser."""
+
+    actor: Params
+    optimizer: Any
+
+
+def make(setup: Setup) -> Algorithm:
+    """Build behaviour cloning."""
+    config = setup.config.replace(encoders="separate")  # the actor has an encoder of its own: there is no critic
+    networks = Networks(config, setup.observation_spec, setup.action_size, 0.0)
+    policy = make_policy(networks)
+
+    def init(key: jax.Array) -> Cloned:
+        actor = networks.init_actor(key)
+        return Cloned(actor, adam.init(actor))
+
+    def step(agent: Cloned, statistics: Statistics, batch: Batch, key: jax.Array) -> tuple[Cloned, Metrics]:
+        inputs = networks.prepare_batch(networks.batch_scaling(statistics), batch)
+
+        def loss(actor: Params) -> jax.Array:
+            latents = networks.encode_pieces(actor, inputs.pieces("before", "goal")).reshape(2, inputs.size, -1)
+            return jnp.mean(jnp.square(networks.act(actor, latents) - batch.action))
+
+        value, gradient = jax.value_and_grad(loss)(agent.actor)
+        value, gradient = setup.shards.mean((value, gradient))
+        count = adam.count(agent.optimizer) + 1
+        correction = adam.corrections(count[None])[0]
+        actor, moments = adam.step(agent.actor, gradient, agent.optimizer, config.ddpg.actor_learning_rate, correction)
+        return Cloned(actor, adam.with_count(moments, count)), {"train/imitation_loss": value}
+
+    def policy_params(agent: Cloned, statistics: Statistics) -> Any:
+        return policy.params(agent.actor, statistics)
+
+    return Algorithm(init, policy.act, scan_batches(step), policy_params, policy.aim)

@@ -1,0 +1,93 @@
+"""``jaxrl-vis audit``."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated
+
+from jaxrl_vis.cli.checks import check_counts, check_env
+from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.config import Pixels, preset
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.report.outputs import check_figure, check_writable
+
+
+@dataclasses.dataclass(frozen=True)
+class Audit:
+    """Compare rewards of image and goal image with the truth of a task: false rewards, order, calibration, exploitation.
+
+    Nothing is trained. A reward of your own is a function of two batches of images [B, C, H, W] uint8, with values between
+    0 and 1: --rewards module:function. A run folder stands for the reward that the run has trained along.
+    """
+
+    env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
+    """Environment with images: a name that `jaxrl-vis envs` lists, or module:Name for your own."""
+    rewards: tuple[str, ...] = ("indicator", "indicator_tolerance")
+    """indicator, indicator_tolerance, features, run folders, or module:function."""
+    episodes: int = 64
+    """Number of episodes of random actions."""
+    goals: int = 32
+    """Number of goals that a random search is to reach by the reward alone."""
+    sequences: int = 64
+    """Number of sequences of actions that it tries for each goal."""
+    noise: float = 0.0
+    """Standard deviation of camera noise, grey levels."""
+    tolerance: float = 8.0
+    """Difference that indicator_tolerance forgives, grey levels."""
+    tolerance_share: float = 0.99
+    """Fraction of the elements that must be equal for indicator_tolerance."""
+    reward_encoder: str | None = None
+    """File with the encoder of features, from `jaxrl-vis encoder`."""
+    pixels: Pixels = "rgbd"
+    """Channels of the images."""
+    image_size: int = 64
+    """Height and width of the images, in pixels."""
+    env_options: tuple[str, ...] = ()
+    """Further options of the environment, as name=value."""
+    seed: int = 0
+    """Seed of episodes and search."""
+    out: Path | None = None
+    """Also draw rewards against distances into this .png, .pdf or .svg."""
+    json: Path | None = None
+    """Also write the numbers to this file."""
+    trust: bool = False
+    """Execute a run's own code without asking (docs/runs.md)."""
+
+
+def run(options: Audit) -> int:
+    """Audit the rewards, and print a table."""
+    check_env(options.env)
+    check_counts(episodes=options.episodes, goals=options.goals, sequences=options.sequences, image_size=options.image_size)
+    if options.episodes < 2:
+        raise RequestError(f"episodes {options.episodes}: other episodes' goals need at least 2")
+    if options.noise < 0.0:
+        raise RequestError(f"noise {options.noise} must not be negative")
+    if options.out is not None:
+        check_figure(options.out)
+    if options.json is not None:
+        check_writable(options.json, "--json")
+    check_devices()
+    from jaxrl_vis.learner.environment import locate_env, make_env
+    from jaxrl_vis.studies.audit import report
+    from jaxrl_vis.studies.audit.rewards import find_reward
+
+    shown = {"env": options.env, "pixels": options.pixels, "image_size": options.image_size, "env_options": options.env_options}
+    config = locate_env(preset("fast", **shown, random_shift=0))
+    env = make_env(config)
+    config = config.replace(
+        tolerance=options.tolerance, tolerance_share=options.tolerance_share, reward_encoder=options.reward_encoder
+    )
+    rewards = {name: find_reward(name, config, options.trust) for name in options.rewards}
+    counts = {"episodes": options.episodes, "goals": options.goals, "sequences": options.sequences}
+    records, pairs, values = report.audit(env, rewards, **counts, noise=options.noise, seed=options.seed)
+    print(report.table(records))
+    if options.out is not None:
+        report.draw(pairs, values, env.threshold, env.distance_unit, options.out)
+        print(options.out)
+    if options.json is not None:
+        asked = {key: value for key, value in dataclasses.asdict(options).items() if key not in ("out", "json", "trust")}
+        record = {"audit": asked, "device": report.devices(), "pairs": len(pairs.distance), "rewards": records}
+        write_atomically(options.json, json.dumps(record, indent=2) + "\n")
+    return 0

@@ -1,0 +1,222 @@
+"""Indicator rewards for a robot of your own: the method of the thesis's section 5.1.4 on plain arrays, without a simulator.
+
+    goal_slots    which later observation of its episode becomes the goal of a transition: relabelling and balancing
+    rewards       positive where what was reached equals the goal, exactly or but for camera noise
+    keep_mask     0 for negatives that the critic contradicts: the filter
+    Learner       all of these in a learner that is fed with episodes, recorded ones or those that it has just played
+    learn         a learner trained on an .npz file of recorded episodes
+
+Observations are images [H, W, C] uint8 or vectors [S] float32, actions [A] lie in [-1, 1], and all episodes have equally many
+steps.
+"""
+
+import functools
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.config import Config, preset, validate
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.plugins import call, find
+from jaxrl_vis.learner import train_step
+from jaxrl_vis.learner.algorithm import Algorithm, Setup
+from jaxrl_vis.learner.auxtasks.auxiliary import make_auxiliary
+from jaxrl_vis.learner.ddpg.losses import keep_mask
+from jaxrl_vis.learner.iteration import choose_batches
+from jaxrl_vis.learner.memory.relabel import choose_goal_slots as goal_slots
+from jaxrl_vis.learner.memory.replay import Replay
+from jaxrl_vis.learner.memory.sampling import Sampler
+from jaxrl_vis.learner.networks import normalizer
+from jaxrl_vis.learner.networks.networks import compute_dtype
+from jaxrl_vis.learner.resolved import resolve
+from jaxrl_vis.types import Episodes, ReplayState, TrainState
+from jaxrl_vis_envs.goals import indicator_reward as rewards
+
+__all__ = ["Learner", "goal_slots", "keep_mask", "learn", "rewards"]
+
+_INSERT, _UPDATE = 0x696E73, 0x757064  # folded into the seed's key
+# Metrics that compare rewards with true states, which nobody knows here.
+_NEED_TRUTH = ("false_", "filtered_false")
+
+
+def _planar(images: np.ndarray) -> np.ndarray:
+    """Convert images [..., H, W, C] to [..., C, H, W]; vectors stay as they are."""
+    return np.moveaxis(images, -1, -3) if images.dtype == np.uint8 else images.astype(np.float32)
+
+
+class Learner:
+    """Off-policy learner that is fed with whole episodes.
+
+    Example::
+
+        learner = Learner((64, 64, 3), action_size=4, horizon=50)
+        learner.add(observations, actions, goal)        # [T+1, 64, 64, 3], [T, 4], [64, 64, 3]
+        learner.update(50)
+        action = learner.act(observation, goal)
+
+    Attributes:
+        config: All settings.
+        episodes: Number of episodes added so far.
+    """
+
+    def __init__(
+        self, observation_shape: tuple[int, ...], action_size: int, horizon: int, capacity: int = 1000, **options: Any
+    ) -> None:
+        """Initialise networks and an empty replay.
+
+        Args:
+            observation_shape: (H, W, C) of images, or (S,) of vectors.
+            action_size: A.
+            horizon: T, steps of an episode.
+            capacity: Number of episodes that are kept.
+            **options: Options of `jaxrl-vis train`, by name: ``preset`` (``cpu`` if not given), ``seed``, ``method``
+                (``indicator_balance_filter``, or with a ``tolerance`` ``indicator_tolerance``), ``algorithm``, ...
+
+        Raises:
+            RequestError: A size or an option is wrong, or needs true states.
+        """
+        if len(observation_shape) not in (1, 3) or min(*observation_shape, action_size, horizon, capacity) < 1:
+            raise RequestError(
+                f"observations are images (H, W, C) or vectors (S,), not {observation_shape}; sizes are at least 1"
+            )
+        method = "indicator_tolerance" if "tolerance" in options else "indicator_balance_filter"
+        name = str(options.pop("preset", "cpu"))
+        self.config: Config = validate(preset(name, **{"method": method, "env": "recordings", **options}))
+        if self.config.run.seeds != 1 or self.config.run.devices != 1:
+            raise RequestError("a learner on the host has one seed and one device")
+        resolved = resolve(self.config, horizon)
+        if resolved.method.reward == "oracle" and self.config.run.algorithm != "contrastive":
+            raise RequestError("method oracle needs true states, which recordings do not have: use indicator_balance_filter")
+        shape = observation_shape if len(observation_shape) == 1 else (observation_shape[2], *observation_shape[:2])
+        self._spec = jax.ShapeDtypeStruct(shape, jnp.uint8 if len(shape) == 3 else jnp.float32)
+        self._given_shape, self._action_size, self._horizon = tuple(observation_shape), action_size, horizon
+        auxiliary = make_auxiliary(self.config, self._spec, action_size, 1, compute_dtype(self.config))
+        if auxiliary.tasks:
+            raise RequestError("a learner on the host has no auxiliary losses: leave out aux_tasks")
+        setup = Setup(self.config, resolved, self._spec, action_size, auxiliary)
+        wanted = self.config.run.algorithm
+        maker = find("algorithm", wanted, train_step.ALGORITHMS, self.config.environment.env_folder)
+        self._algorithm = call("algorithm", wanted, maker, setup, of=Algorithm)
+        self._replay = Replay(capacity, 1, horizon)
+        self._sampler = Sampler(self.config, resolved, self._replay, threshold=0.0)
+        self._key = jax.random.key(self.config.run.seed)
+        self._train = TrainState(jax.jit(self._algorithm.init)(self._key), normalizer.init(self._spec))
+        self._state: ReplayState = self._replay.init(self._spec, 1, action_size)
+        self._updates: dict[int, Callable[..., Any]] = {}
+        self.episodes, self._calls = 0, 0
+
+    def _checked(self, name: str, array: Any, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        array = np.asarray(array)
+        if array.shape != shape or (dtype == np.uint8) != (array.dtype == np.uint8) or not np.all(np.isfinite(array)):
+            wanted = "uint8" if dtype == np.uint8 else "finite numbers"
+            raise RequestError(f"{name} must be {wanted} of the shape {shape}, not {array.dtype} of {array.shape}")
+        return array.astype(dtype)
+
+    def add(self, observations: Any, actions: Any, goal: Any = None) -> None:
+        """Add an episode to the replay; the oldest one gives way once it is full.
+
+        Args:
+            observations: [T+1, ...] before the first action, and after each.
+            actions: [T, A] as executed, in [-1, 1].
+            goal: [...] what the robot was to reach; None: nothing, and its last observation takes the place.
+
+        Raises:
+            RequestError: A shape, a type or a number is wrong.
+        """
+        dtype = np.dtype(self._spec.dtype)
+        seen = self._checked("observations", observations, (self._horizon + 1, *self._given_shape), dtype)
+        done = self._checked("actions", actions, (self._horizon, self._action_size), np.dtype(np.float32))
+        aim = seen[-1] if goal is None else self._checked("goal", goal, self._given_shape, dtype)
+        episode = Episodes(
+            observations=_planar(np.concatenate([seen, aim[None]]))[None],  # type: ignore[arg-type]
+            states=np.zeros((1, self._horizon + 2, 1), np.float32),  # type: ignore[arg-type]
+            actions=np.clip(done, -1.0, 1.0)[None],  # type: ignore[arg-type]
+        )
+        self._state, self._train = self._insert(self._state, self._train, episode, self.episodes)
+        self.episodes += 1
+
+    @functools.cached_property
+    def _insert(self) -> Callable[..., tuple[ReplayState, TrainState]]:
+        def insert(
+            state: ReplayState, train: TrainState, episode: Episodes, number: jax.Array
+        ) -> tuple[ReplayState, TrainState]:
+            statistics = normalizer.update(train.normalizer, episode.observations)
+            return self._replay.insert(state, episode, number), train.replace(normalizer=statistics)
+
+        return jax.jit(insert, donate_argnums=0)
+
+    def update(self, count: int) -> dict[str, float]:
+        """Take ``count`` gradient steps, and return means of their metrics (docs/learner.md).
+
+        Raises:
+            RequestError: There are no episodes yet.
+        """
+        if self.episodes == 0:
+            raise RequestError("there is nothing to learn from yet: add episodes first")
+        config = self.config.replace(updates_per_iteration=count)
+        validate(config)
+
+        def update(train: TrainState, state: ReplayState, key: jax.Array, latest: jax.Array) -> Any:
+            batches = choose_batches(config, self._sampler, state, key, latest)
+            agent, metrics = self._algorithm.update(train.agent, train.statistics, batches, jax.random.fold_in(key, _UPDATE))
+            return train.replace(agent=agent), metrics
+
+        key = jax.random.fold_in(jax.random.fold_in(self._key, _INSERT), self._calls)
+        compiled = self._updates.setdefault(count, jax.jit(update, donate_argnums=0))
+        self._train, metrics = compiled(self._train, self._state, key, self.episodes - 1)
+        self._calls += 1
+        known = {name: value for name, value in metrics.items() if not name.removeprefix("train/").startswith(_NEED_TRUTH)}
+        return {name: float(value) for name, value in jax.device_get(known).items()}
+
+    def act(self, observation: Any, goal: Any) -> np.ndarray:
+        """Compute the policy's action [A] float32 in [-1, 1], without exploration, for an observation and a goal [...].
+
+        Raises:
+            RequestError: A shape or a type is wrong.
+        """
+        dtype = np.dtype(self._spec.dtype)
+        seen, aim = (self._checked(*each, self._given_shape, dtype) for each in (("observation", observation), ("goal", goal)))
+        return np.asarray(self._act(self._train, _planar(seen)[None], _planar(aim)[None])[0])
+
+    @functools.cached_property
+    def _act(self) -> Callable[..., jax.Array]:
+        def act(train: TrainState, observations: jax.Array, goals: jax.Array) -> jax.Array:
+            policy = self._algorithm.policy_params(train.agent, train.statistics)
+            return self._algorithm.act(policy, observations, self._algorithm.aim(policy, goals))
+
+        return jax.jit(act)
+
+
+def learn(recordings: Path | str, updates: int = 5000, **options: Any) -> Learner:
+    """Train a learner on recorded episodes.
+
+    Args:
+        recordings: An .npz file with ``observations`` [N, T+1, ...], ``actions`` [N, T, A], and possibly ``goals`` [N, ...].
+        updates: Number of gradient steps, rounded up to whole hundreds if it is more than that.
+        **options: As of `Learner`.
+
+    Raises:
+        RequestError: The file is missing or has no such arrays, or an option is wrong.
+    """
+    try:
+        with np.load(recordings, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in ("observations", "actions", "goals") if name in file.files}
+        observations, actions = arrays["observations"], arrays["actions"]
+        count, length, *shape = observations.shape
+        if actions.ndim != 3 or actions.shape[:2] != (count, length - 1):
+            raise RequestError(f"actions must have the shape ({count}, {length - 1}, A), not {actions.shape}")
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise RequestError(f"{recordings} has no recorded episodes, observations and actions: {error}") from error
+    learner = Learner(tuple(shape), actions.shape[2], length - 1, capacity=count, **options)
+    goals = arrays.get("goals", [None] * count)
+    for episode in range(count):
+        learner.add(observations[episode], actions[episode], goals[episode])
+    together = min(updates, 100)
+    for _ in range(-(-updates // together)):
+        learner.update(together)
+    return learner

@@ -1,0 +1,182 @@
+"""Rewards of models that are trained along with the learner: an encoder of images of their own, and a loss.
+
+    autoencoder   cosine of the latents of achieved observation and goal (thesis, section 5.1.5, Auto Encoder); reconstructs
+                  achieved observations
+    classifier    probability that the achieved observation is the goal (after VICE: Fu et al., 2018, arXiv 1805.11686); tells
+                  goals, each with itself, from achieved observations with their goals
+
+Rewards lie between R- and R+, and are recomputed for every batch with the current model, without gradient.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner import auxtasks
+from jaxrl_vis.learner.memory.rewards import cosine_reward
+from jaxrl_vis.learner.networks.networks import Inputs, Networks, Piece
+from jaxrl_vis.learner.networks.normalizer import Scaling
+from jaxrl_vis.learner.resolved import Resolved
+from jaxrl_vis.types import Batch, Params, Replaceable
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ModelState(Replaceable):
+    """State of a model between two gradient steps.
+
+    Attributes:
+        params: Nested dictionaries of float32.
+        optimizer: optax state.
+    """
+
+    params: Params
+    optimizer: Any
+
+
+class Rewarded(NamedTuple):
+    """Result of `LearnedReward.of_batch`.
+
+    Attributes:
+        reward: [B] float32, without gradient.
+        loss: [] float32, the model's.
+        gradient: Gradient of that loss, for the parameters, float32.
+    """
+
+    reward: jax.Array
+    loss: jax.Array
+    gradient: Params
+
+
+class Seen(NamedTuple):
+    """Observations that a model compares, as encoders read them.
+
+    Attributes:
+        reached, goal: Pieces of prepared observations, of B transitions each.
+        image: [B, C, H, W] what was reached, normalised.
+        batch: The transitions.
+    """
+
+    reached: list[Piece]
+    goal: list[Piece]
+    image: jax.Array
+    batch: Batch
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedReward:
+    """Model of one configuration; all methods are pure. Create it with `make_learned_reward`.
+
+    Attributes:
+        name: Method, for the name of its loss.
+        networks: Architecture of the encoder.
+        init_params: key -> parameters.
+        loss_and_reward: (parameters, `Seen`) -> loss [] and rewards [B] float32.
+        optimizer: Of the parameters.
+    """
+
+    name: str
+    networks: Networks
+    init_params: Callable[[jax.Array], Params]
+    loss_and_reward: Callable[[Params, Seen], tuple[jax.Array, jax.Array]]
+    optimizer: optax.GradientTransformation
+
+    def init(self, key: jax.Array) -> ModelState:
+        """Initialise the model."""
+        params = self.init_params(key)
+        return ModelState(params=params, optimizer=self.optimizer.init(params))
+
+    def of_batch(self, state: ModelState, scaling: Scaling, inputs: Inputs, batch: Batch) -> Rewarded:
+        """Compute the rewards of a batch, and the model's gradient.
+
+        Args:
+            state: The model.
+            scaling: Scaling of observations.
+            inputs: From `Networks.prepare_batch`.
+            batch: The transitions.
+        """
+        if batch.reached is None:
+            reached, pieces = batch.observation_tp1, inputs.pieces("after")
+        else:
+            reached = batch.reached
+            pieces = [(self.networks.prepare(scaling, reached), slice(None))]
+        seen = Seen(pieces, inputs.pieces("goal"), self.networks.normalize(scaling, reached), batch)
+        (loss, reward), gradient = jax.value_and_grad(self.loss_and_reward, has_aux=True)(state.params, seen)
+        return Rewarded(jax.lax.stop_gradient(reward), loss, gradient)
+
+    def apply(self, state: ModelState, gradient: Params) -> ModelState:
+        """Take one step of the optimiser."""
+        change, moments = self.optimizer.update(gradient, state.optimizer)
+        return ModelState(params=optax.apply_updates(state.params, change), optimizer=moments)
+
+
+def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
+    """Build the autoencoder, in whose latent space observations are compared."""
+    shape = networks.observation_spec, networks.action_size, config.network.latent_size
+    spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
+    task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
+
+    def init(key: jax.Array) -> Params:
+        encoder_key, decoder_key = jax.random.split(key)
+        return {"encoder": networks.init_encoder(encoder_key), "decoder": task.init(decoder_key)}
+
+    def loss_and_reward(params: Params, seen: Seen) -> tuple[jax.Array, jax.Array]:
+        latent = networks.encode_pieces(params, seen.reached)
+        view = auxtasks.View(latent_t=latent, action=seen.batch.action, image=seen.image)
+        goal_latent = networks.encode_pieces(jax.lax.stop_gradient(params), seen.goal)
+        reward = cosine_reward(latent, goal_latent, resolved.reward_positive, resolved.reward_negative)
+        return task.loss(params["decoder"], view), reward
+
+    return LearnedReward("autoencoder", networks, init, loss_and_reward, optax.adam(config.ddpg.critic_learning_rate))
+
+
+def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
+    """Build the classifier of pairs of achieved observation and goal.
+
+    All that was achieved counts as a negative, as in VICE, even where it is the goal: there, both classes are equally likely.
+    """
+    head = networks.head(1)
+
+    def init(key: jax.Array) -> Params:
+        encoder_key, head_key = jax.random.split(key)
+        inputs = jnp.zeros((1, 2 * config.network.latent_size))
+        return {"encoder": networks.init_encoder(encoder_key), "head": head.init(head_key, inputs)["params"]}
+
+    def loss_and_reward(params: Params, seen: Seen) -> tuple[jax.Array, jax.Array]:
+        reached, goal = (networks.encode_pieces(params, pieces) for pieces in (seen.reached, seen.goal))
+        pairs = jnp.stack([jnp.concatenate([goal, reached]), jnp.concatenate([goal, goal])])
+        of_goals, of_reached = head.apply({"params": params["head"]}, pairs)[:, 0].reshape(2, -1)
+        loss = jnp.mean(jax.nn.softplus(-of_goals)) + jnp.mean(jax.nn.softplus(of_reached))
+        share = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair that is in both classes has half of R+ to R-
+        return loss, resolved.reward_negative + (resolved.reward_positive - resolved.reward_negative) * share
+
+    return LearnedReward("classifier", networks, init, loss_and_reward, optax.adam(config.ddpg.critic_learning_rate))
+
+
+_MAKERS = {"autoencoder": make_autoencoder, "classifier": make_classifier}
+
+
+def make_learned_reward(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward | None:
+    """Build the model that computes the rewards; None if the configuration's method has none.
+
+    Args:
+        networks: Architecture of the model's own encoder.
+        config: The method and the step size, that of the critic.
+        resolved: R+ and R-.
+
+    Raises:
+        RequestError: Observations are no images.
+    """
+    method = resolved.method
+    if method.needs_images and not networks.sees_images:
+        raise RequestError(
+            f"method {config.reward.method} encodes images, and {config.environment.env} shows states: train on "
+            f"Visual{config.environment.env}, or use --method indicator"
+        )
+    return _MAKERS[str(method.reward)](networks, config, resolved) if method.is_learned else None

@@ -1,0 +1,116 @@
+"""Modules of the networks: encoder of images, dense layer, head. The only file that knows flax.
+
+The encoder is a stack of 2x2 convolutions with stride 2. Such windows never overlap, so each layer IS a matrix product of
+[pixels, 4 * channels in] with [4 * channels in, channels out]. If the pixels are put into nested 2x2 blocks once,
+
+    [B, C, H, W]  ->  [B, H/16, W/16, 2*2, 2*2, 2*2, 2*2 * C]      (four layers; the finest block last)
+
+every layer is one reshape and one matrix product over the last axis, with no copy between layers. The order is made on the
+uint8 image, where it is cheapest. Borders that do not fill a block are cropped, as a convolution without padding does.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.networks.matmul import product
+
+_glorot = nn.initializers.glorot_uniform()
+
+
+def _cold(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+    """Initialise kernels that make hardly any output: uniform in [-1e-12, 1e-12]."""
+    return jax.random.uniform(key, shape, dtype, -1e-12, 1e-12)
+
+
+# Inputs at most this wide are multiplied element by element: a GPU's matrix units would pad them.
+_NARROW = 16
+
+
+class Encoder(nn.Module):
+    """Encoder: [B, blocks, 4^levels * C] -> [B, latent]; results of several arrays are concatenated."""
+
+    filters: Sequence[int]
+    latent_size: int
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, *pieces: jax.Array, first_layer: int = 0) -> jax.Array:
+        """Encode, from layer ``first_layer`` on."""
+        pieces = tuple(blocks.astype(self.dtype) for blocks in pieces)
+        count, size = pieces[0].shape[1:]
+        channels = size // 4 ** (len(self.filters) - first_layer)
+        for level, filters in list(enumerate(self.filters))[first_layer:]:
+            # Initialised as the convolution that it is: fan-out counts the window too.
+            kernel = self.param(
+                f"kernel_{level}",
+                lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape),
+                (4 * channels, filters),
+            )
+            bias = self.param(f"bias_{level}", nn.initializers.zeros, (filters,)).astype(self.dtype)
+            kernel = kernel.astype(self.dtype)
+            pieces = tuple(nn.relu(product(values.reshape(-1, 4 * channels), kernel) + bias) for values in pieces)
+            channels = filters
+        # Only here, where they are smallest, are the pieces put together.
+        features = [values.reshape(-1, count * channels) for values in pieces]
+        features = jnp.concatenate(features) if len(features) > 1 else features[0]
+        return Dense(self.latent_size, self.dtype, name="latent")(features)
+
+
+class Dense(nn.Module):
+    """Dense layer [B, inputs] -> [B, size], as `flax.linen.Dense`.
+
+    Inputs may be split into parts to be concatenated, arrays [B, part] or [parts, B, part]: nothing is put together first.
+    """
+
+    size: int
+    dtype: Any
+    bias_init: nn.initializers.Initializer = nn.initializers.zeros
+    kernel_init: nn.initializers.Initializer = _glorot
+
+    @nn.compact
+    def __call__(self, *inputs: jax.Array) -> jax.Array:
+        """Multiply and add."""
+        inputs = tuple(values if values.ndim == 3 else values[None] for values in inputs)
+        width = sum(values.shape[0] * values.shape[-1] for values in inputs)
+        kernel = self.param("kernel", self.kernel_init, (width, self.size)).astype(self.dtype)
+        total, first = self.param("bias", self.bias_init, (self.size,)).astype(self.dtype), 0
+        for values in inputs:
+            parts, _, part = values.shape
+            rows = kernel[first : first + parts * part].reshape(parts, part, self.size)
+            values = values.astype(self.dtype)
+            if part <= _NARROW:
+                total = total + jnp.sum(values[..., None] * rows[:, None], axis=(0, 2))
+            else:
+                total = total + jnp.sum(product(values, rows), axis=0)
+            first += parts * part
+        return total
+
+
+class Head(nn.Module):
+    """Head: inputs as for `Dense` -> [B, outputs] float32.
+
+    ``stabilised``: with layer normalisation, and outputs near 0 at first (Zheng et al., 2024, arXiv 2306.03346).
+    """
+
+    hidden_sizes: Sequence[int]
+    outputs: int
+    output_bias: float
+    dtype: Any
+    stabilised: bool = False
+
+    @nn.compact
+    def __call__(self, *inputs: jax.Array) -> jax.Array:
+        """Apply the layers."""
+        for layer, size in enumerate(self.hidden_sizes):
+            values = Dense(size, self.dtype, name=f"hidden_{layer}")(*inputs)
+            if self.stabilised:
+                values = nn.LayerNorm(dtype=self.dtype, name=f"normalization_{layer}")(values)
+            inputs = (nn.relu(values),)
+        # The last layer stays in float32: near Q = -50 neighbouring bfloat16 numbers lie 0.25 apart.
+        bias = nn.initializers.constant(self.output_bias)
+        kernel = _cold if self.stabilised else _glorot
+        return Dense(self.outputs, jnp.float32, bias, kernel, name="output")(*inputs)

@@ -1,0 +1,56 @@
+"""Deterministic policy of the shared networks: an actor, and the statistics that its observations are normalised with.
+
+All that `Algorithm.act`, ``aim`` and ``policy_params`` need, for any algorithm whose actor is that of `Networks`.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.learner.networks.networks import Networks
+from jaxrl_vis.types import NormalizerState, Params, Statistics
+
+
+class PolicyParams(NamedTuple):
+    """Parameters of the policy.
+
+    Attributes:
+        actor: With an encoder, of its own or the critic's.
+        observations, goals: Statistics that these are normalised with.
+    """
+
+    actor: Params
+    observations: NormalizerState
+    goals: NormalizerState
+
+
+class Policy(NamedTuple):
+    """Policy of given networks; pure functions.
+
+    Attributes:
+        params: (actor parameters with an encoder, Statistics) -> PolicyParams.
+        aim: (PolicyParams, goals [E, ...]) -> latents [E, latent], computed once per episode.
+        act: (PolicyParams, observations [E, ...], latents of the goals [E, latent]) -> actions [E, A] float32 in (-1, 1).
+    """
+
+    params: Callable[[Params, Statistics], PolicyParams]
+    aim: Callable[[PolicyParams, jax.Array], jax.Array]
+    act: Callable[[PolicyParams, jax.Array, jax.Array], jax.Array]
+
+
+def make_policy(networks: Networks) -> Policy:
+    """Build the policy of these networks."""
+
+    def encode(policy: PolicyParams, statistics: NormalizerState, observations: jax.Array) -> jax.Array:
+        return networks.encode(policy.actor, networks.prepare(networks.scaling(statistics), observations))
+
+    def act(policy: PolicyParams, observations: jax.Array, aim: jax.Array) -> jax.Array:
+        return networks.act(policy.actor, jnp.stack([encode(policy, policy.observations, observations), aim]))
+
+    return Policy(
+        params=lambda actor, statistics: PolicyParams(actor, statistics.observations, statistics.goals),
+        aim=lambda policy, goals: encode(policy, policy.goals, goals),
+        act=act,
+    )

@@ -1,0 +1,146 @@
+"""Images, goal images and true distances of a task, without a trained policy.
+
+hindsight   episodes of slowly changing random actions; each one's last image is its goal, so that all of them succeed
+pairs       images of episodes with goals: their own last image, those of other episodes, and the goals that were given
+search      for each of some goals, the best of many random sequences of actions by a reward: can it be exploited?
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxrl_vis_envs
+from jaxrl_vis_envs import goals as truth
+from jaxrl_vis_envs.base import GoalEnv
+
+_PERSISTENCE = 0.8  # share of an action that the next one keeps
+
+Reward = Callable[[jax.Array, jax.Array], jax.Array]
+"""(images [B, C, H, W] uint8, goal images of the same shape) -> rewards [B] float32 between 0 and 1."""
+
+
+class Episodes(NamedTuple):
+    """E episodes of T steps.
+
+    Attributes:
+        images: [E, T+1, ...] observations.
+        states: [E, T+1, G] float32, true states.
+        goals: [E, ...] the goal images that were given.
+        goal_states: [E, G] float32, what they show.
+    """
+
+    images: Any
+    states: Any
+    goals: Any
+    goal_states: Any
+
+
+class Pairs(NamedTuple):
+    """N pairs of an image and a goal image.
+
+    Attributes:
+        images, goals: [N, ...].
+        distance: [N] float32, true distance, in the task's unit.
+    """
+
+    images: Any
+    goals: Any
+    distance: Any
+
+
+class Found(NamedTuple):
+    """Result of a search over sequences of actions, for each of E goals.
+
+    Attributes:
+        reward: [E] float32, the greatest reward at the end of an episode.
+        is_reached: [E] bool, whether that episode truly reaches the goal.
+        could_reach: [E] bool, whether any of the sequences does.
+    """
+
+    reward: Any
+    is_reached: Any
+    could_reach: Any
+
+
+def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
+    """Draw slowly changing actions [T, A] in [-1, 1]."""
+
+    def step(action: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+        action = _PERSISTENCE * action + (1.0 - _PERSISTENCE**2) ** 0.5 * noise
+        return action, jnp.clip(action, -1.0, 1.0)
+
+    noise = jax.random.normal(key, (horizon, size))
+    return jax.lax.scan(step, jnp.zeros(size), noise)[1]
+
+
+def play(env: GoalEnv, count: int, seed: int) -> Episodes:
+    """Play ``count`` episodes of random actions."""
+
+    def episode(key: jax.Array) -> Episodes:
+        start_key, action_key = jax.random.split(key)
+        start: Any = env.reset(start_key)
+
+        def step(state: Any, action: jax.Array) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+            state = env.advance(state, action)
+            return state, (env.observe(state), state.achieved_state)
+
+        _, (images, states) = jax.lax.scan(step, start, _actions(action_key, env.horizon, env.action_size))
+        images = jnp.concatenate([start.obs["observation"][None], images])
+        states = jnp.concatenate([start.achieved_state[None], states])
+        return Episodes(images, states, start.obs["desired_goal"], start.goal_state)
+
+    episodes = jaxrl_vis_envs.jit(jax.vmap(episode))(jax.random.split(jax.random.key(seed), count))
+    return Episodes(*map(np.asarray, episodes))
+
+
+def with_noise(episodes: Episodes, deviation: float, seed: int) -> Episodes:
+    """Add camera noise of ``deviation`` grey levels to all images, drawn anew for every one."""
+    if deviation == 0.0:
+        return episodes
+    draw = np.random.default_rng(seed)
+
+    def noisy(images: np.ndarray) -> np.ndarray:
+        changed = images + deviation * draw.standard_normal(images.shape, np.float32)
+        return np.clip(np.round(changed), 0, 255).astype(np.uint8)
+
+    return episodes._replace(images=noisy(episodes.images), goals=noisy(episodes.goals))
+
+
+def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
+    """Pair every image after the first with its episode's last, with another episode's, and with the goal that was given."""
+    count, length = episodes.images.shape[0], env.horizon
+    draw = np.random.default_rng(seed)
+    others = (np.arange(count) + draw.integers(1, max(2, count), count)) % count
+    images, states = episodes.images[:, 1:], episodes.states[:, 1:]
+    goals = (episodes.images[:, -1], episodes.images[others, -1], episodes.goals)
+    goal_states = (episodes.states[:, -1], episodes.states[others, -1], episodes.goal_states)
+    flat: list[Any] = [array.reshape(-1, *array.shape[2:]) for array in (images, states)]
+    shown: list[Any] = [np.repeat(each, length, axis=0) for each in goal_states]
+    distance = [np.asarray(truth.goal_distance(flat[1], each)) for each in shown]
+    repeated = [np.repeat(each, length, axis=0) for each in goals]
+    return Pairs(np.concatenate([flat[0]] * 3), np.concatenate(repeated), np.concatenate(distance))
+
+
+def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) -> Found:
+    """Search for actions that maximise a reward at the end of an episode, ``sequences`` random ones for each of ``goals``."""
+
+    def of_goal(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        start_key, action_key = jax.random.split(key)
+        start: Any = env.reset(start_key)
+
+        def end(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+            actions = _actions(key, env.horizon, env.action_size)
+            state, _ = jax.lax.scan(lambda state, action: (env.advance(state, action), None), start, actions)
+            return env.observe(state), state.achieved_state
+
+        images, states = jax.vmap(end)(jax.random.split(action_key, sequences))
+        rewards = reward(images, jnp.broadcast_to(start.obs["desired_goal"], images.shape))
+        is_reached = truth.success(states, start.goal_state[None], env.threshold) > 0
+        best = jnp.argmax(rewards)
+        return rewards[best], is_reached[best], jnp.any(is_reached)
+
+    found = jaxrl_vis_envs.jit(lambda keys: jax.lax.map(of_goal, keys))(jax.random.split(jax.random.key(seed), goals))
+    return Found(*map(np.asarray, found))

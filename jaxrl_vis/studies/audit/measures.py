@@ -1,0 +1,55 @@
+"""Measures of a reward function against the truth, as functions of NumPy arrays. Rewards lie between 0 and 1."""
+
+import numpy as np
+
+BINS = 10
+"""Number of bins of the calibration error."""
+
+
+def ranks(values: np.ndarray) -> np.ndarray:
+    """Return the ranks [N] float64 of [N] numbers, from 0; equal ones share their mean rank."""
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ends = np.cumsum(counts)
+    return (ends - (counts + 1) / 2.0)[inverse]
+
+
+def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Compute Spearman's rank correlation of [N] numbers; 0 where all of one are equal, which tells nothing about the other."""
+    one, other = (ranks(values) - (len(values) - 1) / 2.0 for values in (first, second))
+    size = np.sqrt(np.sum(one**2) * np.sum(other**2))
+    return 0.0 if size == 0.0 else float(np.sum(one * other) / size)
+
+
+def error_shares(reward: np.ndarray, is_reached: np.ndarray) -> tuple[float, float]:
+    """Compute the shares of false positives among pairs that miss, and of false negatives among pairs that reach.
+
+    Args:
+        reward: [N] float32; at least 0.5 counts as positive.
+        is_reached: [N] bool, the truth.
+
+    Returns:
+        Both shares; NaN where there is no such pair.
+    """
+    positive = reward >= 0.5
+    parts = positive[~is_reached], ~positive[is_reached]
+    false_positive, false_negative = (float(np.mean(part)) if part.size else float("nan") for part in parts)
+    return false_positive, false_negative
+
+
+def calibration(reward: np.ndarray, is_reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compare rewards, read as probabilities, with the share of pairs that reach, in even bins of the reward.
+
+    Returns:
+        Mean reward, share reached (both NaN in empty bins), and number of pairs: [BINS] each.
+    """
+    place = np.minimum((np.clip(reward, 0.0, 1.0) * BINS).astype(int), BINS - 1)
+    count = np.bincount(place, minlength=BINS)
+    some = np.where(count, count, np.nan)
+    mean = np.bincount(place, weights=reward, minlength=BINS) / some
+    return mean, np.bincount(place, weights=is_reached.astype(float), minlength=BINS) / some, count
+
+
+def calibration_error(reward: np.ndarray, is_reached: np.ndarray) -> float:
+    """Compute the expected calibration error: the mean over pairs of |mean reward - share reached| of their bin."""
+    mean, share, count = calibration(reward, is_reached)
+    return float(np.nansum(count * np.abs(mean - share)) / np.sum(count))

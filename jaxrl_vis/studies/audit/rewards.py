@@ -1,0 +1,83 @@
+"""Rewards to audit, by name: built-in ones, one that a run has trained along, or ``module:function``."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.config.methods import METHODS
+from jaxrl_vis.errors import RequestError, nearest
+from jaxrl_vis.host import plugins
+from jaxrl_vis.learner.ddpg.learned_reward import make_learned_reward
+from jaxrl_vis.learner.memory.rewards import make_reward
+from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis.studies.audit.episodes import Reward
+from jaxrl_vis.types import Batch
+
+BUILT_IN = ("indicator", "indicator_tolerance", "features")
+"""Rewards that need neither truth nor a run."""
+
+
+def _as_batch(images: jax.Array, goals: jax.Array) -> Batch:
+    """Return a batch in which ``images`` [B, ...] were reached, without actions and true states."""
+    nothing = jnp.zeros((len(images), 1))
+    return Batch(jnp.stack([images, goals, images]), nothing, nothing, nothing)
+
+
+def _of_run(run_dir: Path, trust: bool) -> Reward:
+    """Return the reward that the first seed of a run has trained along.
+
+    Raises:
+        RequestError: The run's rewards are of another kind.
+    """
+    trainer = open_run(run_dir, trust=trust)
+    program, resolved = trainer.program, trainer.program.resolved
+    if not resolved.method.is_learned:
+        raise RequestError(f"the run in {run_dir} has no model of rewards: train with --method autoencoder or classifier")
+    train = jax.tree.map(lambda leaf: leaf[0], load(trainer, run_dir).train)
+    if not hasattr(train.agent, "reward_model"):
+        raise RequestError(f"the run in {run_dir} has no model of rewards: its algorithm is {trainer.config.run.algorithm}")
+    networks = program.networks
+    model = make_learned_reward(networks, trainer.config, resolved)
+    assert model is not None
+    scaling = networks.batch_scaling(train.statistics)
+    least, most = resolved.reward_negative, resolved.reward_positive
+
+    shape = networks.observation_spec.shape
+
+    def reward(images: jax.Array, goals: jax.Array) -> jax.Array:
+        if images.shape[1:] != shape:
+            raise RequestError(f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}: audit those")
+        batch = _as_batch(images, goals)
+        inputs = networks.prepare_batch(scaling, batch)
+        return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - least) / (most - least)
+
+    return reward
+
+
+def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
+    """Return a reward by name.
+
+    Args:
+        name: One of `BUILT_IN`, a run folder, or ``module:function`` of images and goal images.
+        config: Tolerance and encoder of the built-in ones.
+        trust: As in `run.trained.open_run`.
+
+    Raises:
+        RequestError: There is no such reward, or it lacks something.
+    """
+    if name in BUILT_IN:
+        function = make_reward(config, METHODS[name])
+        return lambda images, goals: function(_as_batch(images, goals), images, 1.0, 0.0)
+    if (Path(name) / "config.json").exists():
+        return _of_run(Path(name), trust)
+    if ":" not in name:
+        others = "run folders and module:function are rewards, too"
+        raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} ({others})")
+    found: Any = plugins.find("reward", name, {}, config.environment.env_folder)
+    if not callable(found):
+        raise RequestError(f"{name} is no reward: it must be a function of images and goal images")
+    own: Any = found
+    return own

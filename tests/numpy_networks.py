@@ -1,0 +1,64 @@
+"""Networks and Adam in NumPy, in float64, with gradients written by hand; they share nothing with the learner."""
+
+import numpy as np
+
+Layers = list[tuple[np.ndarray, np.ndarray]]
+"""(kernel [inputs, outputs], bias [outputs]) of each layer."""
+
+
+def layers(head, which=None) -> Layers:
+    """Layers of a head of the learner, as float64; of several heads that lie in one array, that of number ``which``."""
+    names = [*sorted(name for name in head if name.startswith("hidden")), "output"]
+    pairs = [(head[name]["kernel"], head[name]["bias"]) for name in names]
+    pick = (lambda leaf: leaf) if which is None else (lambda leaf: leaf[which])
+    return [(np.asarray(pick(kernel), np.float64), np.asarray(pick(bias), np.float64)) for kernel, bias in pairs]
+
+
+def forward(network: Layers, inputs: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Outputs of a network with rectified hidden layers, and the inputs of each layer."""
+    seen, values = [], inputs
+    for number, (kernel, bias) in enumerate(network):
+        seen.append(values)
+        values = values @ kernel + bias
+        if number < len(network) - 1:
+            values = np.maximum(values, 0.0)
+    return values, seen
+
+
+def backward(network: Layers, seen: list[np.ndarray], gradient: np.ndarray) -> tuple[Layers, np.ndarray]:
+    """Gradients of all layers and of the inputs, from that of the outputs."""
+    found: Layers = []
+    for (kernel, _), values in zip(network[::-1], seen[::-1], strict=True):
+        found.append((values.T @ gradient, gradient.sum(axis=0)))
+        gradient = (gradient @ kernel.T) * (values > 0.0 if values is not seen[0] else 1.0)
+    return found[::-1], gradient
+
+
+def followed(online: Layers, target: Layers, decay: float) -> Layers:
+    """The target network after one update."""
+    return [tuple(decay * old + (1.0 - decay) * new for old, new in zip(*both)) for both in zip(target, online)]
+
+
+class Adam:
+    """The optimiser of one network (Kingma and Ba, 2015)."""
+
+    def __init__(self, rate: float):
+        self.rate, self.count, self.means, self.squares = rate, 0, None, None
+
+    def step(self, network: Layers, gradient: Layers) -> Layers:
+        if self.means is None:
+            self.means = [[np.zeros_like(leaf) for leaf in layer] for layer in gradient]
+            self.squares = [[np.zeros_like(leaf) for leaf in layer] for layer in gradient]
+        self.count += 1
+        moved = []
+        for layer, slopes, means, squares in zip(network, gradient, self.means, self.squares, strict=True):
+            for index, slope in enumerate(slopes):
+                means[index] = 0.9 * means[index] + 0.1 * slope
+                squares[index] = 0.999 * squares[index] + 0.001 * slope**2
+            moved.append(
+                tuple(
+                    leaf - self.rate * (mean / (1 - 0.9**self.count)) / (np.sqrt(square / (1 - 0.999**self.count)) + 1e-8)
+                    for leaf, mean, square in zip(layer, means, squares, strict=True)
+                )
+            )
+        return moved

@@ -1,0 +1,124 @@
+"""Audit of rewards: its measures on cases that are known, and whole audits of rewards that are right, wrong and no rewards."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import point_mass
+import pytest
+from scipy import stats
+
+from jaxrl_vis import cli
+from jaxrl_vis.studies.audit import measures, report
+from jaxrl_vis_envs import registry
+
+OWN = """
+import jax.numpy as jnp
+
+def always(images, goals):
+    return jnp.ones(len(images))
+
+def too_large(images, goals):
+    return jnp.full(len(images), 2.0)
+
+def two_numbers(images, goals):
+    return jnp.ones((len(images), 2))
+
+def broken(images):
+    return 1.0
+"""
+
+
+def test_rank_correlation_is_that_of_scipy_with_and_without_ties() -> None:
+    draw = np.random.default_rng(0)
+    for levels in (3, 10_000):
+        one, other = draw.integers(0, levels, (2, 60)).astype(float)
+        expected = stats.spearmanr(one, other).statistic
+        assert measures.rank_correlation(one, other) == pytest.approx(expected, abs=1e-12)
+    assert measures.rank_correlation(np.ones(5), np.arange(5)) == 0.0
+    assert measures.rank_correlation(np.arange(5), np.exp(np.arange(5))) == pytest.approx(1.0)
+
+
+def test_shares_of_false_rewards() -> None:
+    reward, is_reached = np.array([1.0, 1.0, 0.2, 0.5, 0.0]), np.array([True, False, True, False, False])
+    assert measures.error_shares(reward, is_reached) == (pytest.approx(2 / 3), 0.5)
+    assert np.isnan(measures.error_shares(reward, np.ones(5, bool))[0])
+
+
+def test_a_probability_is_calibrated_and_its_square_is_not() -> None:
+    draw = np.random.default_rng(0)
+    probability = draw.random(200_000)
+    is_reached = draw.random(200_000) < probability
+    assert measures.calibration_error(probability, is_reached) < 0.01
+    assert measures.calibration_error(probability**2, is_reached) == pytest.approx(1 / 6, abs=0.01)  # mean of p - p^2
+
+
+@pytest.fixture
+def point(monkeypatch: pytest.MonkeyPatch, here: Path) -> Path:
+    entry = registry._Entry(point_mass.PointMass, point_mass.PointMassConfig)
+    monkeypatch.setitem(registry._ENTRIES, "VisualPoint", entry)
+    (here / "own.py").write_text(OWN)
+    return here
+
+
+SMALL = ["audit", "VisualPoint", "--image-size", "16", "--episodes", "8", "--goals", "4", "--sequences", "8"]
+
+
+def test_an_audit_tells_what_rewards_are_worth(point: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rewards = ["--rewards", "indicator", "indicator_tolerance", "own:always", "--out", "a.png", "--json", "a.json"]
+    assert cli.main([*SMALL, *rewards, "--tolerance", "20", "--tolerance-share", "0.95"]) == 0
+    record = json.loads(Path("a.json").read_text())
+    exact, tolerant, always = record["rewards"].values()
+    assert record["pairs"] == 8 * 5 * 3 and record["audit"]["tolerance"] == 20.0
+    assert exact["false_positive"] == 0.0 < exact["false_negative"]
+    assert tolerant["false_negative"] < exact["false_negative"]
+    assert (always["false_positive"], always["false_negative"], always["order_distance"]) == (1.0, 0.0, 0.0)
+    assert always["exploited"] == 1.0 - always["solved"] > 0.0 == exact["exploited"]
+    assert exact["order_time"] > 0.5  # the last image is the goal
+    assert {row["solvable"] for row in record["rewards"].values()} == {exact["solvable"]}
+    assert Path("a.png").stat().st_size > 5000
+    table = capsys.readouterr().out
+    assert table.splitlines()[0] == "| reward | " + " | ".join(report.COLUMNS.values()) + " |"
+
+
+def test_noise_breaks_equality(point: Path) -> None:
+    assert cli.main([*SMALL, "--noise", "2", "--json", "a.json", "--tolerance", "12", "--tolerance-share", "0.9"]) == 0
+    exact, tolerant = json.loads(Path("a.json").read_text())["rewards"].values()
+    assert exact["false_negative"] > 0.3 > tolerant["false_negative"]
+
+
+def test_a_model_that_a_run_has_trained_along_is_audited(point: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train = ["train", "VisualPoint", "--preset", "debug", "--pixels", "rgbd", "--image-size", "16", "--num-envs", "2"]
+    for method, name in (("classifier", "model"), ("indicator", "other")):
+        assert cli.main([*train, "--env-steps", "20", "--method", method, "--run-dir", name]) == 0
+    assert cli.main([*SMALL, "--rewards", "model", "--json", "a.json"]) == 0
+    (record,) = json.loads(Path("a.json").read_text())["rewards"].values()
+    assert all(0.0 <= record[name] <= 1.0 for name in ("false_positive", "false_negative", "calibration_error"))
+    capsys.readouterr()
+    for words, message in (
+        (["--rewards", "other"], "the run in other has no model of rewards: train with --method autoencoder or classifier"),
+        (["--rewards", "model", "--pixels", "rgb"], "sees images of (4, 16, 16), and these are of (3, 16, 16)"),
+    ):
+        assert cli.main([*SMALL, *words]) == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--rewards", "own:too_large"], "reward own:too_large lies between 2 and 2: it must lie between 0 and 1"),
+        (["--rewards", "own:two_numbers"], "reward own:two_numbers has the shape (2,) for each image"),
+        (["--rewards", "own:broken"], "reward own:broken cannot be computed: TypeError"),
+        (["--rewards", "own:none"], "own has no none"),
+        (
+            ["--rewards", "indicater"],
+            "unknown reward 'indicater'; did you mean indicator or indicator_tolerance? (run",
+        ),
+        (["--rewards", "features"], "method features needs an encoder"),
+        (["--episodes", "1"], "other episodes' goals need at least 2"),
+        (["--noise", "-1"], "noise -1.0 must not be negative"),
+    ],
+)
+def test_mistakes_get_one_line(point: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*SMALL, *words]) == 2
+    assert message in capsys.readouterr().err
