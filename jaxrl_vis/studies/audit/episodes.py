@@ -96,17 +96,17 @@ def play(env: GoalEnv, count: int, seed: int) -> Episodes:
     return Episodes(*map(np.asarray, episodes))
 
 
-def with_noise(episodes: Episodes, deviation: float, seed: int) -> Episodes:
-    """Add camera noise of ``deviation`` grey levels to all images, drawn anew for every one."""
+def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
+    """Add camera noise of ``deviation`` grey levels to all images, anew for each: goals were seen at another time."""
     if deviation == 0.0:
-        return episodes
+        return pairs
     draw = np.random.default_rng(seed)
 
-    def noisy(images: np.ndarray) -> np.ndarray:
+    def noisy(images: Any) -> Any:
         changed = images + deviation * draw.standard_normal(images.shape, np.float32)
         return np.clip(np.round(changed), 0, 255).astype(np.uint8)
 
-    return episodes._replace(images=noisy(episodes.images), goals=noisy(episodes.goals))
+    return pairs._replace(images=noisy(pairs.images), goals=noisy(pairs.goals))
 
 
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:

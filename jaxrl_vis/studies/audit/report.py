@@ -79,7 +79,7 @@ def audit(
         rewards: Functions by name, with values between 0 and 1.
         episodes: Number of episodes of random actions.
         goals, sequences: Number of goals of the search, and of random sequences of actions for each.
-        noise: Standard deviation of camera noise on episodes, grey levels. The search has none.
+        noise: Standard deviation of camera noise on all images, grey levels. The search has none.
         seed: Seed of all random numbers.
 
     Returns:
@@ -90,8 +90,7 @@ def audit(
     """
     if len(env.observation_spec.shape) != 3:
         raise RequestError("rewards are audited on images, and this task shows states: name its Visual variant")
-    played = with_noise(play(env, episodes, seed), noise, seed)
-    pairs = make_pairs(env, played, seed)
+    pairs = with_noise(make_pairs(env, play(env, episodes, seed), seed), noise, seed)
     is_reached = pairs.distance <= env.threshold
     # Along an episode, up to its own end: the first part of the pairs.
     own = np.arange(episodes * env.horizon).reshape(episodes, env.horizon)

@@ -96,8 +96,8 @@ class Scope:
 Cells = dict[tuple[str, str], list[Cell]]
 """(environment, variant) -> the cells that make it, one for each group of seeds."""
 
-# `debug` makes 4 gradient steps per iteration, which OL-AUX-5 does not divide.
-_OF_PRESET: dict[str, dict[str, Any]] = {"debug": {"updates_per_iteration": 5}}
+# `debug` makes 4 gradient steps per iteration, which OL-AUX-5 does not divide; nor would 5 be divided by TD3's 2.
+_OF_PRESET: dict[str, dict[str, Any]] = {"debug": {"updates_per_iteration": 10}}
 _LONGEST = 1_500_000  # environment steps of a task without a budget in the study
 
 
