@@ -8,6 +8,9 @@ weighting_cost-DEVICE.json. The exit status of equality is 1 if a method differs
 """
 
 import argparse
+import concurrent.futures
+import json
+import multiprocessing
 import subprocess
 import sys
 import tempfile
@@ -31,23 +34,31 @@ def run_peer(python: Path, script: str, *arguments: str) -> None:
     subprocess.run([str(python), str(Path(__file__).with_name(script)), *arguments], check=True)
 
 
-def equality(python: Path, jacobians: int, results: Path) -> int:
-    """Compare the results of all methods, and write the record."""
-    import json
-
+def compute_ours(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Compute our results in a process of its own, in float64."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from benchmarks.peers.torchjd import equality, ours
+    from benchmarks.peers.torchjd import ours
+
+    return ours.results(arrays)
+
+
+def equality(python: Path, jacobians: int, results: Path) -> int:
+    """Compare the results of all methods, and write the record; both sides run at once, a process for each number of losses."""
+    from benchmarks.peers.torchjd import equality
     from benchmarks.peers.torchjd.jacobians import COUNTS, draw
 
     arrays = draw(jacobians // len(COUNTS))
-    with tempfile.TemporaryDirectory() as folder:
+    parts = [{name: value for name, value in arrays.items() if name.startswith(f"{count}/")} for count in COUNTS]
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as folder, concurrent.futures.ProcessPoolExecutor(len(COUNTS), context) as pool:
         given, found = Path(folder) / "jacobians.npz", Path(folder) / "results.npz"
         np.savez(given, **arrays)  # pyright: ignore[reportArgumentType]
-        mine = ours.results(arrays)
+        computing = [pool.submit(compute_ours, part) for part in parts]
         run_peer(python, "peer.py", str(given), str(found))
         theirs = dict(np.load(found))
+        mine = {name: value for one in computing for name, value in one.result().items()}
     peer_versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
     rows = equality.compare(arrays, mine, theirs)
     for row in rows:

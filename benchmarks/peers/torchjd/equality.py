@@ -82,6 +82,7 @@ RESIDUALS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     "nash_mtl": nash_residual,
 }
 _FULL_RANK = ("fairgrad", "nash_mtl")  # where gradients depend on each other, there may be no solution
+_NO_LINE = ("gradvac",)  # on a line, a gradient is turned to nothing, and its next cosine is rounding
 
 
 def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -97,10 +98,11 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
         differences, residuals = [], {"ours": [], "theirs": []}
         for count in counts:
             jacobians, ranks = arrays[f"{count}/jacobians"], arrays[f"{count}/ranks"]
-            one, other = ours[f"{count}/{method}"], theirs[f"{count}/{method}"]
+            chosen = ranks > (count - 1 if method in _FULL_RANK else 1 if method in _NO_LINE else 0)
+            jacobians, one, other = (
+                each[chosen] for each in (jacobians, ours[f"{count}/{method}"], theirs[f"{count}/{method}"])
+            )
             if method in SOLVED:
-                chosen = ranks == count if method in _FULL_RANK else np.ones(len(ranks), bool)
-                jacobians, one, other = jacobians[chosen], one[chosen], other[chosen]
                 for side, weights in (("ours", one), ("theirs", other)):
                     residuals[side] += [RESIDUALS[method](*pair) for pair in zip(jacobians, weights, strict=True)]
                 one, other = (np.einsum("nk,nkp->np", weights, jacobians) for weights in (one, other))
