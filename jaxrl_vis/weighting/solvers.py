@@ -201,9 +201,9 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
         return wide & (jnp.abs(now.error) > 4.0 * eps * now.high) & (now.steps < _ROOT_STEPS)
 
     zero, one = jnp.zeros((), scaled.dtype), jnp.ones((), scaled.dtype)
-    _, at_zero, free = evaluate(zero, jnp.zeros(len(gramian), bool))
-    _, at_one, free = evaluate(one, free)
-    first = _Bracket(zero, one, at_zero, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
+    _, at_one, free = evaluate(one, jnp.zeros(len(gramian), bool))
+    # 0 is a root, too, where the hull holds 0, but not of interest: as if the error were 1 there.
+    first = _Bracket(zero, one, one, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
     last = jax.lax.while_loop(is_open, step, first)
     # The last error is that of the end that moved last.
     weights, length, _ = evaluate(jnp.where(last.kept == 1, last.low, last.high), last.free, passes=3)
