@@ -10,7 +10,6 @@ weighting_cost-DEVICE.json. The exit status of equality is 1 if a method differs
 import argparse
 import concurrent.futures
 import json
-import multiprocessing
 import subprocess
 import sys
 import tempfile
@@ -34,36 +33,36 @@ def run_peer(python: Path, script: str, *arguments: str) -> None:
     subprocess.run([str(python), str(Path(__file__).with_name(script)), *arguments], check=True)
 
 
-def compute_ours(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute our results in a process of its own, in float64."""
+def equality(python: Path, jacobians: int, results: Path) -> int:
+    """Compute the results of both sides at once, compare them, and write the record."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from benchmarks.peers.torchjd import ours
-
-    return ours.results(arrays)
-
-
-def equality(python: Path, jacobians: int, results: Path) -> int:
-    """Compare the results of all methods, and write the record; both sides run at once, a process for each number of losses."""
-    from benchmarks.peers.torchjd import equality
     from benchmarks.peers.torchjd.jacobians import COUNTS, draw
 
     arrays = draw(jacobians // len(COUNTS))
-    parts = [{name: value for name, value in arrays.items() if name.startswith(f"{count}/")} for count in COUNTS]
-    context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory() as folder, concurrent.futures.ProcessPoolExecutor(len(COUNTS), context) as pool:
+    with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(1) as beside:
         given, found = Path(folder) / "jacobians.npz", Path(folder) / "results.npz"
         np.savez(given, **arrays)  # pyright: ignore[reportArgumentType]
-        computing = [pool.submit(compute_ours, part) for part in parts]
-        run_peer(python, "peer.py", str(given), str(found))
+        peer = beside.submit(run_peer, python, "peer.py", str(given), str(found))
+        mine = ours.results(arrays)
+        peer.result()
         theirs = dict(np.load(found))
-        mine = {name: value for one in computing for name, value in one.result().items()}
-    peer_versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
-    rows = equality.compare(arrays, mine, theirs)
+    return keep(arrays, mine, theirs, results)
+
+
+def keep(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], results: Path) -> int:
+    """Compare the results of both sides, print and write the record; return 1 if a method differs by more than it may."""
+    from benchmarks.peers.torchjd import equality
+    from benchmarks.peers.torchjd.jacobians import COUNTS
+
+    versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
+    rows = equality.compare(arrays, ours, theirs)
     for row in rows:
         print("  ".join(f"{name} {value:.2g}" if isinstance(value, float) else str(value) for name, value in row.items()))
-    record = {"versions": {**provenance.versions(), **peer_versions}, "jacobians": jacobians, "losses": COUNTS, "rows": rows}
+    jacobians = sum(len(value) for name, value in arrays.items() if name.endswith("/jacobians"))
+    record = {"versions": {**provenance.versions(), **versions}, "jacobians": jacobians, "losses": COUNTS, "rows": rows}
     write_atomically(results / PARITY, json.dumps(record, indent=1) + "\n")
     wrong = equality.failures(rows)
     print(f"beyond what is allowed: {', '.join(wrong)}" if wrong else "all within what is allowed")

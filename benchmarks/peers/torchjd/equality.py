@@ -15,7 +15,7 @@ _ROUNDING = 1e-6
 
 
 def relative(one: np.ndarray, other: np.ndarray, least: np.ndarray | float = _TINY) -> np.ndarray:
-    """Distance between rows over the length of the second's, which is ``least`` or more: steps that cancel out are rounding."""
+    """Distance between rows over the length of the second's, or over ``least`` where that is less."""
     axes = tuple(range(1, one.ndim))
     length = np.sqrt((other**2).sum(axis=axes))
     return np.sqrt(((one - other) ** 2).sum(axis=axes)) / np.maximum(length, least)
@@ -113,7 +113,9 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
                 length = np.maximum(np.linalg.norm(other, axis=1), 1e-2 * scale)
                 differences += list(np.linalg.norm(one - other, axis=1) / length)
             elif one.shape[1:] == jacobians.shape[2:]:
-                differences += list(relative(one, other, _ROUNDING * np.linalg.norm(jacobians, axis=2).max(axis=1)))
+                least = _ROUNDING * np.linalg.norm(jacobians, axis=2).max(axis=1)
+                one, other = (np.where(np.linalg.norm(step, axis=1) < least, 0.0, step.T).T for step in (one, other))
+                differences += list(relative(one, other, least))
             else:
                 differences += list(relative(one, other))
         row = {"method": method, "kind": "solver" if method in SOLVED else "closed form", "cases": len(differences)}
