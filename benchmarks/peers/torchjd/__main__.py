@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.peers.torchjd.jacobians import COUNTS, draw
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import write_atomically
 
@@ -39,7 +40,6 @@ def equality(python: Path, jacobians: int, results: Path) -> int:
 
     jax.config.update("jax_enable_x64", True)
     from benchmarks.peers.torchjd import ours
-    from benchmarks.peers.torchjd.jacobians import COUNTS, draw
 
     arrays = draw(jacobians // len(COUNTS))
     with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(1) as beside:
@@ -55,7 +55,6 @@ def equality(python: Path, jacobians: int, results: Path) -> int:
 def keep(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], results: Path) -> int:
     """Compare the results of both sides, print and write the record; return 1 if a method differs by more than it may."""
     from benchmarks.peers.torchjd import equality
-    from benchmarks.peers.torchjd.jacobians import COUNTS
 
     versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
     rows = equality.compare(arrays, ours, theirs)
@@ -85,6 +84,9 @@ def main() -> int:
     cost_options.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args()
     if options.action == "equality":
+        least = len(COUNTS) * max(COUNTS)
+        if options.jacobians < least:
+            parser.error(f"--jacobians must be at least {least}, for some of every rank")
         return equality(options.python, options.jacobians, options.results)
     from benchmarks.peers.torchjd import cost
 
