@@ -279,9 +279,9 @@ def quadratic(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.dot(vector, jnp.dot(matrix, vector, precision=precision), precision=precision)
 
 
-def pseudo_inverse(gramian: jax.Array) -> jax.Array:
-    """Compute the pseudo-inverse of a Gramian, [K, K]; eigenvalues up to 16 K eps of the greatest count as 0: rounding."""
+def pseudo_inverse(gramian: jax.Array, rounding: float = 1.0) -> jax.Array:
+    """Compute the pseudo-inverse of a Gramian, [K, K]; eigenvalues up to ``rounding`` K eps of the greatest count as 0."""
     values, vectors = jnp.linalg.eigh(gramian)
-    cut = 16 * len(gramian) * jnp.finfo(gramian.dtype).eps * jnp.max(jnp.abs(values))
+    cut = rounding * len(gramian) * jnp.finfo(gramian.dtype).eps * jnp.max(jnp.abs(values))
     inverse = jnp.where(values > cut, 1.0 / jnp.where(values > cut, values, 1.0), 0.0)
     return jnp.matmul(vectors * inverse, vectors.T, precision=jax.lax.Precision.HIGHEST)
