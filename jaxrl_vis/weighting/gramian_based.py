@@ -292,7 +292,7 @@ def config(**options: Unpack[Options]) -> Weighting:
         lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
         inverse = jnp.where(lengths > 0.0, 1.0 / jnp.where(lengths > 0.0, lengths, 1.0), 0.0)
         unit = gramian * inverse[:, None] * inverse[None, :]
-        of_unit = jnp.sum(solvers.pseudo_inverse(unit), axis=1)
+        of_unit = jnp.sum(solvers.pseudo_inverse(unit, rounding=16.0), axis=1)
         raw = inverse * of_unit
         squared = solvers.quadratic(gramian, raw)
         # Of length 1 / sqrt(K) or more, unless no direction has any cosine in common: then the step is 0.

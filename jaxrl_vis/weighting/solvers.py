@@ -23,11 +23,12 @@ _NEWTON_STEPS = 60
 _HALVINGS = 16
 
 
-def unit_gramian(gramian: jax.Array) -> tuple[jax.Array, jax.Array]:
+def unit_gramian(gramian: jax.Array, least: float | None = None) -> tuple[jax.Array, jax.Array]:
     """Scale gradients to unit length.
 
     Args:
         gramian: [K, K] float.
+        least: Length, over that of the greatest, below which gradients are scaled no more; None: the precision of a number.
 
     Returns:
         [K, K] Gramian of the scaled gradients; [K] lengths of the gradients, in units of the greatest, and at
@@ -37,7 +38,7 @@ def unit_gramian(gramian: jax.Array) -> tuple[jax.Array, jax.Array]:
     lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
     greatest = jnp.max(lengths)
     greatest = jnp.where(greatest > 0.0, greatest, 1.0)
-    relative = jnp.maximum(lengths / greatest, eps)
+    relative = jnp.maximum(lengths / greatest, eps if least is None else least)
     # One factor at a time: the product of two small lengths may be too small for a number.
     return gramian / greatest / greatest / relative[:, None] / relative[None, :], relative
 
@@ -103,7 +104,9 @@ def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.A
     return jnp.maximum(last.solution, 0.0), last.free
 
 
-def min_norm(gramian: jax.Array, free: jax.Array | None = None, passes: int = 3) -> tuple[jax.Array, jax.Array]:
+def min_norm(
+    gramian: jax.Array, free: jax.Array | None = None, passes: int = 3, least: float | None = None
+) -> tuple[jax.Array, jax.Array]:
     """Compute the weights w >= 0, of sum 1, that minimise w^T G w.
 
     On the ray through w, min over t of t^2 w^T G w + (t - 1)^2 is q / (1 + q), with q = w^T G w: so that x = t w minimises
@@ -112,11 +115,12 @@ def min_norm(gramian: jax.Array, free: jax.Array | None = None, passes: int = 3)
     Args:
         gramian: [K, K] float, positive semidefinite.
         free, passes: As of `nonnegative`.
+        least: As of `unit_gramian`.
 
     Returns:
         [K] float, w; [K] bool, as of `nonnegative`.
     """
-    unit, lengths = unit_gramian(gramian)
+    unit, lengths = unit_gramian(gramian, least)
     per_length = jnp.min(lengths) / lengths
     x, free = nonnegative(unit + per_length[:, None] * per_length[None, :], per_length, free, passes)
     weights = per_length * x
@@ -176,7 +180,9 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     def evaluate(t: jax.Array, free: jax.Array, passes: int = 1) -> tuple[jax.Array, jax.Array, jax.Array]:
         share = t / ball
         shifted = scaled + share * (to_mean[:, None] + to_mean[None, :]) + share**2 * squared
-        weights, free = min_norm(shifted, free, passes)
+        # Sums of three terms, whose rounding would be all that is left of a gradient that is shifted close to 0: with this
+        # least length it stays below what `nonnegative` adds.
+        weights, free = min_norm(shifted, free, passes, least=float(eps) ** (1 / 6))
         return weights, jnp.sqrt(jnp.maximum(quadratic(scaled, weights), 0.0)), free
 
     def step(now: _Bracket) -> _Bracket:
@@ -195,9 +201,9 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
         return wide & (jnp.abs(now.error) > 4.0 * eps * now.high) & (now.steps < _ROOT_STEPS)
 
     zero, one = jnp.zeros((), scaled.dtype), jnp.ones((), scaled.dtype)
-    _, at_zero, free = evaluate(zero, jnp.zeros(len(gramian), bool))
-    _, at_one, free = evaluate(one, free)
-    first = _Bracket(zero, one, at_zero, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
+    _, at_one, free = evaluate(one, jnp.zeros(len(gramian), bool))
+    # 0 is a root, too, where the hull holds 0, but not of interest: as if the error were 1 there.
+    first = _Bracket(zero, one, one, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
     last = jax.lax.while_loop(is_open, step, first)
     # The last error is that of the end that moved last.
     weights, length, _ = evaluate(jnp.where(last.kept == 1, last.low, last.high), last.free, passes=3)
@@ -273,9 +279,9 @@ def quadratic(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     return jnp.dot(vector, jnp.dot(matrix, vector, precision=precision), precision=precision)
 
 
-def pseudo_inverse(gramian: jax.Array) -> jax.Array:
-    """Compute the pseudo-inverse of a Gramian, [K, K]; eigenvalues up to K eps of the greatest count as 0."""
+def pseudo_inverse(gramian: jax.Array, rounding: float = 1.0) -> jax.Array:
+    """Compute the pseudo-inverse of a Gramian, [K, K]; eigenvalues up to ``rounding`` K eps of the greatest count as 0."""
     values, vectors = jnp.linalg.eigh(gramian)
-    cut = len(gramian) * jnp.finfo(gramian.dtype).eps * jnp.max(jnp.abs(values))
+    cut = rounding * len(gramian) * jnp.finfo(gramian.dtype).eps * jnp.max(jnp.abs(values))
     inverse = jnp.where(values > cut, 1.0 / jnp.where(values > cut, values, 1.0), 0.0)
     return jnp.matmul(vectors * inverse, vectors.T, precision=jax.lax.Precision.HIGHEST)

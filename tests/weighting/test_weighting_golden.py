@@ -83,6 +83,22 @@ def test_cagrad_has_the_best_worst_loss_in_its_ball() -> None:
     np.testing.assert_allclose(weights_of(jw.cagrad(0.0), gradients()), 1 / 3)
 
 
+def test_cagrad_of_gradients_on_a_line_stops_short_of_the_mean_or_goes_beyond_it() -> None:
+    """By c = 1/2: of mixed signs, whatever the step, some loss rises, the least for the shortest; of one sign, all fall."""
+    signed = np.random.default_rng(3).normal(size=(200, 3))
+    signed[0] = [1.0, -0.42374804, -0.60578518]  # one gradient is shifted to 0 on the way
+    weighting = jw.cagrad(0.5)
+
+    def step(values: jax.Array) -> jax.Array:
+        found, _, _ = weighting.update(named([1.0, 1.0, 1.0]), values[:, None] * values[None, :], weighting.init(NAMES))
+        assert isinstance(found, dict)
+        return sum((found[name] * value for name, value in zip(NAMES, values, strict=True)), jnp.zeros(()))
+
+    found = jax.jit(jax.vmap(step))(jnp.asarray(signed))
+    is_mixed = (signed.min(axis=1) < 0) & (signed.max(axis=1) > 0)
+    np.testing.assert_allclose(found, signed.mean(axis=1) * np.where(is_mixed, 0.5, 1.5), rtol=1e-6, atol=1e-9)
+
+
 def test_bargains_are_solved() -> None:
     rows = gradients(2)
     shares = weights_of(jw.nash_mtl(), rows)

@@ -8,6 +8,8 @@ weighting_cost-DEVICE.json. The exit status of equality is 1 if a method differs
 """
 
 import argparse
+import concurrent.futures
+import json
 import subprocess
 import sys
 import tempfile
@@ -15,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.peers.torchjd.jacobians import COUNTS, draw
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import write_atomically
 
@@ -32,27 +35,33 @@ def run_peer(python: Path, script: str, *arguments: str) -> None:
 
 
 def equality(python: Path, jacobians: int, results: Path) -> int:
-    """Compare the results of all methods, and write the record."""
-    import json
-
+    """Compute the results of both sides at once, compare them, and write the record."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from benchmarks.peers.torchjd import equality, ours
-    from benchmarks.peers.torchjd.jacobians import COUNTS, draw
+    from benchmarks.peers.torchjd import ours
 
     arrays = draw(jacobians // len(COUNTS))
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(1) as beside:
         given, found = Path(folder) / "jacobians.npz", Path(folder) / "results.npz"
         np.savez(given, **arrays)  # pyright: ignore[reportArgumentType]
+        peer = beside.submit(run_peer, python, "peer.py", str(given), str(found))
         mine = ours.results(arrays)
-        run_peer(python, "peer.py", str(given), str(found))
+        peer.result()
         theirs = dict(np.load(found))
-    peer_versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
-    rows = equality.compare(arrays, mine, theirs)
+    return keep(arrays, mine, theirs, results)
+
+
+def keep(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], results: Path) -> int:
+    """Compare the results of both sides, print and write the record; return 1 if a method differs by more than it may."""
+    from benchmarks.peers.torchjd import equality
+
+    versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
+    rows = equality.compare(arrays, ours, theirs)
     for row in rows:
         print("  ".join(f"{name} {value:.2g}" if isinstance(value, float) else str(value) for name, value in row.items()))
-    record = {"versions": {**provenance.versions(), **peer_versions}, "jacobians": jacobians, "losses": COUNTS, "rows": rows}
+    jacobians = sum(len(value) for name, value in arrays.items() if name.endswith("/jacobians"))
+    record = {"versions": {**provenance.versions(), **versions}, "jacobians": jacobians, "losses": COUNTS, "rows": rows}
     write_atomically(results / PARITY, json.dumps(record, indent=1) + "\n")
     wrong = equality.failures(rows)
     print(f"beyond what is allowed: {', '.join(wrong)}" if wrong else "all within what is allowed")
@@ -75,6 +84,9 @@ def main() -> int:
     cost_options.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args()
     if options.action == "equality":
+        least = len(COUNTS) * max(COUNTS)
+        if options.jacobians < least:
+            parser.error(f"--jacobians must be at least {least}, for some of every rank")
         return equality(options.python, options.jacobians, options.results)
     from benchmarks.peers.torchjd import cost
 

@@ -15,7 +15,7 @@ _ROUNDING = 1e-6
 
 
 def relative(one: np.ndarray, other: np.ndarray, least: np.ndarray | float = _TINY) -> np.ndarray:
-    """Distance between rows over the length of the second's, which is ``least`` or more: steps that cancel out are rounding."""
+    """Distance between rows over the length of the second's, or over ``least`` where that is less."""
     axes = tuple(range(1, one.ndim))
     length = np.sqrt((other**2).sum(axis=axes))
     return np.sqrt(((one - other) ** 2).sum(axis=axes)) / np.maximum(length, least)
@@ -82,6 +82,7 @@ RESIDUALS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     "nash_mtl": nash_residual,
 }
 _FULL_RANK = ("fairgrad", "nash_mtl")  # where gradients depend on each other, there may be no solution
+_NO_LINE = ("gradvac",)  # on a line, a gradient is turned to nothing, and its next cosine is rounding
 
 
 def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -97,10 +98,11 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
         differences, residuals = [], {"ours": [], "theirs": []}
         for count in counts:
             jacobians, ranks = arrays[f"{count}/jacobians"], arrays[f"{count}/ranks"]
-            one, other = ours[f"{count}/{method}"], theirs[f"{count}/{method}"]
+            chosen = ranks > (count - 1 if method in _FULL_RANK else 1 if method in _NO_LINE else 0)
+            jacobians, one, other = (
+                each[chosen] for each in (jacobians, ours[f"{count}/{method}"], theirs[f"{count}/{method}"])
+            )
             if method in SOLVED:
-                chosen = ranks == count if method in _FULL_RANK else np.ones(len(ranks), bool)
-                jacobians, one, other = jacobians[chosen], one[chosen], other[chosen]
                 for side, weights in (("ours", one), ("theirs", other)):
                     residuals[side] += [RESIDUALS[method](*pair) for pair in zip(jacobians, weights, strict=True)]
                 one, other = (np.einsum("nk,nkp->np", weights, jacobians) for weights in (one, other))
@@ -111,7 +113,9 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
                 length = np.maximum(np.linalg.norm(other, axis=1), 1e-2 * scale)
                 differences += list(np.linalg.norm(one - other, axis=1) / length)
             elif one.shape[1:] == jacobians.shape[2:]:
-                differences += list(relative(one, other, _ROUNDING * np.linalg.norm(jacobians, axis=2).max(axis=1)))
+                least = _ROUNDING * np.linalg.norm(jacobians, axis=2).max(axis=1)
+                one, other = (np.where(np.linalg.norm(step, axis=1) < least, 0.0, step.T).T for step in (one, other))
+                differences += list(relative(one, other, least))
             else:
                 differences += list(relative(one, other))
         row = {"method": method, "kind": "solver" if method in SOLVED else "closed form", "cases": len(differences)}
