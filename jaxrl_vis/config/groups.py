@@ -345,7 +345,7 @@ def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:
     """
     for name in changes:
         if name not in OPTIONS:
-            raise RequestError(f"unknown option {name!r}{nearest(str(name), OPTIONS)}")
+            raise RequestError(f"unknown option {str(name)[:60]!r}{nearest(str(name), OPTIONS)}")
     return changes
 
 
@@ -379,12 +379,12 @@ def config_from_dict(values: Any) -> Config:
     options: dict[str, Any] = {}
     for group, saved in values.items():
         if group not in groups:
-            raise RequestError(f"unknown group of options {group!r}{nearest(str(group), groups)}")
+            raise RequestError(f"unknown group of options {str(group)[:60]!r}{nearest(str(group), groups)}")
         if not isinstance(saved, Mapping):
             raise RequestError(f"{group} must be a dictionary of options, not {type(saved).__name__}")
         for name, value in saved.items():
             if name not in OPTIONS or OPTIONS[name].group != group:
                 known = [option for option, field in OPTIONS.items() if field.group == group]
-                raise RequestError(f"unknown option {name!r} in {group}{nearest(str(name), known)}")
+                raise RequestError(f"unknown option {str(name)[:60]!r} in {group}{nearest(str(name), known)}")
             options[name] = fields.check(name, OPTIONS[name].hint, value)
     return Config().replace(**options)

@@ -126,6 +126,7 @@ def test_a_preset_relabels_as_the_method_and_the_observations_ask_for() -> None:
         ({"ddpg": {"batch_size": 2}}, "unknown option 'batch_size' in ddpg"),
         ({"environment": {"frame_stack": "two"}}, "frame_stack must be a whole number, not 'two'"),
         ({"run": {"batch_sizes": 2}}, "unknown option 'batch_sizes' in run; did you mean batch_size"),
+        ({"run": {"[" * 3000: 2}}, f"unknown option '{'[' * 60}' in run"),
         ({"run": {"num_envs": "abc"}}, "num_envs must be a whole number, not 'abc'"),
         ({"reward": {"method": "indicator"}, "environment": {"env": 5}}, "env must be a word, not 5"),
         ({"network": {"hidden_sizes": [8, None]}}, "hidden_sizes must be a whole number, not None"),

@@ -23,7 +23,7 @@ SAID = {
     "02_new_environment": ("of goals reached at the end", "eval/success"),  # `eval` finds the task by what the run folder says
     "03_indicator_rewards": ("oracle  ", "indicator_balance_filter", "of goals reached"),
     "04_auxiliary_losses": ("OL-AUX-5           error on unseen inputs",),
-    "07_weighting": ("sum           upper 0.", "upgrad        digit 0."),
+    "07_weighting": ("sum           lower 0.", "upgrad        digit 0."),
     "06_grasping": ("3 pairs of 256 x 256 pixels", "default                      stitches off by", "of the thesis"),
 }
 
