@@ -66,6 +66,7 @@ def train(task: Task, settings: dict[str, Any], seed: int) -> list[dict[str, flo
     with lend_jax():
         ppo.train(
             environment=env,
+            eval_env=task.make_evaluated() if task.make_evaluated else None,
             wrap_env_fn=task.wrapper(),
             network_factory=networks,
             progress_fn=report,
@@ -95,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--task", choices=TASKS, default="CartpoleBalance")
     parser.add_argument("--smoke", action="store_true", help="a few steps of a few environments, without a record")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--timesteps", type=int, help="environment steps (default: the task's, 5,000,000 or 3,000,000)")
+    parser.add_argument("--timesteps", type=int, help="environment steps (default: the task's, 1,000,000 or 3,000,000)")
     parser.add_argument("--envs", type=int, help="environments (default: the task's, 1,024 or 2,048)")
     parser.add_argument("--results", type=pathlib.Path, default=RESULTS, help="folder of stored records")
     options = parser.parse_args(arguments)
