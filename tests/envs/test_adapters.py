@@ -353,6 +353,14 @@ def test_typed_and_untyped_brax_keys_start_the_same_episode():
     np.testing.assert_array_equal(env.reset(jax.random.PRNGKey(7)).obs, env.reset(jax.random.key(7)).obs)
 
 
+def test_replicated_trees_have_the_sharding_of_brax_pmap():
+    with lend_jax():
+        lent = jax.device_put_replicated({"weight": np.ones(3, np.float32)}, jax.local_devices())
+    returned = jax.pmap(lambda tree: tree, axis_name="i")(lent)  # as brax trains: another sharding compiles it anew
+    assert returned["weight"].sharding == lent["weight"].sharding
+    np.testing.assert_array_equal(lent["weight"], np.ones((len(jax.local_devices()), 3)))
+
+
 BRAX_LEARNING = {"batch_size": 64, "discounting": 0.5}
 
 

@@ -148,6 +148,7 @@ def lend_jax() -> Iterator[None]:
 
 def _device_put_replicated(tree: Any, devices: list[Any]) -> Any:
     """Return ``tree`` with a new first axis along which each of ``devices`` holds a copy."""
-    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
-    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
+    # Sharded as brax's own pmap returns it, over an axis "i": with another name every program is compiled twice.
+    mesh = jax.sharding.Mesh(np.array(devices), ("i",))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("i"))
     return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), sharding), tree)
