@@ -19,6 +19,8 @@ from fake_program import FakeProgram, as_plain, make_fake_trainer, small_config
 
 from jaxrl_vis.errors import RequestError, Terminated
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, REPLACED, Checkpoints
+from jaxrl_vis.run.storage.manifest import FILE
+from jaxrl_vis.run.storage.sums import write_sums
 
 FAKE = Path(__file__).parents[1] / "fake_program.py"
 
@@ -199,6 +201,16 @@ def test_another_structure_is_named(saved):
         Checkpoints(saved).restore_for_resume(shapes)
 
 
+@pytest.mark.parametrize(("before", "after"), [("normalizer.mean", "normalizer.meao"), ('"schema": 2', '"schema": 3')])
+def test_a_changed_byte_of_a_manifest_is_damage_and_not_another_version(states, saved, before, after):
+    for tier in (FULL, LIGHT):
+        file = saved / tier / "3" / FILE
+        file.write_text(file.read_text().replace(before, after, 1))
+    lines = []
+    assert Checkpoints(saved, lines.append).restore_for_resume(states[1]).iteration == 2
+    assert lines == [f"checkpoint {tier}/3 is damaged ({FILE} has changed); trying the one before" for tier in (FULL, LIGHT)]
+
+
 def test_nothing_saved_yet(states, tmp_path):
     checkpoints = Checkpoints(tmp_path / "none", read_only=True)
     assert checkpoints.newest() is None and checkpoints.restore_train(states[1]) is None
@@ -208,6 +220,7 @@ def test_nothing_saved_yet(states, tmp_path):
 def test_a_manifest_of_another_schema_is_refused(states, saved):
     (file,) = [path for path in (saved / FULL / "3" / "manifest").iterdir() if "progress" in path.read_text(errors="replace")]
     file.write_text(file.read_text().replace('"schema": 2', '"schema": 1'))
+    write_sums(saved / FULL / "3")
     with pytest.raises(RequestError, match="is of schema 1, not 2: use the version that wrote it"):
         Checkpoints(saved).restore_for_resume(states[1])
 

@@ -43,6 +43,20 @@ _TIMEOUT_S = 10**9
 DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
 
 
+@contextlib.contextmanager
+def _damage_first(where: Path) -> Iterator[None]:
+    """Raise Unusable in place of a RequestError if files of the checkpoint have changed: a wrong bit is no other version."""
+    try:
+        yield
+    except RequestError:
+        changes = None
+        with contextlib.suppress(OSError):
+            changes = sums.compare_sums(where)
+        if changes:
+            raise Unusable(changes[0]) from None
+        raise
+
+
 @dataclasses.dataclass(frozen=True)
 class Restored:
     """Contents of a checkpoint.
@@ -393,9 +407,10 @@ class Checkpoints:
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
         if not is_manifest(manifest):
             raise Unusable("its manifest is incomplete")
-        if manifest["schema"] != SCHEMA:
-            where = self._folder / tier / str(iteration)
-            raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
+        where = self._folder / tier / str(iteration)
+        with _damage_first(where):
+            if manifest["schema"] != SCHEMA:
+                raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         return manifest
 
     def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
@@ -405,7 +420,8 @@ class Checkpoints:
         specs = {name: host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)
         for name, spec in specs.items():
-            check_structure(where, manifest["items"].get(name, {}), spec)
+            with _damage_first(where):
+                check_structure(where, manifest["items"].get(name, {}), spec)
             specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
         read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
         trees = {}
