@@ -84,9 +84,9 @@ class Learner:
             raise RequestError(
                 f"observations are images (H, W, C) or vectors (S,), not {observation_shape}; sizes are at least 1"
             )
-        method = "indicator_tolerance" if "tolerance" in options else "indicator_balance_filter"
-        name = str(options.pop("preset", "cpu"))
-        self.config: Config = validate(preset(name, **{"method": method, "env": "recordings", **options}))
+        options.setdefault("method", "indicator_tolerance" if "tolerance" in options else "indicator_balance_filter")
+        options.setdefault("env", "recordings")
+        self.config: Config = validate(preset(str(options.pop("preset", "cpu")), **options))
         if self.config.run.seeds != 1 or self.config.run.devices != 1:
             raise RequestError("a learner on the host has one seed and one device")
         resolved = resolve(self.config, horizon)

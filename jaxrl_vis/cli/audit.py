@@ -73,8 +73,15 @@ def run(options: Audit) -> int:
     from jaxrl_vis.studies.audit import report
     from jaxrl_vis.studies.audit.rewards import find_reward
 
-    shown = {"env": options.env, "pixels": options.pixels, "image_size": options.image_size, "env_options": options.env_options}
-    config = locate_env(preset("fast", **shown, random_shift=0))
+    config = preset(
+        "fast",
+        env=options.env,
+        pixels=options.pixels,
+        image_size=options.image_size,
+        env_options=options.env_options,
+        random_shift=0,
+    )
+    config = locate_env(config)
     env = make_env(config)
     config = config.replace(
         tolerance=options.tolerance, tolerance_share=options.tolerance_share, reward_encoder=options.reward_encoder

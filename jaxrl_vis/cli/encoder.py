@@ -49,9 +49,18 @@ def run(options: Encoder) -> int:
     from jaxrl_vis.learner.environment import locate_env, make_env
     from jaxrl_vis.run.encoder import train_encoder
 
-    values = dataclasses.asdict(options)
-    shown = {name: values[name] for name in ("env", "pixels", "image_size", "env_options", "latent_size", "seed")}
-    config = locate_env(preset("fast", **shown, random_shift=0, batch_size=128))
+    config = preset(
+        "fast",
+        env=options.env,
+        pixels=options.pixels,
+        image_size=options.image_size,
+        env_options=options.env_options,
+        latent_size=options.latent_size,
+        seed=options.seed,
+        random_shift=0,
+        batch_size=128,
+    )
+    config = locate_env(config)
     errors = train_encoder(make_env(config), config, options.episodes, options.updates, options.out)
     print(f"{options.out}: mean squared error {errors[0]:.4f} at first, {errors[-1]:.4f} at the end")
     return 0

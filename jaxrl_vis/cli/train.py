@@ -124,7 +124,7 @@ def config_lines(config: Config, given: Collection[str]) -> list[str]:
             group = OPTIONS[option].group
             lines += ["", f"[{group}]"]
         source = ""
-        if option in given or (value != of_algorithm.value(option) and option not in ("preset", "algorithm")):
+        if option in given or value != of_algorithm.value(option):
             source = "given"
         elif value != of_task.value(option) and option != "algorithm":
             source = f"preset {name}, for {config.run.algorithm}"

@@ -69,10 +69,11 @@ def _check(setup: Setup) -> None:
     if config.auxiliary.aux_tasks:
         raise RequestError("contrastive has no auxiliary losses: leave out --aux-tasks")
     goals = config.goals
-    wanted = {"relabel_probability": 1.0, "trivial_goals": 1.0, "future_goals": "geometric"}
-    for name, value in wanted.items():
-        if getattr(goals, name) != value:
-            raise RequestError(f"contrastive learns from goals that follow: {name} must be {value}, not {getattr(goals, name)}")
+    following = dataclasses.replace(goals, relabel_probability=1.0, trivial_goals=1.0, future_goals="geometric")
+    for field in dataclasses.fields(goals):
+        value, wanted = getattr(goals, field.name), getattr(following, field.name)
+        if value != wanted:
+            raise RequestError(f"contrastive learns from goals that follow: {field.name} must be {wanted}, not {value}")
     if setup.resolved.balance_probability:
         raise RequestError(f"contrastive learns from goals that follow: no balance_probability {goals.balance_probability}")
     if setup.shards.count > 1:

@@ -44,7 +44,7 @@ from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_defaul
 JIT_OPTIONS: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "learn": {"donate_argnums": 0}}
 """Arguments of `jaxrl_vis_envs.jit` for the programs that have some."""
 
-ALGORITHMS: dict[str, Callable[[Setup], Algorithm]] = {"ddpg": ddpg.make, "td3": td3.make, "contrastive": contrastive.make}
+ALGORITHMS: dict[str, Callable[[Setup], Algorithm]] = dict(ddpg=ddpg.make, td3=td3.make, contrastive=contrastive.make)
 """Functions that make the built-in algorithms."""
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
