@@ -3,10 +3,12 @@
 import dataclasses
 import hashlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
+import point_mass
 import pytest
 import small_program
 from jax.experimental.compilation_cache import compilation_cache
@@ -23,11 +25,22 @@ from jaxrl_vis.run.compiled import programs, trace_cache
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.compiled.trace_cache import VARIABLE, fingerprint
 from jaxrl_vis.run.storage.folder import RunFolder
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.compiling import compilation
 from jaxrl_vis_envs.compiling.compilation import kernels
 
-CONFIG = preset("debug")
+# Whatever is traced here is traced often, so it is the environment that takes least.
+CONFIG = preset("debug", env="VisualPoint", image_size=8, num_envs=2)
 NAMES = ["init", "learn", "play"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> Iterator[None]:
+    """The environment of the configuration, as one of the packages'."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(point_mass.PointMass, point_mass.PointMassConfig))
+        patch.setattr(point_mass.PointMass, "__module__", "jaxrl_vis_envs.tasks.point_mass")
+        yield
 
 
 @pytest.fixture
