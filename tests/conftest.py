@@ -14,7 +14,8 @@ from typing import Any
 # Read by JAX at its first import, so set before any test module is imported.
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"jaxrl-vis-tests-{getpass.getuser()}"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
+# Also what compiles in a moment: there are thousands of it, and reading takes half as long.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Tests replace parts of the package, which programs that an earlier test has kept would not show.
 os.environ["JAXRL_VIS_KEEP_PROGRAMS"] = "0"

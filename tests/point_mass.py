@@ -1,12 +1,18 @@
 """An environment that compiles in a moment, made as a user would make one: a ball on two rails, a motor for each."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import pytest
 
+from jaxrl_vis.run.compiled import programs, trace_cache
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.pixels import PixelsConfig, image_observer
 from jaxrl_vis_envs.randomization import OFF, Randomization
@@ -78,3 +84,20 @@ class StatePointMass(PointMass):
 
     def observe_state(self, data: Any) -> jax.Array:
         return jnp.concatenate([data.qpos, data.qvel])
+
+
+@contextlib.contextmanager
+def registered(programs_folder: Path | None = None) -> Iterator[None]:
+    """Make the environment known as VisualPoint.
+
+    Args:
+        programs_folder: A folder in which programs are kept once they are traced, as those of built-in environments are; None
+            keeps none.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(PointMass, PointMassConfig))
+        if programs_folder is not None:
+            patch.setattr(PointMass, "__module__", "jaxrl_vis_envs.tasks.point_mass")
+            patch.setenv(trace_cache.VARIABLE, "1")
+            patch.setattr(programs, "enable_compilation_cache", lambda: str(programs_folder))
+        yield

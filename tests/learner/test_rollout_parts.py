@@ -6,6 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import point_mass
 import pytest
 
 from jaxrl_vis.config import preset
@@ -18,13 +19,13 @@ from jaxrl_vis.learner.train_step import TrainStep, make_train_step
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.compiled.threaded_rollout import ThreadedRollout
 
-SIZES = {"num_envs": 10, "seeds": 2, "eval_episodes": 13, "image_size": 16}
-CONFIG = preset("debug", env="VisualReacher", **SIZES)
+CONFIG = preset("debug", env="VisualPoint", num_envs=10, seeds=2, eval_episodes=13, image_size=16)
 
 
 @pytest.fixture(scope="module")
 def program() -> TrainStep:
-    return make_train_step(make_env(CONFIG), CONFIG)
+    with point_mass.registered():
+        return make_train_step(make_env(CONFIG), CONFIG)
 
 
 @pytest.fixture(scope="module")

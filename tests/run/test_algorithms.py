@@ -11,16 +11,15 @@ from fake_program import rows_without_time
 import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.learner.train_step import ALGORITHMS
-from jaxrl_vis_envs import registry
 
 TRAIN = ["train", "VisualPoint", "--preset", "debug", "--image-size", "8", "--num-envs", "2", "--env-steps", "40"]
 TRAIN += ["--full-checkpoint-interval", "2", "--checkpoint-interval", "2", "--seeds", "2"]
 
 
 @pytest.fixture(autouse=True)
-def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(point_mass.PointMass, point_mass.PointMassConfig))
-    yield
+def registered() -> Iterator[None]:
+    with point_mass.registered():
+        yield
 
 
 @pytest.mark.parametrize("algorithm", [name for name in ALGORITHMS if name != "ddpg"])

@@ -21,11 +21,10 @@ from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner import train_step
 from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import trainer
-from jaxrl_vis.run.compiled import programs, trace_cache
+from jaxrl_vis.run.compiled import trace_cache
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.compiled.trace_cache import VARIABLE, fingerprint
 from jaxrl_vis.run.storage.folder import RunFolder
-from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.compiling import compilation
 from jaxrl_vis_envs.compiling.compilation import kernels
 
@@ -34,27 +33,18 @@ CONFIG = preset("debug", env="VisualPoint", image_size=8, num_envs=2)
 NAMES = ["init", "learn", "play"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def registered() -> Iterator[None]:
-    """The environment of the configuration, as one of the packages'."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(registry._ENTRIES, "VisualPoint", registry._Entry(point_mass.PointMass, point_mass.PointMassConfig))
-        patch.setattr(point_mass.PointMass, "__module__", "jaxrl_vis_envs.tasks.point_mass")
-        yield
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch) -> Iterator[Path]:
     """Where programs are kept, which nothing turns off."""
-    monkeypatch.setenv(VARIABLE, "1")
-    monkeypatch.setattr(programs, "enable_compilation_cache", lambda: str(tmp_path))
     monkeypatch.setattr(compilation, "_assumed", set())  # of kernels that other tests have let in
-    return tmp_path / "programs"
+    with point_mass.registered(tmp_path):
+        yield tmp_path / "programs"
 
 
 @pytest.fixture(scope="module")
 def program():
-    return small_program.make_train_step(make_env(CONFIG), CONFIG)
+    with point_mass.registered():
+        return small_program.make_train_step(make_env(CONFIG), CONFIG)
 
 
 def untraceable(program, *names: str):

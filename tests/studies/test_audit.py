@@ -1,6 +1,7 @@
 """Audit of rewards: its measures on cases that are known, and whole audits of rewards that are right, wrong and no rewards."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 from scipy import stats
 
 from jaxrl_vis import cli
+from jaxrl_vis.config import preset
+from jaxrl_vis.run.storage.folder import RunFolder
 from jaxrl_vis.studies.audit import measures, report
-from jaxrl_vis_envs import registry
 
 OWN = """
 import jax.numpy as jnp
@@ -54,11 +56,10 @@ def test_a_probability_is_calibrated_and_its_square_is_not() -> None:
 
 
 @pytest.fixture
-def point(monkeypatch: pytest.MonkeyPatch, here: Path) -> Path:
-    entry = registry._Entry(point_mass.PointMass, point_mass.PointMassConfig)
-    monkeypatch.setitem(registry._ENTRIES, "VisualPoint", entry)
+def point(here: Path) -> Iterator[Path]:
     (here / "own.py").write_text(OWN)
-    return here
+    with point_mass.registered():
+        yield here
 
 
 SMALL = ["audit", "VisualPoint", "--image-size", "16", "--episodes", "8", "--goals", "4", "--sequences", "8"]
@@ -89,8 +90,9 @@ def test_noise_breaks_equality(point: Path) -> None:
 
 def test_a_model_that_a_run_has_trained_along_is_audited(point: Path, capsys: pytest.CaptureFixture[str]) -> None:
     train = ["train", "VisualPoint", "--preset", "debug", "--pixels", "rgbd", "--image-size", "16", "--num-envs", "2"]
-    for method, name in (("classifier", "model"), ("indicator", "other")):
-        assert cli.main([*train, "--env-steps", "20", "--method", method, "--run-dir", name]) == 0
+    assert cli.main([*train, "--env-steps", "20", "--method", "classifier", "--run-dir", "model"]) == 0
+    Path("other").mkdir()  # of which the configuration suffices
+    RunFolder(Path("other")).open(preset("debug", env="VisualPoint", image_size=16, method="indicator"), False, False, ())
     assert cli.main([*SMALL, "--rewards", "model", "--json", "a.json"]) == 0
     (record,) = json.loads(Path("a.json").read_text())["rewards"].values()
     assert all(0.0 <= record[name] <= 1.0 for name in ("false_positive", "false_negative", "calibration_error"))
