@@ -114,7 +114,7 @@ def _image(policy: Policy) -> dict[str, Any]:
     described: dict[str, Any] = {
         "layout": "planar: [channel, row, column], row 0 at the top",
         "frame_stack": int(env.frame_stack),
-        "stacking": "channels of the newest image first, then of those one, two, ... control steps before; a goal repeats its image",
+        "stacking": "channels of the newest image first, then of those one, two, ... control steps before; goals repeat theirs",
         "channels": None if pixels is None else _channels(pixels),
         "depth": None,
         "camera": None,

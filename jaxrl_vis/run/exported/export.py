@@ -169,7 +169,8 @@ def _of_program(contract: Contract) -> Any:
         (_, *sizes), kind = found[name]
         if tuple(sizes) != shape or kind != dtype:
             raise RequestError(
-                f"{contract.file} does not fit its contract: {name} is {kind} {tuple(sizes)}, not {dtype} {shape}; export it again"
+                f"{contract.file} does not fit its contract, {name} is {kind} {tuple(sizes)} and not {dtype} {shape}: "
+                "export it again"
             )
     return model
 

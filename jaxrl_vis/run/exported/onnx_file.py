@@ -80,7 +80,9 @@ def _latent(graph: _Graph, onnx: Any, layers: Layers, name: str) -> str:
     """Add the normalisation and the encoder of one input; return the name of its latent [batch, latent]."""
     source = layers.scaling(name)
     mean, scale = (graph.constant(f"{source}/{part}", layers.arrays[f"{source}/{part}"]) for part in ("mean", "scale"))
-    low, high = (graph.constant(end, np.float32(value)) for end, value in (("low", -layers.limit), ("high", layers.limit)))
+    low, high = (
+        graph.constant(end, np.array(value, np.float32)) for end, value in (("low", -layers.limit), ("high", layers.limit))
+    )
     values = graph.node("Cast", [name], f"{name}/float", to=onnx.TensorProto.FLOAT)
     values = graph.node("Sub", [values, mean], f"{name}/centred")
     values = graph.node("Mul", [values, scale], f"{name}/scaled")
