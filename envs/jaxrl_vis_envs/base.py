@@ -77,6 +77,7 @@ class GoalEnv(abc.ABC):
     threshold: float  # an episode succeeds if goal_distance <= threshold, in `distance_unit`
     distance_unit: str = "m"
     control_period: float  # simulated seconds of one control step
+    action_meaning: str = ""  # of the components of an action, with units, for whoever builds the robot
     # Difficulty of the task before learning, measured by benchmarks/tasks/task_difficulty.py; None: not measured.
     chance: float | None = None  # success rate of uniformly random actions
     difficulty: float | None = None  # mean distance from start to goal, in multiples of `threshold`

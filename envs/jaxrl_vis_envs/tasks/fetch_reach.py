@@ -100,6 +100,10 @@ class FetchReach(PulledArm):
 
     config: FetchReachConfig
     action_size = 4
+    action_meaning = (
+        "displacement of the gripper along the world's x, y and z from where it is, in multiples of action_scale (m); the last "
+        "component is ignored"
+    )
     camera = "front"
     chance, difficulty = 0.008, 2.8  # benchmarks/tasks/task_difficulty.py FetchReach --episodes 1000
 

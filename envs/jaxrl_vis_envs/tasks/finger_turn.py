@@ -63,6 +63,7 @@ class FingerTurn(MjxGoalEnv):
     """The task. ``observer`` determines what the agent sees."""
 
     action_size = 2
+    action_meaning = "torques of the proximal and the distal joint, in multiples of 30 and 15 N m"
     camera = "side"
     distance_unit = "m"
     exact_contacts = True  # contacts are what moves the spinner

@@ -103,6 +103,7 @@ class HandReach(MjxGoalEnv):
     """The task. ``observer`` determines what the agent sees."""
 
     action_size = 20
+    action_meaning = "target angles of the 20 actuators, in the model's order, with -1 and 1 at the ends of each one's range"
     camera = "front"
     distance_unit = "m"
     exact_contacts = True  # the task depends on contacts

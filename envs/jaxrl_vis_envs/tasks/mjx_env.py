@@ -21,6 +21,7 @@ from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import ImageObserver, Observer, image_observer
 from jaxrl_vis_envs.registry import register
+from jaxrl_vis_envs.render import Scene
 
 
 class MjxGoalEnv(GoalEnv):
@@ -54,7 +55,7 @@ class MjxGoalEnv(GoalEnv):
         self._model = mjx_model.put_model(mj_model)
         self._draw = observer(mj_model) if observer is not None else None
         self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
-        self._scene = getattr(self._draw, "scene", None)
+        self._scene: Scene | None = getattr(self._draw, "scene", None)
         if self._randomization.varies_appearance and self._scene is None:
             raise ValueError("camera, lights and colours can only be randomized in a task that draws images")
 
@@ -136,6 +137,11 @@ class MjxGoalEnv(GoalEnv):
     @property
     def goal_state_size(self) -> int:
         return jax.eval_shape(self.achieved, self._data_shape).shape[0]
+
+    @property
+    def scene(self) -> Scene | None:
+        """Scene and camera of the images, before randomisation; None if the task observes states."""
+        return self._scene
 
     @functools.cached_property
     def _data_shape(self) -> mjx.Data:

@@ -65,6 +65,10 @@ class Reacher(MjxGoalEnv):
     """The task. ``observer`` determines what the agent sees."""
 
     action_size = 2
+    action_meaning = (
+        "of shoulder and elbow: velocities that a control step begins with, in multiples of velocity_scale (rad/s); with "
+        "control=torque the controls of their motors"
+    )
     camera = "above"
     distance_unit = "m"
     chance, difficulty = 0.004, 23.7  # benchmarks/tasks/task_difficulty.py Reacher --episodes 20000

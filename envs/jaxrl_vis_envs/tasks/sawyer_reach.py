@@ -68,6 +68,9 @@ class SawyerReach(PulledArm):
 
     config: SawyerReachConfig
     action_size = 3
+    action_meaning = (
+        "displacement along the world's x, y and z of the target that pulls the hand, in multiples of action_scale (m)"
+    )
     camera = "above"
     chance, difficulty = 0.010, 3.5  # benchmarks/tasks/task_difficulty.py SawyerReach --episodes 1000
 

@@ -111,6 +111,9 @@ class StalkReach(MjxGoalEnv):
 
     config: StalkReachConfig
     action_size = 3
+    action_meaning = (
+        "displacement along x, y and z of the position that the grip is driven to, in multiples of action_scale (m)"
+    )
     camera = "shoulder"
     distance_unit = "m"
     control_period = _CONTROL_PERIOD

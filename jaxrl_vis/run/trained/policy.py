@@ -18,7 +18,9 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
+from jaxrl_vis.run.storage.checkpoint import Restored
 from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis_envs.base import GoalEnv
 
 
@@ -32,6 +34,7 @@ class Policy:
         seed: Seed of the run that trained it.
         iteration: Iteration of its checkpoint.
         parameters: Parameters of the policy, from `Algorithm.policy_params`.
+        algorithm: The algorithm, whose ``act`` and ``aim`` read them.
     """
 
     env: GoalEnv
@@ -39,7 +42,7 @@ class Policy:
     seed: int
     iteration: int
     parameters: PolicyParams = dataclasses.field(repr=False)
-    _algorithm: Algorithm = dataclasses.field(repr=False)
+    algorithm: Algorithm = dataclasses.field(repr=False)
 
     @property
     def env_name(self) -> str:
@@ -75,7 +78,7 @@ class Policy:
 
     @functools.cached_property
     def _act(self) -> Any:
-        algorithm = self._algorithm
+        algorithm = self.algorithm
 
         def act(parameters: PolicyParams, observation: jax.Array, goal: jax.Array) -> jax.Array:
             observations, goals = (jnp.asarray(array, self.observation_spec.dtype)[None] for array in (observation, goal))
@@ -118,11 +121,31 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | 
             untrusted code.
     """
     trainer = open_run(run_dir, trust=trust)
+    seed = choose_seed(trainer, run_dir, seed)
+    return make_policy(trainer, load(trainer, run_dir, checkpoint), seed)
+
+
+def choose_seed(trainer: Trainer, run_dir: Path | str, seed: int | None) -> int:
+    """Return ``seed``, or the first of the run for None.
+
+    Raises:
+        RequestError: The run has not trained it.
+    """
     seed = trainer.config.run.seed if seed is None else seed
     if seed not in trainer.seeds:
         trained = f"seed {trainer.seeds[0]}" if len(trainer.seeds) == 1 else f"seeds {trainer.seeds[0]} to {trainer.seeds[-1]}"
         raise RequestError(f"the run in {run_dir} has trained no seed {seed}, only {trained}")
-    restored = load(trainer, run_dir, checkpoint)
+    return seed
+
+
+def make_policy(trainer: Trainer, restored: Restored, seed: int) -> Policy:
+    """Make the policy of one seed.
+
+    Args:
+        trainer: From `restored_run.open_run`.
+        restored: The learner, from `restored_run.load`.
+        seed: One of the trainer's seeds.
+    """
     enable_compilation_cache()
     index, algorithm = trainer.seeds.index(seed), trainer.program.algorithm
     train = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), restored.train)

@@ -1,0 +1,64 @@
+"""``jaxrl-vis export``."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from jaxrl_vis.cli.checks import check_run, may_run_code
+from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.files import check_path
+
+if TYPE_CHECKING:
+    from jaxrl_vis.run.exported.export import Check
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a trained policy to a file that runs without this project, with its contract and golden frames; or check one.
+
+    The exit status is 1 if the file's actions differ from our own by more than 1e-4.
+    """
+
+    run_dir: Annotated[Path | None, AlsoPositional()] = None
+    """The run folder."""
+    format: Literal["onnx", "stablehlo", "safetensors"] = "onnx"
+    """Format: ONNX (needs the extra ``export``), StableHLO for JAX without this project, or weights by name."""
+    out: Path | None = None
+    """Folder for the policy, contract.json and golden.npz; export/FORMAT in the run folder if not given."""
+    seed: int | None = None
+    """Seed, of a run with several; the first if not given."""
+    overwrite: bool = False
+    """Replace an exported policy in the folder."""
+    check: Path | None = None
+    """Export nothing: run this exported file on its golden frames, and print the largest difference."""
+    trust: bool = False
+    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+
+
+def run(options: Export) -> int:
+    """Export a policy, or check an exported one."""
+    if options.check is not None:
+        if options.run_dir is not None or options.out is not None or options.overwrite:
+            raise RequestError("--check takes an exported file and writes nothing: leave out the run, --out and --overwrite")
+        check_path(options.check)
+        from jaxrl_vis.run.exported.export import check_file
+
+        return _report(check_file(options.check))
+    if options.run_dir is None:
+        raise RequestError("no run given: name its folder, or an exported file with --check")
+    check_run(options.run_dir)
+    if options.out is not None:
+        check_path(options.out)
+    trust = may_run_code(options.run_dir, options.trust)
+    from jaxrl_vis.run.exported.export import export_run
+
+    return _report(
+        export_run(options.run_dir, options.format, options.out, seed=options.seed, overwrite=options.overwrite, trust=trust)
+    )
+
+
+def _report(check: "Check") -> int:
+    verdict = "" if check.passed else ", which is too much: export it again"
+    print(f"{check.file}: largest difference {check.difference:.1e} over {check.count} golden frames{verdict}")
+    return 0 if check.passed else 1
