@@ -25,8 +25,9 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("host.files",),
     ("host.devices", "host.distributed", "host.plugins", "host.weights_file"),
     ("learner",),
-    ("indicator", "report"),
-    ("run",),
+    ("report",),
+    ("recordings",),
+    ("indicator", "run"),
     ("host.worker_pool", "studies"),
     ("bench", "host.doctor"),
     ("cli.parsing",),  # the part of the command line that commands of `stalks` are written with
