@@ -53,7 +53,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: fractions.Fractio
                 stream.height, stream.width = frame.shape[:2]
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
             picture.pts, picture.time_base = number, 1 / fps
-            container.mux(stream.encode(picture))
+            container.mux(stream.encode(picture))  # type: ignore[arg-type]
         container.mux(stream.encode(None))
 
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
-from jaxrl_vis.recordings import images, lerobot_format as form
+from jaxrl_vis.recordings import images
+from jaxrl_vis.recordings import lerobot_format as form
 from jaxrl_vis.recordings.episodes import Recordings
 
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}

@@ -5,8 +5,8 @@
     data/chunk-000/file-000.parquet               a row a step: observation before the action, action, true states
     videos/KEY/chunk-000/file-000.mp4             colours, all episodes one after the other
 
-LeRobot has a row for each action, so an episode has T rows. What is seen after the last action stands in columns of meta/episodes
-that begin with `LAST`, which LeRobot's loader does not look at.
+LeRobot has a row for each action, so an episode has T rows. What is seen after the last action stands in columns of
+meta/episodes that begin with `LAST`, which LeRobot's loader does not look at.
 
 Source: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, and the loader of lerobot 0.4.4, which the format is tried with.
 """

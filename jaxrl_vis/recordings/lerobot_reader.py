@@ -2,7 +2,6 @@
 
 import contextlib
 import itertools
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,10 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import read_json
-from jaxrl_vis.recordings import images, lerobot_format as form
+from jaxrl_vis.recordings import images
+from jaxrl_vis.recordings import lerobot_format as form
 from jaxrl_vis.recordings.episodes import Recordings
 from jaxrl_vis.recordings.lerobot import check_packages
-
-_ONE = np.float32
 
 
 def is_dataset(folder: Path) -> bool:
@@ -50,6 +48,10 @@ def read(folder: Path) -> Recordings:
 
 
 class _Reader:
+    _rows: list[dict[str, Any]]
+    _steps: int
+    _data: Any
+
     def __init__(self, folder: Path, info: Mapping[str, Any]) -> None:
         self._folder, self._info, self._features = folder, info, info["features"]
 
@@ -90,7 +92,7 @@ class _Reader:
         column = self._data[name].combine_chunks()
         size = self._features[name]["shape"][0]
         flat = column if self._features[name]["shape"] == [1] else column.flatten()
-        values = flat.to_numpy(zero_copy_only=False).astype(_ONE)
+        values = flat.to_numpy(zero_copy_only=False).astype(np.float32)
         return values.reshape(len(self._rows), self._steps, size)
 
     def _closed(self, name: str, values: np.ndarray) -> np.ndarray:
@@ -123,8 +125,8 @@ class _Reader:
         return self._closed(form.STATE, seen), goals_of_all
 
     def _images(self, name: str, count: int | None = None) -> np.ndarray:
-        """Return the first images of every episode, [N, count or T, H, W, 3] uint8."""
-        count = self._steps if count is None else count
+        """Return the first ``count`` images of every episode, or all T: [N, count, H, W, 3] uint8."""
+        count = count or self._steps
         height, width = self._features[name]["shape"][:2]
         shown = np.empty((len(self._rows), count, height, width, 3), np.uint8)
         if self._features[name]["dtype"] == "image":
