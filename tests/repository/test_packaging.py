@@ -30,6 +30,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("indicator", "run"),
     ("host.worker_pool", "studies"),
     ("bench", "host.doctor"),
+    ("host.platform_report",),
     ("cli.parsing",),  # the part of the command line that commands of `stalks` are written with
     ("cli.checks",),
     ("stalks",),

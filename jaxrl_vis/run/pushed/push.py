@@ -33,7 +33,8 @@ def check_target(to: str) -> None:
         to: A folder that does not exist or is empty, or ``hub:user/name``.
 
     Raises:
-        RequestError: The folder holds something or cannot be written, the name is no repository's, or huggingface_hub is missing.
+        RequestError: The folder holds something or cannot be written, the name is no repository's, or huggingface_hub is
+            missing.
     """
     if to.startswith(HUB):
         if not _REPOSITORY.fullmatch(to.removeprefix(HUB)):
