@@ -18,6 +18,7 @@ from typing import Any
 from jaxrl_vis.errors import StorageError
 from jaxrl_vis.host import doctor, provenance
 from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.run.storage.folder import RunFolder
 
 SCHEMA = 1
 _TASK = "VisualReacher"
@@ -57,13 +58,13 @@ class Training:
         """Train, and check that numbers stay finite (a trainer does)."""
         import jaxrl_vis
 
-        start, metrics, done = time.perf_counter(), {}, 0
+        start = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-            trainer = jaxrl_vis.make_trainer(jaxrl_vis.preset("debug", env=_TASK), Path(folder) / "run")
-            for report in trainer.run():
-                metrics, done = report.metrics, report.env_steps
-        speed = float(metrics["time/env_steps_per_s"])
-        wall = time.perf_counter() - start
+            run = RunFolder(Path(folder) / "run")
+            for _ in jaxrl_vis.make_trainer(jaxrl_vis.preset("debug", env=_TASK), run.path).run():
+                pass
+            row = run.rows()[-1]
+        speed, done, wall = float(row["time/env_steps_per_s"]), int(row["env_steps"]), time.perf_counter() - start
         self.figures = {
             "task": _TASK,
             "preset": "debug",
@@ -111,7 +112,7 @@ def to_record(findings: dict[str, Any], training: dict[str, Any] | None) -> dict
     return {
         "platform_schema": SCHEMA,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "system": f"{platform.system()} {platform.release()}",
+        "system": " ".join([platform.system(), *platform.libc_ver()]).strip(),
         "machine": platform.machine(),
         "processor": processor(),
         "cores": os.cpu_count(),
