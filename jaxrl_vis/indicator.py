@@ -11,7 +11,6 @@ steps.
 """
 
 import functools
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ from jaxrl_vis.learner.memory.sampling import Sampler
 from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import compute_dtype
 from jaxrl_vis.learner.resolved import resolve
+from jaxrl_vis.recordings.convert import read
 from jaxrl_vis.types import Episodes, ReplayState, TrainState
 from jaxrl_vis_envs.goals import indicator_reward as rewards
 
@@ -196,26 +196,20 @@ def learn(recordings: Path | str, updates: int = 5000, **options: Any) -> Learne
     """Train a learner on recorded episodes.
 
     Args:
-        recordings: An .npz file with ``observations`` [N, T+1, ...], ``actions`` [N, T, A], and possibly ``goals`` [N, ...].
+        recordings: An .npz file with ``observations`` [N, T+1, ...], ``actions`` [N, T, A], and possibly ``goals`` [N, ...]; or
+            the folder of a LeRobot dataset (`jaxrl_vis.recordings`).
         updates: Number of gradient steps, rounded up to whole hundreds if it is more than that.
         **options: As of `Learner`.
 
     Raises:
         RequestError: The file is missing or has no such arrays, or an option is wrong.
     """
-    try:
-        with np.load(recordings, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ("observations", "actions", "goals") if name in file.files}
-        observations, actions = arrays["observations"], arrays["actions"]
-        count, length, *shape = observations.shape
-        if actions.ndim != 3 or actions.shape[:2] != (count, length - 1):
-            raise RequestError(f"actions must have the shape ({count}, {length - 1}, A), not {actions.shape}")
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise RequestError(f"{recordings} has no recorded episodes, observations and actions: {error}") from error
-    learner = Learner(tuple(shape), actions.shape[2], length - 1, capacity=count, **options)
-    goals = arrays.get("goals", [None] * count)
+    recorded = read(Path(recordings))
+    count, shape = recorded.count, recorded.observations.shape[2:]
+    learner = Learner(shape, recorded.actions.shape[2], recorded.horizon, capacity=count, **options)
+    goals = [None] * count if recorded.goals is None else recorded.goals
     for episode in range(count):
-        learner.add(observations[episode], actions[episode], goals[episode])
+        learner.add(recorded.observations[episode], recorded.actions[episode], goals[episode])
     together = min(updates, 100)
     for _ in range(-(-updates // together)):
         learner.update(together)

@@ -17,7 +17,22 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jaxrl_vis
-from jaxrl_vis.cli import audit, bench, doctor, encoder, envs, eval, export, figure, play, sweep, train, verify
+from jaxrl_vis.cli import (
+    audit,
+    bench,
+    dataset,
+    doctor,
+    encoder,
+    envs,
+    eval,
+    export,
+    figure,
+    play,
+    push,
+    sweep,
+    train,
+    verify,
+)
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
 from jaxrl_vis.host import distributed
@@ -30,6 +45,8 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `
     "eval": (eval.Eval, eval.run),
     "play": (play.Play, play.run),
     "export": (export.Export, export.run),
+    "dataset": (dataset.Dataset, dataset.run),
+    "push": (push.Push, push.run),
     "verify": (verify.Verify, verify.run),
     "audit": (audit.Audit, audit.run),
     "encoder": (encoder.Encoder, encoder.run),

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from jaxrl_vis.errors import RequestError
@@ -77,23 +77,62 @@ def physics_and_camera() -> str:
     return f"one step of {env.name} and its {size} image in {time.perf_counter() - start:.1f} s, compilation included"
 
 
+def renderer() -> str:
+    """Draw a ball above a floor, and check depths and segmentation that follow from their places."""
+    import jax
+    import mujoco
+    import numpy as np
+
+    from jaxrl_vis_envs.render import Scene, render
+
+    model = mujoco.MjModel.from_xml_string(_BALL)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    scene, size = Scene.from_mjmodel(model, camera="above", height=33, width=33), 33
+    frame = jax.tree.map(np.asarray, jax.jit(lambda scene: render(scene, data))(scene))
+    middle, corner = (size // 2, size // 2), (0, 0)
+    ball, floor = float(frame.depth[middle]), float(frame.depth[corner])
+    if (int(frame.segmentation[corner]), int(frame.segmentation[middle])) != (0, 1):
+        raise ValueError("the image shows other objects than there are")
+    if abs(ball - 1.5) > 1e-3 or abs(floor - 2.0) > 1e-3:
+        raise ValueError(f"depths are {ball:.4f} and {floor:.4f} m in place of 1.5 and 2 m")
+    return f"depths and objects of a {size}x{size} image are right"
+
+
+_BALL = """
+<mujoco>
+  <worldbody>
+    <camera name="above" pos="0 0 2" fovy="45"/>
+    <light pos="0 0 3"/>
+    <geom name="floor" type="plane" size="5 5 .1"/>
+    <geom name="ball" type="sphere" pos="0 0 .25" size=".25"/>
+  </worldbody>
+</mujoco>
+"""
+
+
 CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
     ("versions", versions),
     ("devices", devices),
     ("memory", memory),
     ("compile cache", compilation_cache),
     ("environment", physics_and_camera),
+    ("renderer", renderer),
 )
 
 
-def main() -> int:
+def main(more: Sequence[tuple[str, Callable[[], str]]] = (), findings: dict[str, Any] | None = None) -> int:
     """Run all checks, even after failures, and print the results.
+
+    Args:
+        more: Further checks, by name.
+        findings: Filled with ``passed`` and ``text`` of each check, by name.
 
     Returns:
         0 if all checks pass; 1 if one fails; 2 if JAX is configured for a device that is not available, which stops the checks.
     """
-    failures = 0
-    for name, check in CHECKS:
+    failures, checks = 0, (*CHECKS, *more)
+    for name, check in checks:
         try:
             verdict, text = "ok  ", check()
         except RequestError as error:
@@ -102,6 +141,8 @@ def main() -> int:
         except Exception as error:  # noqa: BLE001 - every failure is reported
             failures += 1
             verdict, text = "FAIL", f"{type(error).__name__}: {' '.join(str(error).split())}"
+        if findings is not None:
+            findings[name] = {"passed": verdict != "FAIL", "text": text}
         print(f"{verdict}  {name:14} {text}", flush=True)
-    print("all is well" if not failures else f"{failures} of {len(CHECKS)} checks failed")
+    print("all is well" if not failures else f"{failures} of {len(checks)} checks failed")
     return 1 if failures else 0

@@ -70,7 +70,7 @@ def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarra
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
     """Write named arrays without conversion."""
-    whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}  # numbers stay without axes
     write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 

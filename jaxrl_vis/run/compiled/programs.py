@@ -21,7 +21,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.host import distributed
 from jaxrl_vis.host.devices import cache_fault, default_cache, enable_compilation_cache
 from jaxrl_vis.learner.acting.evaluate import Evaluation
-from jaxrl_vis.learner.acting.rollout import Exploration
+from jaxrl_vis.learner.acting.rollout import NO_EXPLORATION, Exploration
 from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.train_step import JIT_OPTIONS
 from jaxrl_vis.report import videos
@@ -248,6 +248,24 @@ class Programs:
             return self.compiled("evaluate")(train, chosen)
         keys = jnp.stack([chosen] * len(self.seeds))
         return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.run.eval_episodes, self.env.frame_stack)
+
+    def record(self, train: TrainState, key: jax.Array, count: int) -> list[Any]:
+        """Play episodes without noise by the program of training rollouts; return their parts (`rollout_parts.Played`).
+
+        Args:
+            train: The learner, [S, ...].
+            key: [] a typed key, which draws the episodes; all seeds play the same ones.
+            count: Episodes of each learner, rounded up to whole parts.
+        """
+        program, size = self.compiled("play"), self.program.part_size
+        if self.program.plays_any:
+            keys = jnp.stack([key] * len(self.seeds))
+            return self._rollout.play(program, train, keys, count, NO_EXPLORATION)
+        parts = []
+        for number in range(-(-count // size)):  # it plays nothing but whole rollouts
+            keys = self.layout.put(jnp.stack([jax.random.fold_in(key, number)] * len(self.seeds)), self.layout.by_seed)
+            parts += self._rollout.play(program, train, keys, size, NO_EXPLORATION)
+        return parts
 
     def pending(self, metrics: Metrics) -> Pending:
         """Prepare metrics of `train_iteration` or `evaluate` for reading by the host, without compiling anything."""

@@ -19,6 +19,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
 from jaxrl_vis.run.storage.checkpoint import Restored
+from jaxrl_vis.run.trained import policy_file
 from jaxrl_vis.run.trained.restored_run import load, open_run
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis_envs.base import GoalEnv
@@ -111,7 +112,7 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | 
     """Load the policy of a run, on any platform that JAX supports.
 
     Args:
-        run_dir: The run folder.
+        run_dir: The run folder, or a folder of `jaxrl-vis push`.
         seed: Seed, for a run with several; None: the first.
         checkpoint: Iteration of an existing checkpoint; None: the newest valid one.
         trust: Allow the run's own code, which a task ``module:Name`` executes; not needed for runs that were trained here.
@@ -121,6 +122,11 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | 
             untrusted code.
     """
     trainer = open_run(run_dir, trust=trust)
+    if policy_file.holds_policy(Path(run_dir)):
+        pushed, source = policy_file.read(Path(run_dir), trainer)
+        policy_file.check_seed(source, seed, checkpoint)
+        enable_compilation_cache()
+        return Policy(trainer.env, trainer.config, source.seed, source.iteration, pushed, trainer.program.algorithm)
     seed = choose_seed(trainer, run_dir, seed)
     return make_policy(trainer, load(trainer, run_dir, checkpoint), seed)
 

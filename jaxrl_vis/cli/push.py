@@ -1,0 +1,33 @@
+"""``jaxrl-vis push``."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from jaxrl_vis.cli.checks import check_run, may_run_code
+from jaxrl_vis.cli.parsing import AlsoPositional
+
+
+@dataclasses.dataclass(frozen=True)
+class Push:
+    """Push a trained policy to a folder or a hub: card, curve, video, configuration and weights; `load_policy` reads it."""
+
+    run_dir: Annotated[Path, AlsoPositional()]
+    """The run folder."""
+    to: str
+    """A new folder, or hub:user/name for the Hugging Face hub (needs the extra hub, and `hf auth login` once)."""
+    seed: int | None = None
+    """Seed whose policy is pushed; the run's first if not given."""
+    trust: bool = False
+    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+
+
+def run(options: Push) -> int:
+    """Push a policy."""
+    check_run(options.run_dir)
+    trust = may_run_code(options.run_dir, options.trust)
+    from jaxrl_vis.run.pushed.push import check_target, push
+
+    check_target(options.to)
+    print(push(options.run_dir, options.to, options.seed, trust))
+    return 0

@@ -1,0 +1,59 @@
+"""Recorded episodes in any of the formats, by the place where they are."""
+
+from pathlib import Path
+
+from jaxrl_vis.errors import RequestError, StorageError
+from jaxrl_vis.host.files import check_path
+from jaxrl_vis.recordings import lerobot, lerobot_reader, npz
+from jaxrl_vis.recordings.episodes import Recordings
+from jaxrl_vis.report.outputs import check_writable
+
+LEROBOT, NPZ = "lerobot", "npz"
+
+
+def holds_recordings(path: Path) -> bool:
+    """Return True if ``path`` is an .npz file, the folder of one, or a LeRobot dataset."""
+    check_path(path)
+    return path.suffix == ".npz" or (path / npz.FILE_NAME).is_file() or lerobot_reader.is_dataset(path)
+
+
+def read(path: Path) -> Recordings:
+    """Read recorded episodes.
+
+    Args:
+        path: See `holds_recordings`.
+
+    Raises:
+        RequestError: There are none, or they are damaged.
+    """
+    if lerobot_reader.is_dataset(path):
+        return lerobot_reader.read(path)
+    return npz.read(path if path.suffix == ".npz" else path / npz.FILE_NAME)
+
+
+def check_out(out: Path, kind: str) -> None:
+    """Check that episodes can be written to ``out``. Call it before playing them.
+
+    Raises:
+        RequestError: The place is taken or not writable, or a package is missing.
+    """
+    if kind == LEROBOT:
+        lerobot.check_packages()
+        if out.is_dir() and any(out.iterdir()):
+            raise RequestError(f"--out {out} is not empty: name a new folder")
+    check_writable(out, "--out", folder=out.suffix != ".npz")
+
+
+def write(recordings: Recordings, out: Path, kind: str) -> Path:
+    """Write episodes, and return the file or folder.
+
+    Raises:
+        RequestError: See `check_out`.
+        StorageError: They cannot be written.
+    """
+    path = out if kind == LEROBOT or out.suffix == ".npz" else out / npz.FILE_NAME
+    try:
+        (lerobot if kind == LEROBOT else npz).write(recordings, path)
+    except OSError as error:
+        raise StorageError(f"cannot write {path} ({error.strerror or error}): nothing is left of it there") from error
+    return path

@@ -1,0 +1,156 @@
+"""Recorded episodes on the host, and the replay that holds them.
+
+played = Recordings.of_rollout(episodes, frame_stack, about)    what `rollout.play` returns, as a person reads it
+replay, state = recordings.to_replay()                          as the learner reads it: byte for byte what was recorded
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.learner.memory.replay import Replay
+from jaxrl_vis.types import Episodes, ReplayState
+
+_CHANNELS = (1, 3, 4)  # depth; colour; both
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recordings:
+    """N episodes of T steps each. Images are [H, W, C] uint8: colour, depth, or both in this order.
+
+    Attributes:
+        observations: [N, T+1, H, W, C] uint8, or [N, T+1, S] float32: after 0, 1, ... T steps, the newest image of each.
+        actions: [N, T, A] float32, as executed, in [-1, 1].
+        goals: [N, H, W, C] uint8, or [N, S] float32; None if nobody has asked for anything.
+        states: [N, T+1, G] float32, the true states at the same times; None if nobody knows them.
+        goal_states: [N, G] float32, those of the goals; None likewise.
+        success: [N] bool, at the last step; None likewise.
+        about: Where they come from: ``task``, ``control_period`` (s), ``frame_stack``, ``depth_range`` (m), ...
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    goals: np.ndarray | None = None
+    states: np.ndarray | None = None
+    goal_states: np.ndarray | None = None
+    success: np.ndarray | None = None
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes, types and numbers.
+
+        Raises:
+            RequestError: Something does not fit; the message names the array.
+        """
+        seen, actions = self.observations, self.actions
+        images = seen.dtype == np.uint8 and seen.ndim == 5 and seen.shape[-1] in _CHANNELS
+        if not images and not (seen.dtype == np.float32 and seen.ndim == 3):
+            raise RequestError(
+                "observations must be images [N, T+1, H, W, C] uint8 with 1, 3 or 4 channels, or vectors [N, T+1, S] float32, "
+                f"not {seen.dtype} of {seen.shape}"
+            )
+        count, slots = seen.shape[:2]
+        if not count or slots < 2:
+            raise RequestError(f"observations of {count} episodes and {slots} times: there must be an episode of a step")
+        steps = slots - 1
+        if actions.dtype != np.float32 or actions.ndim != 3 or actions.shape[:2] != (count, steps) or not actions.shape[2]:
+            raise RequestError(
+                f"actions must have the shape ({count}, {steps}, A) float32, not {actions.dtype} of {actions.shape}"
+            )
+        size = 0 if self.states is None else self.states.shape[-1]
+        wanted: dict[str, tuple[tuple[int, ...], Any]] = {
+            "goals": ((count, *seen.shape[2:]), seen.dtype),
+            "states": ((count, slots, size), np.float32),
+            "goal_states": ((count, size), np.float32),
+            "success": ((count,), np.bool_),
+        }
+        for name, (shape, dtype) in wanted.items():
+            array = getattr(self, name)
+            if array is not None and (array.shape != shape or array.dtype != dtype):
+                raise RequestError(f"{name} must have the shape {shape} {np.dtype(dtype)}, not {array.dtype} of {array.shape}")
+        stack = self.about.get("frame_stack", 1)
+        if not isinstance(stack, int) or stack < 1:
+            raise RequestError(f"about.frame_stack must be a whole number from 1, not {stack!r}")
+        if (self.states is None) != (self.goal_states is None):
+            raise RequestError("states and goal_states come together: give both or neither")
+        for name in ("observations", "actions", "goals", "states", "goal_states"):
+            array = getattr(self, name)
+            if array is not None and array.dtype == np.float32 and not np.all(np.isfinite(array)):
+                raise RequestError(f"{name} must be finite numbers: leave the episodes out that are not")
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.observations.shape[0]
+
+    @property
+    def horizon(self) -> int:
+        """T."""
+        return self.actions.shape[1]
+
+    @property
+    def are_images(self) -> bool:
+        """True if observations are images."""
+        return self.observations.dtype == np.uint8
+
+    @property
+    def frame_stack(self) -> int:
+        """F, number of images that the policy saw at once; each is recorded once."""
+        return self.about.get("frame_stack", 1)
+
+    @classmethod
+    def of_rollout(cls, episodes: Episodes, success: Any, about: Mapping[str, Any]) -> Self:
+        """Take the episodes of one learner, [N, ...] arrays on any device, to the host.
+
+        Args:
+            episodes: As `rollout.play` returns them.
+            success: [N], at the last step.
+            about: As of `Recordings`.
+        """
+        seen = np.asarray(episodes.observations)
+        if seen.dtype == np.uint8:
+            seen = np.moveaxis(seen[:, :, : seen.shape[2] // int(about.get("frame_stack", 1))], 2, -1)
+        states = np.asarray(episodes.states)
+        return cls(
+            observations=np.ascontiguousarray(seen[:, :-1]),
+            actions=np.asarray(episodes.actions),
+            goals=np.ascontiguousarray(seen[:, -1]),
+            states=states[:, :-1],
+            goal_states=states[:, -1],
+            success=np.asarray(success) > 0,
+            about=about,
+        )
+
+    def first(self, count: int | None) -> Self:
+        """Return the first ``count`` episodes, or all for None."""
+        arrays = (field.name for field in dataclasses.fields(self) if field.name != "about")
+        return dataclasses.replace(
+            self, **{name: array[:count] for name in arrays if (array := getattr(self, name)) is not None}
+        )
+
+    def to_episodes(self) -> Episodes:
+        """Convert to the learner's form, with one image in each slot. A missing goal is the last observation; missing true
+        states are zeros [G = 1].
+        """
+        goals = self.observations[:, -1] if self.goals is None else self.goals
+        seen = np.concatenate([self.observations, goals[:, None]], axis=1)
+        if self.states is None or self.goal_states is None:
+            states = np.zeros((self.count, self.horizon + 2, 1), np.float32)
+        else:
+            states = np.concatenate([self.states, self.goal_states[:, None]], axis=1)
+        planar = np.moveaxis(seen, -1, 2) if self.are_images else seen
+        return Episodes(observations=jnp.asarray(planar), states=jnp.asarray(states), actions=jnp.asarray(self.actions))
+
+    def to_replay(self) -> tuple[Replay, ReplayState]:
+        """Return a replay that holds just these episodes, and its sizes: sample from it as from any other.
+
+        The true states that oracle rewards read are there if they were recorded.
+        """
+        of_one_image = Replay(1, self.count, self.horizon)
+        state = jax.jit(of_one_image.of_rollout)(self.to_episodes())
+        return of_one_image._replace(frame_stack=self.frame_stack), state

@@ -1,0 +1,107 @@
+"""Card of a policy, README.md: what it does, how well, and the command that trained it, for people and for a hub."""
+
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.run.command import training_command
+
+
+class Score(NamedTuple):
+    """Success at the last step of evaluation episodes.
+
+    Attributes:
+        share: From 0 to 1.
+        low, high: Wilson's interval of 95 %.
+        episodes: Number of episodes.
+        env_steps: Environment steps of the training before.
+        distance: Mean distance to the goal, in the task's unit.
+    """
+
+    share: float
+    low: float
+    high: float
+    episodes: int
+    env_steps: int
+    distance: float
+
+
+def score(row: Mapping[str, Any], episodes: int) -> Score:
+    """Summarise a row of metrics.jsonl of an evaluation on ``episodes`` episodes."""
+    from scipy.stats import binomtest
+
+    share = float(row["eval/success"])
+    interval = binomtest(round(share * episodes), episodes).proportion_ci(method="wilson")
+    distance = float(row["eval/goal_distance"])
+    return Score(share, float(interval.low), float(interval.high), episodes, int(row["env_steps"]), distance)
+
+
+def card(
+    config: Config, record: Mapping[str, Any], seed: int, scores: Mapping[int, Score], unit: str, pictures: Mapping[str, str]
+) -> str:
+    """Write the card.
+
+    Args:
+        config: Configuration of the run.
+        record: The run's config.json.
+        seed: Seed whose weights are in the folder.
+        scores: By seed; empty if none was evaluated where the weights were saved.
+        unit: Unit of distances.
+        pictures: File by caption.
+    """
+    task, name = config.environment.env, f"{config.environment.env}, {config.reward.method}, {config.run.algorithm}"
+    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in _front(task, name, scores.get(seed)).items()), "---", ""]
+    lines += [f"# {name}", "", f"A policy that reaches goals of the task {task}, trained by jaxrl-vis.", ""]
+    lines += [f"![{caption}]({file})\n" for caption, file in pictures.items()]
+    lines += ["| seed | environment steps | success | 95 % interval | episodes | mean distance |", "|---|---|---|---|---|---|"]
+    for number, each in scores.items():
+        here = " (these weights)" if number == seed else ""
+        lines.append(
+            f"| {number}{here} | {each.env_steps:,} | {each.share:.3f} | {each.low:.3f} to {each.high:.3f} | "
+            f"{each.episodes} | {each.distance:.3g} {unit} |"
+        )
+    if not scores:
+        lines[-2:] = [f"Weights of seed {seed}; not evaluated where they were saved."]
+    versions = record.get("versions") or {}
+    device = (record.get("device") or {}).get("name", "unknown")
+    lines += [
+        "",
+        "Success is measured at the last step of an episode, without exploration; the interval is Wilson's.",
+        "",
+        "## Use",
+        "",
+        "```python",
+        "import jaxrl_vis",
+        "",
+        'policy = jaxrl_vis.load_policy("FOLDER")  # this folder; observation, goal -> action in [-1, 1]',
+        "```",
+        "",
+        "## Training",
+        "",
+        "```sh",
+        training_command(config),
+        "```",
+        "",
+        f"Revision {record.get('git_revision') or 'unknown'}; "
+        + ", ".join(f"{package} {versions[package]}" for package in ("python", "jax", "mujoco") if package in versions)
+        + f"; {device}. The configuration is in config.json, evaluations are in metrics.jsonl.",
+    ]
+    if ":" in task:
+        lines += ["", f"The task {task} is code of its own, which is not in this folder."]
+    return "\n".join(lines) + "\n"
+
+
+def _front(task: str, name: str, of_seed: Score | None) -> dict[str, Any]:
+    """Return the front matter; its values are written as JSON, which YAML contains."""
+    front: dict[str, Any] = {
+        "library_name": "jaxrl-vis",
+        "pipeline_tag": "reinforcement-learning",
+        "tags": ["reinforcement-learning", "robotics", "jax", "mujoco", "goal-conditioned", task],
+    }
+    if of_seed is not None:
+        kind = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
+        metric = {"type": "success_rate", "name": "success", "value": round(of_seed.share, 4), "verified": False}
+        result = {"task": kind, "dataset": {"name": task, "type": task}, "metrics": [metric]}
+        front["model-index"] = [{"name": name, "results": [result]}]
+    return front
