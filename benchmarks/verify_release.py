@@ -1,4 +1,4 @@
-"""Verification of a release: two builds that are equal byte for byte, what is in them, and a smoke test from an empty environment.
+"""Verification of a release: two builds that are equal byte for byte, and a smoke test from an empty environment.
 
     python -m benchmarks.verify_release [--out dist] [--python python3.12] [--skip-install]
 
@@ -112,8 +112,9 @@ def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
         checkout: Checkout with pyproject.toml, which describes the root component.
         path: The file.
     """
-    command = [sys.executable, "-m", "cyclonedx_py", "environment", str(python), "--pyproject", str(checkout / "pyproject.toml")]
-    command += ["--output-reproducible", "--output-format", "JSON", "--output-file", str(path)]
+    command = [sys.executable, "-m", "cyclonedx_py", "environment", str(python)]
+    command += ["--pyproject", str(checkout / "pyproject.toml"), "--output-reproducible"]
+    command += ["--output-format", "JSON", "--output-file", str(path)]
     subprocess.run(command, check=True, capture_output=True, text=True)
     bill = json.loads(path.read_text())
     # pip came with the environment, and what is released is the root.

@@ -13,9 +13,9 @@ EXPECTED = (
     ("ARM (aarch64, Linux)", "All of it: MuJoCo and jaxlib have wheels, and nothing here is compiled for one processor."),
     (
         "Apple (arm64, macOS)",
-        "All of it on the CPU, by the same wheels; not on the GPU: jax-metal lacks operations, and is not tried.",
+        "All of it on the CPU, by the wheels of MuJoCo and jaxlib. Its GPU: nothing is promised, jax-metal lags behind JAX.",
     ),
-    ("TPU", "Training and images by the plain renderer; MJX runs there; the kernels for NVIDIA GPUs are left aside by themselves."),
+    ("TPU", "Training, MJX, and images by the plain renderer; the kernels for NVIDIA GPUs are left aside by themselves."),
     ("AMD GPU (ROCm)", "As on a TPU, with AMD's jaxlib; the kernels are for NVIDIA GPUs alone."),
 )
 """Platforms that nothing was run on, and what is expected."""
