@@ -24,11 +24,11 @@ BIN := .venv/bin
 STAMPS := .venv/stamps
 ACCELERATOR := $(shell nvidia-smi -L >/dev/null 2>&1 && echo gpu || echo base)
 
-.PHONY: help train test fuzz docs lint format bench-cpu tables stale pins clean
+.PHONY: help train test fuzz docs lint format bench-cpu tables stale verify-release pins clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
 	@echo
 	@echo "  variables: SEED=$(SEED) PRESET=$(PRESET) (auto: cpu or fast by the hardware) RUN_DIR=... ARGS='--any-option 1' WORKERS=$(WORKERS)"
 
@@ -63,6 +63,9 @@ tables: $(STAMPS)/dev ## Write the tables of README and docs from the records in
 
 stale: $(STAMPS)/dev ## List records that are older than the code they measured, and rows without a record
 	@JAX_PLATFORMS=cpu $(BIN)/python -m benchmarks.ledger stale
+
+verify-release: $(STAMPS)/dev ## Build wheel and sdist twice, compare, install and try the wheel in an empty environment; into dist/
+	@$(BIN)/python -m benchmarks.verify_release $(ARGS)
 
 pins: .venv/bin/python ## Write requirements/*.txt anew
 	@$(PINS) $(PINS_ARGS) pyproject.toml -c requirements/cpu.in -o requirements/base.txt

@@ -1,4 +1,4 @@
-"""Verification of a release: two builds, equal byte for byte, what is in them, and a smoke test from an empty environment.
+"""Verification of a release: two builds that are equal byte for byte, and a smoke test from an empty environment.
 
     python -m benchmarks.verify_release [--out dist] [--python python3.12] [--skip-install]
 
@@ -112,25 +112,19 @@ def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
         checkout: Checkout with pyproject.toml, which describes the root component.
         path: The file.
     """
-    command = [
-        sys.executable,
-        "-m",
-        "cyclonedx_py",
-        "environment",
-        str(python),
-        "--pyproject",
-        str(checkout / "pyproject.toml"),
-    ]
-    command += ["--output-reproducible", "--output-format", "JSON", "--output-file", str(path)]
+    command = [sys.executable, "-m", "cyclonedx_py", "environment", str(python)]
+    command += ["--pyproject", str(checkout / "pyproject.toml"), "--output-reproducible"]
+    command += ["--output-format", "JSON", "--output-file", str(path)]
     subprocess.run(command, check=True, capture_output=True, text=True)
     bill = json.loads(path.read_text())
-    for component in [bill["metadata"]["component"], *bill["components"]]:
-        links = component.get("externalReferences", [])
-        component["externalReferences"] = [link for link in links if not link["url"].startswith("file:")]
-    # pip came with the environment.
-    bill["components"] = [
-        component for component in bill["components"] if component["name"] not in ("pip", "setuptools", _OURS)
-    ]
+    # pip came with the environment, and what is released is the root.
+    root, left_out = bill["metadata"]["component"], {"pip", "setuptools", _OURS}
+    refs = {part["bom-ref"]: part["name"] for part in bill["components"]}
+    bill["components"] = [part for part in bill["components"] if part["name"] not in left_out]
+    bill["dependencies"] = [part for part in bill["dependencies"] if refs.get(part["ref"]) not in left_out]
+    for component in [root, *bill["components"]]:
+        links = [link for link in component.get("externalReferences", []) if not link["url"].startswith("file:")]
+        component["externalReferences"] = links
     path.write_text(json.dumps(bill, indent=1) + "\n")
 
 

@@ -204,7 +204,7 @@ def learn(recordings: Path | str, updates: int = 5000, **options: Any) -> Learne
     Raises:
         RequestError: The file is missing or has no such arrays, or an option is wrong.
     """
-    recorded = read(Path(recordings))
+    recorded = read(recordings)
     count, shape = recorded.count, recorded.observations.shape[2:]
     learner = Learner(shape, recorded.actions.shape[2], recorded.horizon, capacity=count, **options)
     goals = [None] * count if recorded.goals is None else recorded.goals

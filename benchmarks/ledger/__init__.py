@@ -5,7 +5,8 @@
     result_tables    tables of docs/lab/results.md           ablations    learning curves of the ablations, one table
     comparison_table figures of the README beside others'    render_table tables of docs/lab/renderer_speed.md
     scaling_table    tables of docs/scaling.md               markers      position of a table in its page
-    pixels_table     table of docs/pixels.md                 pages        every page with tables from records
+    pixels_table     table of docs/pixels.md                 platforms_table  tables of docs/where_it_ran.md
+    pages            every page with tables from records
 
     python -m benchmarks.ledger tables     write the tables of README and docs (`make tables`)
     python -m benchmarks.ledger stale      list stale records, rows without a record, and outdated tables (`make stale`)

@@ -17,7 +17,7 @@ def holds_recordings(path: Path) -> bool:
     return path.suffix == ".npz" or (path / npz.FILE_NAME).is_file() or lerobot_reader.is_dataset(path)
 
 
-def read(path: Path) -> Recordings:
+def read(path: Path | str) -> Recordings:
     """Read recorded episodes.
 
     Args:
@@ -26,6 +26,7 @@ def read(path: Path) -> Recordings:
     Raises:
         RequestError: There are none, or they are damaged.
     """
+    path = Path(path)
     if lerobot_reader.is_dataset(path):
         return lerobot_reader.read(path)
     return npz.read(path if path.suffix == ".npz" else path / npz.FILE_NAME)
@@ -44,13 +45,19 @@ def check_out(out: Path, kind: str) -> None:
     check_writable(out, "--out", folder=out.suffix != ".npz")
 
 
-def write(recordings: Recordings, out: Path, kind: str) -> Path:
+def write(recordings: Recordings, out: Path | str, kind: str) -> Path:
     """Write episodes, and return the file or folder.
+
+    Args:
+        recordings: The episodes.
+        out: A new folder; or an .npz file.
+        kind: `LEROBOT` or `NPZ`.
 
     Raises:
         RequestError: See `check_out`.
         StorageError: They cannot be written.
     """
+    out = Path(out)
     path = out if kind == LEROBOT or out.suffix == ".npz" else out / npz.FILE_NAME
     try:
         (lerobot if kind == LEROBOT else npz).write(recordings, path)

@@ -1,0 +1,70 @@
+"""Table of docs/where_it_ran.md, written from the records of `jaxrl-vis doctor --report` and of the benchmarks."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from benchmarks.ledger.records import read_all
+from jaxrl_vis.host.platform_report import SCHEMA
+
+FOLDER = "platforms"
+_BENCHMARKS = ("render", "physics", "env", "update", "train")
+EXPECTED = (
+    ("ARM (aarch64, Linux)", "All of it: MuJoCo and jaxlib have wheels, and nothing here is compiled for one processor."),
+    (
+        "Apple (arm64, macOS)",
+        "All of it on the CPU, by the wheels of MuJoCo and jaxlib. Its GPU: nothing is promised, jax-metal lags behind JAX.",
+    ),
+    ("TPU", "Training, MJX, and images by the plain renderer; the kernels for NVIDIA GPUs are left aside by themselves."),
+    ("AMD GPU (ROCm)", "As on a TPU, with AMD's jaxlib; the kernels are for NVIDIA GPUs alone."),
+)
+"""Platforms that nothing was run on, and what is expected."""
+
+
+def platforms_table(results: Path) -> str | None:
+    """Write a row for each machine, Python and JAX, newest first, as Markdown; None without records."""
+    rows = [_row(record) for record in _records(results)] + _benchmarked(results)
+    if not rows:
+        return None
+    rows.sort(key=lambda row: row[0], reverse=True)
+    lines = ["| date | machine | driver | Python | JAX | what ran |", "|---|---|---|---|---|---|"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def not_run_table(_: Path) -> str:
+    """Write the platforms that nothing was run on, as Markdown."""
+    return "\n".join(["| not run | expected |", "|---|---|", *(f"| {name} | {text} |" for name, text in EXPECTED)])
+
+
+def _records(results: Path) -> list[dict[str, Any]]:
+    files = sorted((results / FOLDER).glob("*.json"))
+    records = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    return [record for record in records if record.get("platform_schema") == SCHEMA]
+
+
+def _row(record: dict[str, Any]) -> tuple[str, ...]:
+    machine = record["accelerator"] or f"{record['processor']}, {record['cores']} cores"
+    checks, training = record["checks"], record["training"]
+    failed = [name for name, passed in checks.items() if not passed]
+    ran = f"doctor: {len(checks) - len(failed)} of {len(checks)} checks" + (f" (failed: {', '.join(failed)})" if failed else "")
+    if training is not None:
+        ran += f"; {training['task']}, {training['preset']}: {training['env_steps_per_s']:,.0f} steps/s"
+    versions = record["versions"]
+    place = f"{machine} ({record['machine']}, {record['system']})"
+    return record["date"], place, record["driver"] or "", versions["python"], versions["jax"], ran
+
+
+def _benchmarked(results: Path) -> list[tuple[str, ...]]:
+    """Return a row for each device, Python and JAX that benchmarks have run on, with the date of the newest."""
+    found: dict[tuple[str, str, str], tuple[str, set[str]]] = {}
+    for path, record in read_all(results):
+        name = record["name"].partition("/")[0]
+        if path.parent != results or name not in _BENCHMARKS or not isinstance(record["device"], str):
+            continue
+        place = (record["device"], record["versions"]["python"], record["versions"]["jax"])
+        date, names = found.get(place, ("", set()))
+        found[place] = (max(date, record["date"][:10]), names | {name})
+    return [
+        (date, device, "", python, jax, f"benchmarks: {', '.join(name for name in _BENCHMARKS if name in names)}")
+        for (device, python, jax), (date, names) in found.items()
+    ]
