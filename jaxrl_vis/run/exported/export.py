@@ -14,8 +14,9 @@ from jaxrl_vis.run.exported import contract as contracts
 from jaxrl_vis.run.exported import golden, onnx_file, stablehlo
 from jaxrl_vis.run.exported.contract import FORMATS, TOLERANCE, Contract
 from jaxrl_vis.run.exported.layers import COMPUTATION, INPUTS, Layers, forward, layers_of
+from jaxrl_vis.run.storage.folder import EXPORT_FOLDER
 from jaxrl_vis.run.trained.policy import Policy, choose_seed, make_policy
-from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 
 _EPISODES = 8
 
@@ -44,7 +45,7 @@ def export_run(
     kind: str,
     out: Path | str | None = None,
     seed: int | None = None,
-    checkpoint: int | None = None,
+    checkpoint: Choice = None,
     overwrite: bool = False,
     trust: bool = False,
 ) -> Check:
@@ -69,7 +70,7 @@ def export_run(
     if kind == "onnx":
         onnx_file.require()
     run_dir = Path(run_dir)
-    folder = run_dir / "export" / kind if out is None else Path(out)
+    folder = run_dir / EXPORT_FOLDER / kind if out is None else Path(out)
     _check_folder(folder, overwrite)
     # Of networks that compute in bfloat16 or TF32, no other library would repeat the roundings.
     trainer = open_run(run_dir, True, trust, eval_episodes=num_recorded(_EPISODES), compute_dtype="float32")
