@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jaxrl_vis
-from jaxrl_vis.cli import audit, bench, doctor, encoder, envs, eval, export, figure, play, sweep, train, verify
+from jaxrl_vis.cli import audit, bench, doctor, encoder, envs, eval, export, figure, play, search, sweep, train, verify
 from jaxrl_vis.cli.parsing import PROGRAM, parse
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
 from jaxrl_vis.host import distributed
@@ -38,6 +38,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `
     "bench": (bench.Bench, bench.run),
     "figure": (figure.Figure, figure.run),
     "sweep": (sweep.Sweep, sweep.run),
+    "search": (search.Search, search.run),
 }
 
 # Exit statuses of errors reported in one line.

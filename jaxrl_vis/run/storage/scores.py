@@ -18,6 +18,11 @@ def metric(config: Config) -> str:
     return config.run.best_by or "success"
 
 
+def is_lower_better(config: Config) -> bool:
+    """Return True if smaller scores are better, as of distances."""
+    return metric(config) in _LOWER_IS_BETTER
+
+
 def score(config: Config, values: Mapping[str, Sequence[float]]) -> float:
     """Return the score of an evaluation.
 
@@ -33,7 +38,7 @@ def is_better(config: Config, new: float, old: float | None) -> bool:
     """Return True if a score is better than another; any is better than None. Equal ones are not."""
     if old is None:
         return True
-    return new < old if metric(config) in _LOWER_IS_BETTER else new > old
+    return new < old if is_lower_better(config) else new > old
 
 
 def is_enough(config: Config, value: float) -> bool:
@@ -41,7 +46,7 @@ def is_enough(config: Config, value: float) -> bool:
     level = config.run.stop_at
     if level is None:
         return False
-    return value <= level if metric(config) in _LOWER_IS_BETTER else value >= level
+    return value <= level if is_lower_better(config) else value >= level
 
 
 def enough_at(config: Config, rows: Sequence[Mapping[str, Any]], seeds: Collection[int]) -> list[int]:
