@@ -49,7 +49,7 @@ class Policy:
         """Name of the environment, as in `jaxrl_vis_envs.make`."""
         return self.config.environment.env
 
-    @property
+    @functools.cached_property  # a state task traces its observation for it
     def observation_spec(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of an observation, and of a goal: [C, H, W] uint8 or [S] float32."""
         return self.env.observation_spec
