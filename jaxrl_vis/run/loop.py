@@ -34,8 +34,9 @@ from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.goodput import Goodput
 from jaxrl_vis.run.loggers.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.loggers.group import Loggers
-from jaxrl_vis.run.milestones import Callback, Milestones
+from jaxrl_vis.run.milestones import Milestones
 from jaxrl_vis.run.pace import Pace
+from jaxrl_vis.run.reports import Callback, Report
 from jaxrl_vis.run.saving import Saver, import_saving_libraries
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage import metrics
@@ -50,23 +51,6 @@ from jaxrl_vis.types import LoopState
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
 GUARD = "guard/"
 """Metrics whose names begin like this stop a run where they are not 0; all others reach metrics.jsonl."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Report:
-    """Record of one iteration on the host.
-
-    Attributes:
-        iteration: Iterations done since the run began, this one included.
-        env_steps: Environment steps so far, per seed.
-        updates: Gradient steps so far, per seed.
-        metrics: Name -> one number per seed; ``eval/*`` only where the iteration ended with an evaluation.
-    """
-
-    iteration: int
-    env_steps: int
-    updates: int
-    metrics: PerSeed
 
 
 class RunLoop:

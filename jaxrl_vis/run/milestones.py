@@ -1,20 +1,17 @@
 """Events of a run that depend on its evaluations: a new best checkpoint, and an early end."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import distributed
+from jaxrl_vis.run.reports import Callback, Report
 from jaxrl_vis.run.saving import Saver
 from jaxrl_vis.run.storage import scores
 from jaxrl_vis.run.storage.checkpoint import BEST, Checkpoints
 from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.types import LoopState
-
-if TYPE_CHECKING:
-    from jaxrl_vis.run.loop import Report
 
 SCORE, SCORED = "score", "scored"
 """Keys of the manifest of a best checkpoint: its score, and the metric."""
@@ -66,7 +63,7 @@ class Milestones:
             self._saver.best(loop, iteration, progress, about)
             self._best = score
 
-    def ends(self, report: "Report", callbacks: "Sequence[Callback]") -> str | None:
+    def ends(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
         """Return why the run ends after this evaluation; None if it goes on."""
         asked = False
         for callback in callbacks:  # each of them, also after one that asks to stop
@@ -75,7 +72,3 @@ class Milestones:
         if distributed.any_process(scores.is_enough(self._config, score)):
             return f"{scores.metric(self._config)} {score:.3f} has reached --stop-at {self._config.run.stop_at:g}"
         return "a callback asked to stop" if distributed.any_process(asked) else None
-
-
-Callback = Callable[["Report"], bool | None]
-"""Called with each report that has an evaluation, in every process; returns True to end the run, as if it were finished."""

@@ -24,8 +24,8 @@ from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.loggers import group
-from jaxrl_vis.run.loop import Report, RunLoop
-from jaxrl_vis.run.milestones import Callback
+from jaxrl_vis.run.loop import RunLoop
+from jaxrl_vis.run.reports import Callback, Report
 from jaxrl_vis.run.signals import shielded_children
 from jaxrl_vis.run.storage.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.types import LoopState, Metrics, TrainState
