@@ -10,6 +10,7 @@ from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.weights_file import read_parameters, write_parameters
 from jaxrl_vis.learner.acting.evaluate import num_recorded
+from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.exported import contract as contracts
 from jaxrl_vis.run.exported import golden, onnx_file, stablehlo
 from jaxrl_vis.run.exported.contract import FORMATS, TOLERANCE, Contract
@@ -86,8 +87,7 @@ def export_run(
 
 def _check_folder(folder: Path, overwrite: bool) -> None:
     """Raise a RequestError if ``folder`` is a file, or holds something that may not be replaced."""
-    if folder.exists() and not folder.is_dir():
-        raise RequestError(f"--out {folder} is a file: name a folder")
+    check_writable(folder, "--out", folder=True)
     names = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
     if names and contracts.FILE not in names:
         raise RequestError(f"{folder} holds other files: name an empty or a new folder with --out")
@@ -115,22 +115,24 @@ def _write(
 ) -> None:
     """Write the files, the contract last: an export that was interrupted has none, or that of a complete one."""
     file, described = folder / FORMATS[kind], folder / contracts.FILE
+    contents = b""  # made before anything there is deleted
+    if kind == "stablehlo":
+        contents = stablehlo.to_bytes(policy)
+    elif kind == "onnx" and layers is not None:
+        spec = policy.observation_spec
+        about = f"{policy.env_name}: observation and goal to action; see {contracts.FILE}"
+        contents = onnx_file.to_bytes(layers, spec.shape, np.dtype(spec.dtype), about)
+    elif layers is not None:
+        shapes = {name: list(array.shape) for name, array in layers.arrays.items()}
+        contract["network"] = {"limit": layers.limit, "shapes": shapes, "computation": list(COMPUTATION)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         described.unlink(missing_ok=True)
         for name in set(FORMATS.values()) - {file.name}:
             (folder / name).unlink(missing_ok=True)
-        if kind == "onnx":
-            assert layers is not None
-            spec = policy.observation_spec
-            about = f"{policy.env_name}: observation and goal to action; see {contracts.FILE}"
-            write_atomically(file, onnx_file.to_bytes(layers, spec.shape, np.dtype(spec.dtype), about))
-        elif kind == "stablehlo":
-            write_atomically(file, stablehlo.to_bytes(policy))
-        else:
-            assert layers is not None
-            network = {"limit": layers.limit, "shapes": {name: list(array.shape) for name, array in layers.arrays.items()}}
-            contract["network"] = {**network, "computation": list(COMPUTATION)}
+        if contents:
+            write_atomically(file, contents)
+        elif layers is not None:
             write_parameters(file, layers.nested(), {"contract": contract}, bits=32)
         write_atomically(folder / golden.FILE, golden.to_bytes(frames))
         write_atomically(described, json.dumps(contract, indent=2) + "\n")
