@@ -29,6 +29,7 @@ from jaxrl_vis.cli import (
     figure,
     play,
     push,
+    search,
     sweep,
     train,
     verify,
@@ -55,6 +56,7 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {  # without those of `
     "bench": (bench.Bench, bench.run),
     "figure": (figure.Figure, figure.run),
     "sweep": (sweep.Sweep, sweep.run),
+    "search": (search.Search, search.run),
 }
 
 # Exit statuses of errors reported in one line.

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Literal
 
 from jaxrl_vis.cli.parsing import PROGRAM
 from jaxrl_vis.errors import RequestError
@@ -67,6 +68,19 @@ def check_run(folder: Path) -> None:
         if folder.exists() and above is not None:
             raise RequestError(f"{folder} lies in a run folder: name that, {above}")
         raise RequestError(f"{folder} is not a run folder (it holds no config.json); {PROGRAM} train makes one")
+
+
+def read_checkpoint(word: str | None) -> int | Literal["best"] | None:
+    """Read ``--checkpoint``: an iteration, ``best``, or nothing.
+
+    Raises:
+        RequestError: It is none of these.
+    """
+    if word is None or word == "best":
+        return word
+    if not (word.isdecimal() and len(word) < 19):
+        raise RequestError(f"--checkpoint {word[:40]}: name the iteration of a checkpoint, or best")
+    return int(word)
 
 
 def check_counts(**counts: int | None) -> None:

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
+from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.report.outputs import check_writable
@@ -21,6 +21,8 @@ class Eval:
     """Number of episodes; that of the run if not given."""
     json: Path | None = None
     """Also write the results to this file."""
+    checkpoint: str | None = None
+    """Iteration of the checkpoint, or best for the one that --best-by keeps; the newest valid one if not given."""
     trust: bool = False
     """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
 
@@ -30,11 +32,12 @@ def run(options: Eval) -> int:
     check_run(options.run_dir)
     trust = may_run_code(options.run_dir, options.trust)
     check_counts(episodes=options.episodes)
+    checkpoint = read_checkpoint(options.checkpoint)
     if options.json is not None:
         check_writable(options.json, "--json")
     from jaxrl_vis.run.trained.restored_run import evaluate_run
 
-    figures = evaluate_run(options.run_dir, episodes=options.episodes, keep_programs=True, trust=trust)
+    figures = evaluate_run(options.run_dir, episodes=options.episodes, keep_programs=True, trust=trust, checkpoint=checkpoint)
     for name, per_seed in figures.items():
         print(f"{name:28}" + "".join(f" {value:9.4f}" for value in per_seed))
     if options.json is not None:

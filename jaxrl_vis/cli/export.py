@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from jaxrl_vis.cli.checks import check_run, may_run_code
+from jaxrl_vis.cli.checks import check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import check_path
@@ -32,6 +32,8 @@ class Export:
     """Replace an exported policy in the folder."""
     check: Path | None = None
     """Export nothing: run this exported file on its golden frames, and print the largest difference."""
+    checkpoint: str | None = None
+    """Iteration of the checkpoint, or best for the one that --best-by keeps; the newest valid one if not given."""
     trust: bool = False
     """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
 
@@ -50,11 +52,20 @@ def run(options: Export) -> int:
     check_run(options.run_dir)
     if options.out is not None:
         check_path(options.out)
+    checkpoint = read_checkpoint(options.checkpoint)
     trust = may_run_code(options.run_dir, options.trust)
     from jaxrl_vis.run.exported.export import export_run
 
     return _report(
-        export_run(options.run_dir, options.format, options.out, seed=options.seed, overwrite=options.overwrite, trust=trust)
+        export_run(
+            options.run_dir,
+            options.format,
+            options.out,
+            seed=options.seed,
+            checkpoint=checkpoint,
+            overwrite=options.overwrite,
+            trust=trust,
+        )
     )
 
 

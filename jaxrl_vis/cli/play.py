@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated
 
-from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
+from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.errors import RequestError
 
@@ -24,6 +24,8 @@ class Play:
     """Also show the predictions of auxiliary tasks: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
     """Number of episodes to show."""
+    checkpoint: str | None = None
+    """Iteration of the checkpoint, or best for the one that --best-by keeps; the newest valid one if not given."""
     trust: bool = False
     """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
 
@@ -32,6 +34,7 @@ def run(options: Play) -> int:
     """Draw a run's episodes."""
     check_run(options.run_dir)
     check_counts(episodes=options.episodes)
+    checkpoint = read_checkpoint(options.checkpoint)
     if options.html and options.aux:
         raise RequestError("--html shows the robot, --aux its images: give one of them")
     trust = may_run_code(options.run_dir, options.trust)
@@ -39,7 +42,7 @@ def run(options: Play) -> int:
     from jaxrl_vis.run.trained import play_auxiliary, restored_run
 
     if options.aux:
-        play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes, trust=trust)
+        play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes, trust=trust, checkpoint=checkpoint)
     else:
         restored_run.play_run(
             options.run_dir,
@@ -48,6 +51,7 @@ def run(options: Play) -> int:
             three_dimensional=options.html,
             keep_programs=True,
             trust=trust,
+            checkpoint=checkpoint,
         )
     print(out)
     return 0

@@ -38,6 +38,7 @@ from jaxrl_vis.errors import RequestError, nearest
 # Values that a field allows, for checks, the command line and its help.
 Pixels = Literal["rgbd", "rgb", "depth"]
 Randomized = Literal["camera", "lights", "colours", "dynamics"]
+BestBy = Literal["success", "goal_distance", "goal_distance_median"]
 ComputeDtype = Literal["auto", "float32", "bfloat16"]
 
 LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without bound
@@ -83,6 +84,12 @@ class RunOptions:
     """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
     full_checkpoint_interval: Annotated[int, Bounds(0, LARGEST_COUNT), HOST, RESUMABLE, UNMEASURED] = 0
     """Iterations between full checkpoints (with the replay, for an exact resume). 0: only when a run is interrupted."""
+    best_by: Annotated[BestBy | None, HOST, RESUMABLE, UNMEASURED] = None
+    """Metric of the evaluations whose best learner is kept as a further checkpoint, for `--checkpoint best`; of several seeds,
+    its mean. None: none is kept."""
+    stop_at: Annotated[NotNegative | None, HOST, RESUMABLE, UNMEASURED] = None
+    """Stop early, after the first evaluation where the metric of best_by (success if that is None) is at least this, or, of a
+    distance, at most."""
 
 
 @dataclasses.dataclass(frozen=True)

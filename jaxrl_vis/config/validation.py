@@ -64,6 +64,8 @@ def validate(config: Config) -> Config:
             f"randomize_strength {environment.randomize_strength} has no effect: choose what varies with --randomize"
         )
     _validate_devices(config)
+    if run.stop_at is not None and run.stop_at > 1 and run.best_by in (None, "success"):
+        raise RequestError(f"stop_at {run.stop_at:g} can never be reached: success is from 0 to 1, such as --stop-at 0.95")
     if run.seed + run.seeds - 1 > _LARGEST_SEED:
         raise RequestError(f"seed {run.seed} is too large: the last of {run.seeds} must be at most {_LARGEST_SEED}")
     return config

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
+from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.compiled.programs import Programs
-from jaxrl_vis.run.storage import metrics
+from jaxrl_vis.run.storage import metrics, scores
 from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.storage.folder import RunFolder, read_run_id
 from jaxrl_vis.run.storage.progress import Progress
@@ -18,15 +19,37 @@ from jaxrl_vis.types import LoopState
 def is_finished(
     folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
 ) -> bool:
-    """Return True if a run is complete: a valid checkpoint after ``total`` iterations, its evaluation, and its images."""
-    if max([0, *checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)]) < total:
+    """Return True if a run is complete: a valid last checkpoint, its evaluation, and its images.
+
+    The last one is that after ``total`` iterations, or after an early end.
+    """
+    last = _last_saved(checkpoints)
+    if last < total and not has_ended_early(folder, programs.config, programs.seeds, last):
         return False
     restored = checkpoints.restore_train(programs.shapes)
-    if restored is None or restored.iteration < total:
+    if restored is None or restored.iteration < min(last, total):
         say("the last checkpoint is not usable, so the run is not finished: resuming from the last good one")
         return False
     files = [folder.curve, folder.video] if programs.shows_images else [folder.curve]
     return is_evaluated(folder, programs.seeds, restored) and all(file.exists() for file in files)
+
+
+def has_ended_early(folder: RunFolder, config: Config, seeds: Collection[int], iteration: int) -> bool:
+    """Return True if the evaluation after ``iteration`` has reached the level at which the run stops."""
+    return config.run.stop_at is not None and iteration in scores.enough_at(config, folder.rows(), seeds)
+
+
+def say_finished(folder: RunFolder, checkpoints: Checkpoints, config: Config, total: int) -> str:
+    """Return a message about a run that is complete, and how to go on."""
+    last = _last_saved(checkpoints)
+    if last < total:
+        reached = f"{last} of {total} iterations, --stop-at {config.run.stop_at:g} is reached"
+        return f"{folder.path} is finished already ({reached}): ask for another --stop-at to go on"
+    return f"{folder.path} is finished already ({total} iterations): ask for more --env-steps to go on"
+
+
+def _last_saved(checkpoints: Checkpoints) -> int:
+    return max([0, *checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)])
 
 
 def without_replay(programs: Programs, restored: Restored) -> LoopState:

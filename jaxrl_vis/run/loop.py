@@ -17,7 +17,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,9 @@ from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.goodput import Goodput
 from jaxrl_vis.run.loggers.console import RunConsole, show_seconds, show_shares
 from jaxrl_vis.run.loggers.group import Loggers
+from jaxrl_vis.run.milestones import Milestones
 from jaxrl_vis.run.pace import Pace
+from jaxrl_vis.run.reports import Callback, Report
 from jaxrl_vis.run.saving import Saver, import_saving_libraries
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage import metrics
@@ -51,23 +53,6 @@ GUARD = "guard/"
 """Metrics whose names begin like this stop a run where they are not 0; all others reach metrics.jsonl."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Report:
-    """Record of one iteration on the host.
-
-    Attributes:
-        iteration: Iterations done since the run began, this one included.
-        env_steps: Environment steps so far, per seed.
-        updates: Gradient steps so far, per seed.
-        metrics: Name -> one number per seed; ``eval/*`` only where the iteration ended with an evaluation.
-    """
-
-    iteration: int
-    env_steps: int
-    updates: int
-    metrics: PerSeed
-
-
 class RunLoop:
     """State of one call of `Trainer.run`.
 
@@ -76,6 +61,7 @@ class RunLoop:
         folder: Folder of its files.
         log: Names of the loggers, see `loggers`.
         on_begun: Called when the folder is this run's.
+        callbacks: Called after each evaluation, when all is saved.
     """
 
     def __init__(
@@ -84,8 +70,9 @@ class RunLoop:
         folder: RunFolder,
         log: tuple[str, ...] = (),
         on_begun: Callable[[], None] = lambda: None,
+        callbacks: Sequence[Callback] = (),
     ):
-        self._on_begun = on_begun
+        self._on_begun, self._callbacks = on_begun, tuple(callbacks)
         self._programs, self._folder = programs, folder
         self._config, self._program = programs.config, programs.program
         self._writes = distributed.is_first()
@@ -94,6 +81,7 @@ class RunLoop:
         self._checkpoints = Checkpoints(folder.checkpoints, self._say)
         self._held: Held | None = None  # by the first process
         self._saver = Saver(programs, folder, self._checkpoints, self._say, self._check_ours)
+        self._milestones = Milestones(self._config, self._checkpoints, self._saver, self._say)
         self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._say)
         self._results = Results(programs, folder, self._loggers, self._say)
         self._total: int = self._program.num_iterations
@@ -131,9 +119,7 @@ class RunLoop:
             if goes_on and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._say):
                 if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
                     self._say(said)
-                self._say(
-                    f"{self._folder.path} is finished already ({self._total} iterations): ask for more --env-steps to go on"
-                )
+                self._say(earlier.say_finished(self._folder, self._checkpoints, self._config, self._total))
                 return
             interruption = Interruption()
             try:
@@ -237,6 +223,7 @@ class RunLoop:
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
         self._on_begun()
+        self._milestones.begin()
         with self._saver.writing():
             foreign = self._checkpoints.set_foreign_aside()
             damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
@@ -285,6 +272,8 @@ class RunLoop:
     def _take_over(self, restored: Restored) -> None:
         self._progress = Progress.from_dict(restored.progress)
         self._done, self._evaluated_at = restored.iteration, earlier.last_evaluation(restored)
+        if earlier.has_ended_early(self._folder, self._config, self._programs.seeds, self._done):
+            self._total = min(self._total, self._done)
         # A run that has come far enough before it was evaluated, or that is asked for fewer steps than it has, ends with that.
         self._progress.evaluation_due |= self._done >= self._total and not earlier.is_evaluated(
             self._folder, self._programs.seeds, restored
@@ -308,7 +297,9 @@ class RunLoop:
     def _train(self, interruption: Interruption) -> Iterator[Report]:
         config = self._config
         if self._progress.evaluation_due:
-            yield self._evaluate(self._report(self._done, {}), self._begin_evaluation())
+            report = self._evaluate(self._report(self._done, {}), self._begin_evaluation())
+            self._end_early(report)
+            yield report
         while self._done < self._total:
             assert self._loop is not None
             self._loop, values = self._programs.train_iteration(self._loop)
@@ -341,7 +332,15 @@ class RunLoop:
             # A signal that came during the evaluation must not wait for another iteration.
             if self._done < self._total and interruption.reached_any():
                 self._save_and_end(False, interruption)
+            if evaluation:
+                self._end_early(report)
             yield report
+
+    def _end_early(self, report: Report) -> None:
+        """Make this iteration the last one if an evaluation, or a callback that is told of it, asks for that."""
+        if (reason := self._milestones.ends(report, self._callbacks)) and self._done < self._total:
+            self._say(f"stopped at iteration {self._done} of {self._total}: {reason}")
+            self._total = self._done
 
     def _is_due(self, interval: int) -> bool:
         return interval > 0 and self._done % interval == 0
@@ -406,6 +405,8 @@ class RunLoop:
         if self._is_due(self._config.run.eval_interval):
             progress.since_evaluation = []
         self._show(values, speed)
+        assert self._loop is not None
+        self._milestones.evaluated(self._loop, self._done, values, self._progress_now())
         self._pace.mark(self._done)
         return dataclasses.replace(report, metrics=report.metrics | values)
 

@@ -12,7 +12,8 @@ import functools
 import importlib
 import shlex
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -75,6 +76,19 @@ class Saver:
         self._checkpoints.save_light(iteration, loop.train, dataclasses.asdict(progress))
         if not self._keeps_full:
             self._checkpoints.retire_full()
+
+    def best(self, loop: LoopState, iteration: int, progress: Progress, about: Mapping[str, Any]) -> None:
+        """Save the learner as the best one, and wait for the disk. Raises as `light`.
+
+        Args:
+            loop: The state.
+            iteration: Iterations completed.
+            progress: Progress of the host.
+            about: Entries that its manifest has in addition to those of the progress.
+        """
+        self._check()
+        self._refuse_nonfinite(loop, iteration)
+        self._checkpoints.save_best(iteration, loop.train, {**dataclasses.asdict(progress), **about})
 
     def full(self, loop: LoopState, iteration: int, progress: Progress) -> None:
         """Save the complete state and wait for the disk. Raises as `light`."""

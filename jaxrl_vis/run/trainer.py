@@ -24,7 +24,8 @@ from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.loggers import group
-from jaxrl_vis.run.loop import Report, RunLoop
+from jaxrl_vis.run.loop import RunLoop
+from jaxrl_vis.run.reports import Callback, Report
 from jaxrl_vis.run.signals import shielded_children
 from jaxrl_vis.run.storage.folder import RunFolder, default_folder, read_log
 from jaxrl_vis.types import LoopState, Metrics, TrainState
@@ -134,13 +135,18 @@ class Trainer:
                 raise RequestError(f"evaluate takes one key for all seeds, not {key.shape} of them")
         return self.programs.evaluate(loop.train if isinstance(loop, LoopState) else loop, key)[0]
 
-    def run(self) -> Iterator[Report]:
+    def run(self, callbacks: Sequence[Callback] = ()) -> Iterator[Report]:
         """Train to the end and yield a `Report` per iteration, one iteration late.
 
         Compiles; evaluates every ``eval_interval`` iterations and at the end; writes metrics, checkpoints, the curve and the
         video into the run folder; and reports on stdout, where errors are ignored. Signals that would end the process are
         handled between iterations, in the main thread and unless the caller has handlers. After leaving the loop early, the
         next call continues from the last save.
+
+        Args:
+            callbacks: Each is called with every report that has an evaluation, once all of it is saved. One that returns True
+                ends the run there, as if that were its end: the curve and the video are drawn, and nothing is left to resume
+                but more iterations.
 
         Raises:
             RequestError: The folder, the saved run or the memory does not suit the configuration, or another process writes
@@ -150,7 +156,7 @@ class Trainer:
             Terminated: A signal other than Ctrl-C, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
-        loop = RunLoop(self.programs, self.folder, self._log, self._go_on_next_time)
+        loop = RunLoop(self.programs, self.folder, self._log, self._go_on_next_time, callbacks)
         return loop.reports(self._resume, self._overwrite)
 
     def _go_on_next_time(self) -> None:

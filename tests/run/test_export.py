@@ -1,11 +1,13 @@
 """`jaxrl-vis export`: what leaves acts as what stays, and says so when it does not."""
 
+import dataclasses
 import importlib
 import json
 import re
 import shutil
 import subprocess
 import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +23,10 @@ from jaxrl_vis.config import preset
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.networks.policy import make_policy
-from jaxrl_vis.run.exported import golden, onnx_file
+from jaxrl_vis.run.exported import golden, onnx_file, stablehlo
 from jaxrl_vis.run.exported.contract import FORMATS, TOLERANCE, read_contract
 from jaxrl_vis.run.exported.export import check_file, export_run
-from jaxrl_vis.run.exported.layers import collect, forward
+from jaxrl_vis.run.exported.layers import collect, forward, layers_of
 from jaxrl_vis.types import NormalizerState, Statistics
 
 FORMATS_HERE = [kind for kind in FORMATS if kind != "onnx" or importlib.util.find_spec("onnxruntime")]
@@ -172,6 +174,39 @@ def test_layers_of_every_preset_act_as_the_networks(name: str, changes: dict[str
     model = onnx_file.Model(tmp_path / "policy.onnx")
     assert model.inputs["goal"] == (("batch", *shape), np.dtype(dtype).name)
     np.testing.assert_allclose(model(*inputs), expected, atol=TOLERANCE / 10)
+
+
+def test_a_policy_of_one_s_own_leaves_as_stablehlo(runs: dict, tmp_path: Path) -> None:
+    policy = jaxrl_vis.load_policy(runs["Told"])
+    own = dataclasses.replace(policy, algorithm=policy.algorithm._replace(networks=None))
+    with pytest.raises(RequestError, match="has a policy of its own, .*--format stablehlo"):
+        layers_of(own)
+    (tmp_path / "policy.stablehlo").write_bytes(stablehlo.to_bytes(own))
+    zero = np.zeros((1, 1), np.float32)
+    np.testing.assert_allclose(
+        stablehlo.Program(tmp_path / "policy.stablehlo")(zero, zero)[0], policy(zero[0], zero[0]), atol=1e-6
+    )
+
+
+def test_stacked_images_are_put_together_as_the_task_does() -> None:
+    """From images of 2 channels, 8 episodes of 3 steps; pixels count the steps, goals are 100."""
+    images = np.broadcast_to(np.arange(4)[None, None, :, None, None, None], (1, 8, 4, 2, 3, 3)).astype(np.uint8)
+    recorded = {"frames": images, "goals": np.full((1, 8, 2, 3, 3), 100, np.uint8)}
+    programs = types.SimpleNamespace(evaluate=lambda train: ({}, recorded))
+    trainer = types.SimpleNamespace(programs=programs, seeds=range(1))
+
+    class Policy:
+        seed, env = 0, types.SimpleNamespace(frame_stack=3)
+
+        def __call__(self, observation: jax.Array, goal: jax.Array) -> jax.Array:
+            return jnp.mean(observation[None, :1] + goal[:1], axis=(1, 2, 3))
+
+    frames = golden.record(trainer, None, Policy())  # type: ignore[arg-type]
+    assert frames.observation.shape == (32, 6, 3, 3) and (frames.goal == 100).all()
+    newest = frames.observation[:, 0, 0, 0]
+    assert set(newest) == {0, 1, 2, 3}
+    for age in range(3):
+        np.testing.assert_array_equal(frames.observation[:, 2 * age, 0, 0], np.maximum(newest.astype(int) - age, 0))
 
 
 # -- Elsewhere

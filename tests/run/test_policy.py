@@ -204,3 +204,13 @@ def test_examples_of_the_pages_run(page: str, runs: dict[str, Path], checkout: P
     exec(compile(block.replace("runs/mine", str(runs["VisualTold"])), page, "exec"), names)
     assert names["action"].shape == (1,)
     assert page == "docs/start.md" or names["actions"].shape == (16, 1) and names["truncated"]
+
+
+def test_a_call_does_not_trace_the_environment_again(
+    policies: dict[str, jaxrl_vis.Policy], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which would take a hundred times as long as the policy."""
+    policy, zero = policies["Told"], np.zeros(1, np.float32)
+    policy(zero, zero)
+    monkeypatch.setattr(type(policy.env), "observation_spec", property(lambda _: pytest.fail("traced again")))
+    policy(zero, zero)

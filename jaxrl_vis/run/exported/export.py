@@ -10,12 +10,14 @@ from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.weights_file import read_parameters, write_parameters
 from jaxrl_vis.learner.acting.evaluate import num_recorded
+from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.exported import contract as contracts
 from jaxrl_vis.run.exported import golden, onnx_file, stablehlo
 from jaxrl_vis.run.exported.contract import FORMATS, TOLERANCE, Contract
 from jaxrl_vis.run.exported.layers import COMPUTATION, INPUTS, Layers, forward, layers_of
+from jaxrl_vis.run.storage.folder import EXPORT_FOLDER
 from jaxrl_vis.run.trained.policy import Policy, choose_seed, make_policy
-from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 
 _EPISODES = 8
 
@@ -44,7 +46,7 @@ def export_run(
     kind: str,
     out: Path | str | None = None,
     seed: int | None = None,
-    checkpoint: int | None = None,
+    checkpoint: Choice = None,
     overwrite: bool = False,
     trust: bool = False,
 ) -> Check:
@@ -69,7 +71,7 @@ def export_run(
     if kind == "onnx":
         onnx_file.require()
     run_dir = Path(run_dir)
-    folder = run_dir / "export" / kind if out is None else Path(out)
+    folder = run_dir / EXPORT_FOLDER / kind if out is None else Path(out)
     _check_folder(folder, overwrite)
     # Of networks that compute in bfloat16 or TF32, no other library would repeat the roundings.
     trainer = open_run(run_dir, True, trust, eval_episodes=num_recorded(_EPISODES), compute_dtype="float32")
@@ -85,8 +87,7 @@ def export_run(
 
 def _check_folder(folder: Path, overwrite: bool) -> None:
     """Raise a RequestError if ``folder`` is a file, or holds something that may not be replaced."""
-    if folder.exists() and not folder.is_dir():
-        raise RequestError(f"--out {folder} is a file: name a folder")
+    check_writable(folder, "--out", folder=True)
     names = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
     if names and contracts.FILE not in names:
         raise RequestError(f"{folder} holds other files: name an empty or a new folder with --out")
@@ -114,22 +115,24 @@ def _write(
 ) -> None:
     """Write the files, the contract last: an export that was interrupted has none, or that of a complete one."""
     file, described = folder / FORMATS[kind], folder / contracts.FILE
+    contents = b""  # made before anything there is deleted
+    if kind == "stablehlo":
+        contents = stablehlo.to_bytes(policy)
+    elif kind == "onnx" and layers is not None:
+        spec = policy.observation_spec
+        about = f"{policy.env_name}: observation and goal to action; see {contracts.FILE}"
+        contents = onnx_file.to_bytes(layers, spec.shape, np.dtype(spec.dtype), about)
+    elif layers is not None:
+        shapes = {name: list(array.shape) for name, array in layers.arrays.items()}
+        contract["network"] = {"limit": layers.limit, "shapes": shapes, "computation": list(COMPUTATION)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         described.unlink(missing_ok=True)
         for name in set(FORMATS.values()) - {file.name}:
             (folder / name).unlink(missing_ok=True)
-        if kind == "onnx":
-            assert layers is not None
-            spec = policy.observation_spec
-            about = f"{policy.env_name}: observation and goal to action; see {contracts.FILE}"
-            write_atomically(file, onnx_file.to_bytes(layers, spec.shape, np.dtype(spec.dtype), about))
-        elif kind == "stablehlo":
-            write_atomically(file, stablehlo.to_bytes(policy))
-        else:
-            assert layers is not None
-            network = {"limit": layers.limit, "shapes": {name: list(array.shape) for name, array in layers.arrays.items()}}
-            contract["network"] = {**network, "computation": list(COMPUTATION)}
+        if contents:
+            write_atomically(file, contents)
+        elif layers is not None:
             write_parameters(file, layers.nested(), {"contract": contract}, bits=32)
         write_atomically(folder / golden.FILE, golden.to_bytes(frames))
         write_atomically(described, json.dumps(contract, indent=2) + "\n")

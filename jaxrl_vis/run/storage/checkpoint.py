@@ -1,13 +1,15 @@
-"""Two tiers of orbax checkpoints: light ones often, full ones rarely.
+"""Tiers of orbax checkpoints: light ones often, full ones rarely, and the best one.
 
     checkpoints/light/<iteration>/   train         networks, targets, optimisers, statistics: enough for eval and play
+    checkpoints/best/<iteration>/    train         as light, of the best evaluation: never resumed from, and only one is kept
     checkpoints/full/<iteration>/    train, rest   with the replay, keys and iteration: for an exact resume
     checkpoints/recent/                            the same against a kill, where it is cheap, see `recent`
 
 Each checkpoint has a manifest: names, shapes, dtypes and checksums of all arrays, and the host's progress. orbax makes a folder
 appear under its final name only when it is complete; the checksums detect later damage, such as a flipped byte, which would
 otherwise be restored silently. After the background write, SHA256SUMS (`sums`) is added for `verification`, also of data that
-is never restored. The newest two of each tier are kept.
+is never restored. The newest two light and full
+ones are kept.
 
 A run resumes from the newest valid checkpoint of all tiers; if several are equally new, from the full, the recent or the light
 one, in this order. Nothing newer is ever deleted: a damaged checkpoint is moved to checkpoints/damaged/, and one of another
@@ -36,7 +38,7 @@ from jaxrl_vis.types import LoopState, TrainState
 if TYPE_CHECKING:  # orbax takes a fifth of this package's import time, so it is imported where it is used
     import orbax.checkpoint as ocp
 
-LIGHT, FULL, RECENT = "light", "full", "recent"
+LIGHT, FULL, RECENT, BEST = "light", "full", "recent", "best"
 _PRECEDENCE = (FULL, RECENT, LIGHT)  # for resuming, among equally new ones
 _KEPT = 2
 _TIMEOUT_S = 10**9
@@ -62,7 +64,7 @@ class Restored:
     """Contents of a checkpoint.
 
     Attributes:
-        tier: `LIGHT`, `FULL` or `RECENT`.
+        tier: `LIGHT`, `FULL`, `RECENT` or `BEST`.
         iteration: Iterations completed.
         train: The learner, [S, ...].
         loop: The complete state; None from the light tier.
@@ -139,7 +141,8 @@ class Checkpoints:
             patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
             options = ocp.CheckpointManagerOptions(
                 async_options=None if distributed.are_several() else patient,
-                preservation_policy=None if self._read_only else LatestN(_KEPT),
+                # The best one may be older than the one that it replaces, see `save_best`.
+                preservation_policy=None if self._read_only or tier == BEST else LatestN(_KEPT),
                 cleanup_tmp_directories=not self._read_only,
                 read_only=self._read_only,
                 create=not self._read_only,
@@ -182,6 +185,16 @@ class Checkpoints:
             progress: A JSON value.
         """
         self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
+
+    def save_best(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
+        """Write the learner, wait for the disk, and only then delete the best one before. See `save_light`."""
+        self._save(BEST, iteration, {"train": to_save(train, copy=False)}, progress)
+        self.wait()
+        for earlier in self.iterations(BEST):
+            if earlier != iteration:
+                self._forget(BEST)
+                if distributed.is_first():
+                    shutil.rmtree(self._folder / BEST / str(earlier), ignore_errors=True)
 
     def save_full(self, iteration: int, loop: LoopState, progress: dict[str, Any]) -> None:
         """Write the complete state and wait for the disk: an asynchronous copy of the replay would need memory for two."""
@@ -241,7 +254,7 @@ class Checkpoints:
         for aside in (self._folder / REPLACED).glob("*-*") if distributed.is_first() else ():
             tier, _, iteration = aside.name.rpartition("-")
             place = self._folder / tier / iteration
-            if tier not in (LIGHT, FULL):
+            if tier not in (LIGHT, FULL, BEST):
                 continue
             if place.exists():
                 shutil.rmtree(aside, ignore_errors=True)
@@ -317,7 +330,7 @@ class Checkpoints:
         Returns:
             Where they are now.
         """
-        foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL)}
+        foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL, BEST)}
         moved = self._move(foreign, FOREIGN)
         recent = _free(self._folder / FOREIGN / RECENT)
         if distributed.is_first() and self.recent.set_foreign_aside(recent):

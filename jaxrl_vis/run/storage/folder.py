@@ -30,13 +30,16 @@ from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 
 SCHEMA = 2
 
-CHECKPOINT_FOLDERS = ("light", "full", "recent", "damaged", "replaced")
+CHECKPOINT_FOLDERS = ("light", "full", "best", "recent", "damaged", "replaced")
 """Subfolders written by `checkpoint`."""
 
 _UNFINISHED = "orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
 
 LOGGER_FOLDERS, WANDB_STATE = ("tensorboard", "wandb"), "wandb.json"
 """Files and folders that `loggers` write into a run folder."""
+
+EXPORT_FOLDER = "export"
+"""Folder of exported policies (`jaxrl_vis.run.exported`)."""
 
 
 def default_folder(config: Config) -> Path:

@@ -16,15 +16,17 @@ from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.report import auxiliary_video, videos
 from jaxrl_vis.run.storage.folder import read_config
-from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 from jaxrl_vis.types import Batch, Episodes, TrainState
 
 SHOWN = ("autoencoder", "optical_flow", "egomotion")
 """Auxiliary tasks whose predictions can be drawn."""
 
 
-def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trust: bool = False) -> None:
-    """Play episodes with the first seed of a run's newest valid checkpoint, and draw the predictions of its auxiliary tasks.
+def play_auxiliary(
+    run_dir: Path | str, out: Path | str, episodes: int = 6, trust: bool = False, checkpoint: Choice = None
+) -> None:
+    """Play episodes with the first seed of a run's checkpoint, and draw the predictions of its auxiliary tasks.
 
     Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle are shown side by
     side, as far as the run has the tasks. Predictions are those of the critic's heads.
@@ -34,6 +36,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
         out: .gif, .mp4 (needs imageio-ffmpeg, the extra ``video``) or .html.
         episodes: Number of episodes.
         trust: As in `trained.open_run`.
+        checkpoint: The checkpoint.
 
     Raises:
         RequestError: There is no run, nothing usable in it, no auxiliary task to show, or no way to write ``out``.
@@ -54,7 +57,7 @@ def play_auxiliary(run_dir: Path | str, out: Path | str, episodes: int = 6, trus
     env, config, networks = trainer.env, trainer.config, trainer.program.networks
     if networks is None:
         raise RequestError(f"--aux shows what networks of ddpg predict, and the run in {run_dir} has {config.run.algorithm}")
-    train = load(trainer, run_dir).train
+    train = load(trainer, run_dir, checkpoint).train
     enable_compilation_cache()
     parts = trainer.programs.play(train, jnp.stack([trainer.programs.evaluation_key] * config.run.seeds))
     played, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, episodes, axis=1), *parts)

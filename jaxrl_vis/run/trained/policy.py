@@ -20,7 +20,7 @@ from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
 from jaxrl_vis.run.storage.checkpoint import Restored
 from jaxrl_vis.run.trained import policy_file
-from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis_envs.base import GoalEnv
 
@@ -50,7 +50,7 @@ class Policy:
         """Name of the environment, as in `jaxrl_vis_envs.make`."""
         return self.config.environment.env
 
-    @property
+    @functools.cached_property  # a state task traces its observation for it
     def observation_spec(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of an observation, and of a goal: [C, H, W] uint8 or [S] float32."""
         return self.env.observation_spec
@@ -108,13 +108,13 @@ class Policy:
             raise RequestError(f"{self.env_name}: {name} must be {spec.dtype}, not {dtype}")
 
 
-def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: int | None = None, trust: bool = False) -> Policy:
+def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: Choice = None, trust: bool = False) -> Policy:
     """Load the policy of a run, on any platform that JAX supports.
 
     Args:
         run_dir: The run folder, or a folder of `jaxrl-vis push`.
         seed: Seed, for a run with several; None: the first.
-        checkpoint: Iteration of an existing checkpoint; None: the newest valid one.
+        checkpoint: Iteration of an existing checkpoint; ``best``: the one that ``best_by`` keeps; None: the newest valid one.
         trust: Allow the run's own code, which a task ``module:Name`` executes; not needed for runs that were trained here.
 
     Raises:

@@ -70,7 +70,7 @@ def read(folder: Path, trainer: Trainer) -> tuple[PolicyParams, Source]:
     return jax.tree.unflatten(jax.tree.structure(wanted), leaves), source
 
 
-def check_seed(source: Source, seed: int | None, checkpoint: int | None) -> None:
+def check_seed(source: Source, seed: int | None, checkpoint: int | str | None) -> None:
     """Raise a `RequestError` if another seed or checkpoint is asked for than the folder holds."""
     if seed not in (None, source.seed) or checkpoint not in (None, source.iteration):
         raise RequestError(f"the folder holds the policy of seed {source.seed} after iteration {source.iteration} alone")

@@ -1,6 +1,7 @@
 """Use of trained runs: evaluating them again, and playing episodes."""
 
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
@@ -9,7 +10,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.acting.evaluate import num_recorded
 from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.compiled.memory import check_compiled
-from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.storage.folder import read_config, read_run_id
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
@@ -33,18 +34,24 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
     return make_trainer(config, keep_programs=keep_programs)
 
 
-def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -> Restored:
+Choice = int | Literal["best"] | None
+"""Checkpoint of a run: its iteration; ``best``: the one that `RunOptions.best_by` keeps; None: the newest valid one."""
+
+
+def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Restored:
     """Load a saved learner of a run.
 
     Args:
         trainer: From `open_run`.
         run_dir: The run folder.
-        checkpoint: Iteration of the checkpoint; None: the newest valid one.
+        checkpoint: The checkpoint.
 
     Raises:
         RequestError: There is no such checkpoint, or no usable one.
     """
     checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True, run_id=read_run_id(Path(run_dir)))
+    if checkpoint == "best":
+        return _load_best(trainer, run_dir, checkpoints)
     saved = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
     if checkpoint is not None and saved and checkpoint not in saved:
         available = ", ".join(map(str, saved))
@@ -60,15 +67,30 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: int | None = None) -
     return restored
 
 
+def _load_best(trainer: Trainer, run_dir: Path | str, checkpoints: Checkpoints) -> Restored:
+    try:
+        kept = checkpoints.iterations(BEST)
+        if not kept:
+            raise RequestError(f"the run in {run_dir} has kept no best checkpoint: train with --best-by, such as success")
+        return checkpoints.restore(BEST, checkpoints.manifest(BEST, kept[-1]), trainer.shapes)
+    finally:
+        checkpoints.close()
+
+
 def evaluate_run(
-    run_dir: Path | str, episodes: int | None = None, keep_programs: bool = False, trust: bool = False
+    run_dir: Path | str,
+    episodes: int | None = None,
+    keep_programs: bool = False,
+    trust: bool = False,
+    checkpoint: Choice = None,
 ) -> dict[str, list[float]]:
-    """Evaluate the newest valid checkpoint of a run.
+    """Evaluate a checkpoint of a run.
 
     Args:
         run_dir: The run folder.
         episodes: Number of episodes; None: as during training.
         keep_programs, trust: As of `open_run`.
+        checkpoint: The checkpoint.
 
     Returns:
         ``eval/success``, ``eval/goal_distance`` etc.: one number per seed.
@@ -77,7 +99,7 @@ def evaluate_run(
         RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
     """
     trainer = open_run(run_dir, keep_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
-    restored = load(trainer, run_dir)
+    restored = load(trainer, run_dir, checkpoint)
     check_compiled(trainer.programs.of_evaluation(), already_there=True)
     values = jax.device_get(trainer.evaluate(restored.train))
     return {name: [float(number) for number in value] for name, value in values.items()}
@@ -90,8 +112,9 @@ def play_run(
     three_dimensional: bool = False,
     keep_programs: bool = False,
     trust: bool = False,
+    checkpoint: Choice = None,
 ) -> None:
-    """Play episodes with the first seed of a run's newest valid checkpoint, and write a video.
+    """Play episodes with the first seed of a run's checkpoint, and write a video.
 
     Args:
         run_dir: The run folder.
@@ -100,6 +123,7 @@ def play_run(
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
             variants.
         keep_programs, trust: As of `open_run`.
+        checkpoint: The checkpoint.
 
     Raises:
         RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
@@ -112,7 +136,7 @@ def play_run(
         raise RequestError(
             f"{trainer.config.environment.env} shows the robot no images: play a run on a Visual task, or with --html"
         )
-    train = load(trainer, run_dir).train
+    train = load(trainer, run_dir, checkpoint).train
     if three_dimensional:
         viewer.write_page(programs.program, train, programs.evaluation_key, max(1, episodes), out)
         return

@@ -11,8 +11,8 @@ from typing import Any
 from jaxrl_vis.config import OPTIONS, Config
 from jaxrl_vis.host.files import is_count
 from jaxrl_vis.run.goodput import read_processes
-from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, RECENT
-from jaxrl_vis.run.storage.folder import LOGGER_FOLDERS, WANDB_STATE, RunFolder
+from jaxrl_vis.run.storage.checkpoint import BEST, DAMAGED, FOREIGN, FULL, LIGHT, RECENT
+from jaxrl_vis.run.storage.folder import EXPORT_FOLDER, LOGGER_FOLDERS, WANDB_STATE, RunFolder
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.storage.metrics import RUN_ID, Place
 from jaxrl_vis.run.storage.recent import names_of_others
@@ -210,12 +210,12 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
     """
     files = (folder.config, folder.metrics, folder.processes, folder.curve, folder.video)
     of_run = {file.name for file in files} | {LOCK_NAME, WANDB_STATE, *_PLAYED}
-    of_run |= {folder.checkpoints.name, folder.nonfinite.name, *LOGGER_FOLDERS}
+    of_run |= {folder.checkpoints.name, folder.nonfinite.name, EXPORT_FOLDER, *LOGGER_FOLDERS}
     foreign = [entry.name for entry in folder.path.iterdir() if entry.name not in of_run]
     if folder.checkpoints.is_dir():
         names = [entry.name for entry in folder.checkpoints.iterdir()]
-        foreign += [f"checkpoints/{name}" for name in names if name not in (LIGHT, FULL, RECENT, *_ASIDE)]
-        for tier in (LIGHT, FULL):
+        foreign += [f"checkpoints/{name}" for name in names if name not in (LIGHT, FULL, BEST, RECENT, *_ASIDE)]
+        for tier in (LIGHT, FULL, BEST):
             entries = list((folder.checkpoints / tier).iterdir()) if (folder.checkpoints / tier).is_dir() else []
             names = {entry.name for entry in entries if not (entry.is_dir() and entry.name.isdigit())}
             half = sorted(name for name in names if ".orbax-checkpoint-tmp" in name)

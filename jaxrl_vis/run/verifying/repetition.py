@@ -10,7 +10,7 @@ from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.loop import GUARD
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.arrays import is_intact, to_host
-from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, state_without_learner
+from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT, state_without_learner
 from jaxrl_vis.run.storage.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.verifying.inspection import Expected, Findings, listed
@@ -171,7 +171,7 @@ class Repeater:
 
     def _compare_checkpoints(self, iteration: int, mark: int | None, loop: LoopState) -> None:
         """Compare the state with checkpoints of the same iteration by their checksums."""
-        for tier in (LIGHT, FULL, RECENT):
+        for tier in (LIGHT, FULL, BEST, RECENT):
             manifest = self._manifests.get((tier, iteration))
             if manifest is None or saved_progress(manifest).replay_lost_at != mark:
                 continue

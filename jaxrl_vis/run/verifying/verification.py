@@ -19,7 +19,7 @@ from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.run.compiled.memory import check_compiled, check_memory
-from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
+from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
 from jaxrl_vis.run.storage.metrics import RUN_ID
@@ -168,7 +168,7 @@ class _Verifier:
 
     def _names(self) -> list[tuple[str, int]]:
         return sorted(
-            ((tier, number) for tier in (LIGHT, FULL) for number in self._checkpoints.iterations(tier)),
+            ((tier, number) for tier in (LIGHT, FULL, BEST) for number in self._checkpoints.iterations(tier)),
             key=lambda name: name[::-1],
         )
 
@@ -184,7 +184,7 @@ class _Verifier:
             try:
                 differences = compare_sums(self._folder.checkpoints / tier / str(number))
                 manifest = self._checkpoints.manifest(tier, number)
-                if tier == LIGHT and manifest.get("iteration") == number:
+                if tier in (LIGHT, BEST) and manifest.get("iteration") == number:
                     self._checkpoints.restore(tier, manifest, self._programs.shapes)
             except (RequestError, OSError) as error:
                 if self._is_there(tier, number):

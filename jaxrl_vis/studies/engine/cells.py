@@ -16,6 +16,7 @@ from typing import Any
 
 from jaxrl_vis.config import UNMEASURED, Config
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.run.storage import scores
 from jaxrl_vis.run.storage.folder import RunFolder, contradictions, read_config
 
 
@@ -85,9 +86,15 @@ def find_folder(cell: Cell, runs: Path) -> Path:
 
 
 def _reached(folder: Path, cell: Cell) -> int | None:
-    """Return the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one."""
+    """Return the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one.
+
+    A run that stops early has come far enough with the evaluation that it stops at.
+    """
     steps: dict[int, set[int]] = {}
-    for row in RunFolder(folder).rows():
+    rows = RunFolder(folder).rows()
+    if cell.config.run.stop_at is not None and (ended := scores.enough_at(cell.config, rows, cell.seeds)):
+        return next(row["env_steps"] for row in rows if row["iteration"] == ended[0])
+    for row in rows:
         if row["env_steps"] >= cell.config.run.env_steps and "eval/success" in row:
             steps.setdefault(row["env_steps"], set()).add(row["seed"])
     return min((count for count, seeds in steps.items() if seeds >= set(cell.seeds)), default=None)

@@ -1,0 +1,74 @@
+"""Events of a run that depend on its evaluations: a new best checkpoint, and an early end."""
+
+from collections.abc import Callable, Sequence
+
+from jaxrl_vis.config import Config
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host import distributed
+from jaxrl_vis.run.reports import Callback, Report
+from jaxrl_vis.run.saving import Saver
+from jaxrl_vis.run.storage import scores
+from jaxrl_vis.run.storage.checkpoint import BEST, Checkpoints
+from jaxrl_vis.run.storage.metrics import PerSeed
+from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.types import LoopState
+
+SCORE, SCORED = "score", "scored"
+"""Keys of the manifest of a best checkpoint: its score, and the metric."""
+
+
+class Milestones:
+    """Milestones of one run. The best score is kept with the best checkpoint alone, so every resumption finds it there.
+
+    Args:
+        config: The run.
+        checkpoints: Its checkpoints.
+        saver: Saves them.
+        say: Prints a line.
+    """
+
+    def __init__(self, config: Config, checkpoints: Checkpoints, saver: Saver, say: Callable[[str], None]):
+        self._config, self._checkpoints, self._saver, self._say = config, checkpoints, saver, say
+        self._best: float | None = None
+
+    def begin(self) -> None:
+        """Read the best score so far."""
+        if self._config.run.best_by is None:
+            return
+        for iteration in reversed(self._checkpoints.iterations(BEST)):
+            try:
+                progress = self._checkpoints.manifest(BEST, iteration)["progress"]
+            except RequestError as error:
+                self._say(f"{error}: the next evaluation is the best")
+                continue
+            score = progress.get(SCORE)
+            if progress.get(SCORED) == scores.metric(self._config) and isinstance(score, float):
+                self._best = score
+                return
+
+    def evaluated(self, loop: LoopState, iteration: int, values: PerSeed, progress: Progress) -> None:
+        """Save the learner if its evaluation is the best.
+
+        Args:
+            loop: The state.
+            iteration: Iterations completed.
+            values: Metrics of the evaluation.
+            progress: Progress of the host.
+        """
+        if self._config.run.best_by is None:
+            return
+        score = scores.score(self._config, values)
+        if scores.is_better(self._config, score, self._best):
+            about = {SCORE: score, SCORED: scores.metric(self._config)}
+            self._saver.best(loop, iteration, progress, about)
+            self._best = score
+
+    def ends(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
+        """Return why the run ends after this evaluation; None if it goes on."""
+        asked = False
+        for callback in callbacks:  # each of them, also after one that asks to stop
+            asked |= callback(report) is True
+        score = scores.score(self._config, report.metrics)
+        if distributed.any_process(scores.is_enough(self._config, score)):
+            return f"{scores.metric(self._config)} {score:.3f} has reached --stop-at {self._config.run.stop_at:g}"
+        return "a callback asked to stop" if distributed.any_process(asked) else None

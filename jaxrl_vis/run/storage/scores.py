@@ -1,0 +1,66 @@
+"""Score of an evaluation, by which a run keeps its best checkpoint and stops early. Imports no JAX.
+
+A score is the mean over seeds of one metric (`RunOptions.best_by`; success if none is named): one program trains all seeds, so
+they share one checkpoint and end together.
+"""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from jaxrl_vis.config import Config
+
+_LOWER_IS_BETTER = ("goal_distance", "goal_distance_median")
+
+
+def metric(config: Config) -> str:
+    """Return the name of the metric, without ``eval/``."""
+    return config.run.best_by or "success"
+
+
+def is_lower_better(config: Config) -> bool:
+    """Return True if smaller scores are better, as of distances."""
+    return metric(config) in _LOWER_IS_BETTER
+
+
+def score(config: Config, values: Mapping[str, Sequence[float]]) -> float:
+    """Return the score of an evaluation.
+
+    Args:
+        config: The run.
+        values: ``eval/*``, one number per seed.
+    """
+    per_seed = values[f"eval/{metric(config)}"]
+    return math.fsum(per_seed) / len(per_seed)
+
+
+def is_better(config: Config, new: float, old: float | None) -> bool:
+    """Return True if a score is better than another; any is better than None. Equal ones are not."""
+    if old is None:
+        return True
+    return new < old if is_lower_better(config) else new > old
+
+
+def is_enough(config: Config, value: float) -> bool:
+    """Return True if a score has reached the level at which the run stops (`RunOptions.stop_at`)."""
+    level = config.run.stop_at
+    if level is None:
+        return False
+    return value <= level if is_lower_better(config) else value >= level
+
+
+def enough_at(config: Config, rows: Sequence[Mapping[str, Any]], seeds: Collection[int]) -> list[int]:
+    """Return the iterations, ascending, after whose evaluations the run could have stopped.
+
+    Args:
+        config: The run.
+        rows: Rows of metrics.jsonl.
+        seeds: Seeds of the run, of which an evaluation must have rows.
+    """
+    name = f"eval/{metric(config)}"
+    by_iteration: dict[int, dict[int, float]] = {}
+    for row in rows:
+        if isinstance(row.get(name), int | float) and row["seed"] in seeds:
+            by_iteration.setdefault(row["iteration"], {})[row["seed"]] = row[name]
+    complete = {number: found for number, found in sorted(by_iteration.items()) if len(found) == len(seeds)}
+    return [number for number, found in complete.items() if is_enough(config, score(config, {name: list(found.values())}))]
