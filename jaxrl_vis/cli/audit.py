@@ -3,11 +3,9 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_env
-from jaxrl_vis.cli.parsing import AlsoPositional
-from jaxrl_vis.config import Pixels, preset
+from jaxrl_vis.cli.task_images import TaskImages
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.host.files import write_atomically
@@ -15,15 +13,13 @@ from jaxrl_vis.report.outputs import check_figure, check_writable
 
 
 @dataclasses.dataclass(frozen=True)
-class Audit:
+class Audit(TaskImages):
     """Compare rewards of image and goal image with the truth of a task: false rewards, order, calibration, exploitation.
 
     Nothing is trained. A reward of your own is a function of two batches of images [B, C, H, W] uint8, with values between
     0 and 1: --rewards module:function. A run folder stands for the reward that the run has trained along.
     """
 
-    env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
-    """Environment with images: a name that `jaxrl-vis envs` lists, or module:Name for your own."""
     rewards: tuple[str, ...] = ("indicator", "indicator_tolerance")
     """indicator, indicator_tolerance, features, run folders, or module:function."""
     episodes: int = 64
@@ -40,14 +36,6 @@ class Audit:
     """Fraction of the elements that must be equal for indicator_tolerance."""
     reward_encoder: str | None = None
     """File with the encoder of features, from `jaxrl-vis encoder`."""
-    pixels: Pixels = "rgbd"
-    """Channels of the images."""
-    image_size: int = 64
-    """Height and width of the images, in pixels."""
-    env_options: tuple[str, ...] = ()
-    """Further options of the environment, as name=value."""
-    seed: int = 0
-    """Seed of episodes and search."""
     out: Path | None = None
     """Also draw rewards against distances into this .png, .pdf or .svg."""
     json: Path | None = None
@@ -73,15 +61,7 @@ def run(options: Audit) -> int:
     from jaxrl_vis.studies.audit import report
     from jaxrl_vis.studies.audit.rewards import find_reward
 
-    config = preset(
-        "fast",
-        env=options.env,
-        pixels=options.pixels,
-        image_size=options.image_size,
-        env_options=options.env_options,
-        random_shift=0,
-    )
-    config = locate_env(config)
+    config = locate_env(options.config())
     env = make_env(config)
     config = config.replace(
         tolerance=options.tolerance, tolerance_share=options.tolerance_share, reward_encoder=options.reward_encoder

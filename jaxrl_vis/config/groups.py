@@ -352,7 +352,7 @@ def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:
     """
     for name in changes:
         if name not in OPTIONS:
-            raise RequestError(f"unknown option {str(name)[:60]!r}{nearest(str(name), OPTIONS)}")
+            raise RequestError(f"unknown option {str(name)[:60]!r}{nearest(str(name), OPTIONS, 'see jaxrl-vis train --help')}")
     return changes
 
 

@@ -29,7 +29,12 @@ def read(path: Path | str) -> Recordings:
     path = Path(path)
     if lerobot_reader.is_dataset(path):
         return lerobot_reader.read(path)
-    return npz.read(path if path.suffix == ".npz" else path / npz.FILE_NAME)
+    return npz.read(_npz_file(path))
+
+
+def _npz_file(path: Path) -> Path:
+    """Return the file of episodes that ``path`` is, or that lies in this folder."""
+    return path if path.suffix == ".npz" else path / npz.FILE_NAME
 
 
 def check_out(out: Path, kind: str) -> None:
@@ -42,6 +47,8 @@ def check_out(out: Path, kind: str) -> None:
         lerobot.check_packages()
         if out.is_dir() and any(out.iterdir()):
             raise RequestError(f"--out {out} is not empty: name a new folder")
+    elif (file := _npz_file(out)).exists():
+        raise RequestError(f"--out {file} is there already: name a new file")
     check_writable(out, "--out", folder=out.suffix != ".npz")
 
 
@@ -57,8 +64,7 @@ def write(recordings: Recordings, out: Path | str, kind: str) -> Path:
         RequestError: See `check_out`.
         StorageError: They cannot be written.
     """
-    out = Path(out)
-    path = out if kind == LEROBOT or out.suffix == ".npz" else out / npz.FILE_NAME
+    path = Path(out) if kind == LEROBOT else _npz_file(Path(out))
     try:
         (lerobot if kind == LEROBOT else npz).write(recordings, path)
     except OSError as error:

@@ -119,6 +119,11 @@ def test_targets_are_checked_before_the_work(pushed: Path, tmp_path: Path, monke
     assert not list(tmp_path.iterdir())
 
 
+def test_commands_that_need_the_whole_run_say_so(pushed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", str(pushed)]) == 2
+    assert "holds a policy alone, for jaxrl_vis.load_policy" in capsys.readouterr().err
+
+
 def test_weights_of_another_network_are_refused(pushed: Path, tmp_path: Path) -> None:
     for file in ("policy.safetensors", "config.json"):
         (tmp_path / file).write_bytes((pushed / file).read_bytes())
@@ -156,7 +161,13 @@ def test_the_command_writes_and_converts(run: Path, tmp_path: Path, capsys: pyte
     np.testing.assert_array_equal(first.observations[:3], last.observations)
     np.testing.assert_array_equal(first.actions[:3], last.actions)
     capsys.readouterr()
-    assert cli.main(["dataset", str(file), "--out", str(dataset)]) == 2
-    assert "not empty" in capsys.readouterr().err
+    before = file.read_bytes()
+    for words, message in (
+        (["--out", str(dataset)], "not empty"),
+        (["--format", "npz", "--out", str(file)], "played.npz is there already: name a new file"),
+    ):
+        assert cli.main(["dataset", str(file), *words]) == 2
+        assert message in capsys.readouterr().err
+    assert file.read_bytes() == before
     assert cli.main(["dataset", str(tmp_path), "--out", str(tmp_path / "new")]) == 2
     assert "is not a run folder" in capsys.readouterr().err

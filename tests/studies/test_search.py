@@ -128,6 +128,7 @@ def test_another_search_is_refused(tmp_path: Path) -> None:
     [
         ("batch_size", "write NAME=LOW..HIGH"),
         ("batch_siz=1..2", "unknown option 'batch_siz'; did you mean batch_size"),
+        ("lr=1..2", "unknown option 'lr'; see jaxrl-vis train --help"),
         ("batch_size=80..4", "LOW must lie below HIGH"),
         ("random_shift=0..4,log", "above 0 for ,log"),
         ("batch_size=0..4", "batch_size must be at least 1"),

@@ -8,8 +8,7 @@
 Each checkpoint has a manifest: names, shapes, dtypes and checksums of all arrays, and the host's progress. orbax makes a folder
 appear under its final name only when it is complete; the checksums detect later damage, such as a flipped byte, which would
 otherwise be restored silently. After the background write, SHA256SUMS (`sums`) is added for `verification`, also of data that
-is never restored. The newest two light and full
-ones are kept.
+is never restored. The newest two light ones and the newest two full ones are kept.
 
 A run resumes from the newest valid checkpoint of all tiers; if several are equally new, from the full, the recent or the light
 one, in this order. Nothing newer is ever deleted: a damaged checkpoint is moved to checkpoints/damaged/, and one of another

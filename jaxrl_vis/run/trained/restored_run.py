@@ -12,6 +12,7 @@ from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.compiled.memory import check_compiled
 from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.storage.folder import read_config, read_run_id
+from jaxrl_vis.run.trained import policy_file
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
 
@@ -62,6 +63,8 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Re
         checkpoints.close()
     if restored is None and saved and checkpoint is not None:
         raise RequestError(f"checkpoint {checkpoint} of the run in {run_dir} is damaged: leave it out for the newest good one")
+    if restored is None and policy_file.holds_policy(Path(run_dir)):
+        raise RequestError(f"{run_dir} holds a policy alone, for jaxrl_vis.load_policy: name the run that it was pushed from")
     if restored is None:
         raise RequestError(f"the run in {run_dir} has no usable checkpoint: train it first")
     return restored

@@ -72,7 +72,7 @@ def read_range(text: str) -> Range:
     if not equals or not values:
         raise RequestError(f"--vary {text}: write NAME=LOW..HIGH, NAME=LOW..HIGH,log or NAME=VALUE,VALUE")
     if name not in OPTIONS:
-        raise RequestError(f"--vary {text}: unknown option {name!r}{nearest(name, OPTIONS)}")
+        raise RequestError(f"--vary {text}: unknown option {name!r}{nearest(name, OPTIONS, 'see jaxrl-vis train --help')}")
     if ".." not in values:
         words = tuple(dict.fromkeys(values.split(",")))
         for word in words:

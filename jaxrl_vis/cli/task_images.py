@@ -1,0 +1,35 @@
+"""Options of commands that look at the images of a task without training on it."""
+
+import dataclasses
+from typing import Annotated, Any
+
+from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.config import Config, Pixels, preset
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskImages:
+    """Images of a task."""
+
+    env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
+    """Environment with images: a name that `jaxrl-vis envs` lists, or module:Name for your own."""
+    pixels: Pixels = "rgbd"
+    """Channels of the images."""
+    image_size: int = 64
+    """Height and width of the images, in pixels."""
+    env_options: tuple[str, ...] = ()
+    """Further options of the environment, as name=value."""
+    seed: int = 0
+    """Seed of everything random."""
+
+    def config(self, **changes: Any) -> Config:
+        """Return the configuration of the preset `fast` with these images, and further options by name."""
+        return preset(
+            "fast",
+            env=self.env,
+            pixels=self.pixels,
+            image_size=self.image_size,
+            env_options=self.env_options,
+            random_shift=0,
+            **changes,
+        )
