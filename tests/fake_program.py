@@ -3,12 +3,16 @@
 As a script (`python fake_program.py RUN_DIR KIND`), it trains until somebody stops it; the tests send it signals.
 """
 
+import collections
+import dataclasses
+import functools
 import math
 import signal
 import sys
 import time
 import types
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,103 +44,138 @@ def small_config(**changes) -> Config:
     return config.replace(**(looking | changes))
 
 
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    """What the jitted functions of a `FakeProgram` depend on."""
+
+    image: int
+    num_envs: int
+    seeds: int
+    episodes: int
+    nan_at: int | None
+    break_state: bool
+    filtered_share: float
+
+
+_TRACES: collections.Counter[_Sizes] = collections.Counter()
+
+
+def _make_env(image_size: int) -> types.SimpleNamespace:
+    return types.SimpleNamespace(
+        distance_unit="m",
+        threshold=0.05,
+        control_period=0.04,
+        horizon=HORIZON,
+        frame_stack=1,
+        observation_spec=jax.ShapeDtypeStruct((1, image_size, image_size), jnp.uint8),
+        goal_state_size=3,
+        action_size=4,
+    )
+
+
 class FakeProgram:
-    """See the module."""
+    """See the module. Functions of equal sizes are made, and traced, once a process."""
 
     def __init__(self, config: Config, nan_at: int | None = None, break_state: bool = False, filtered_share: float = 0.1):
-        self.config, self.traces, self.layout = config, 0, ONE_DEVICE
-        self.env = types.SimpleNamespace(
-            distance_unit="m",
-            threshold=0.05,
-            control_period=0.04,
-            horizon=HORIZON,
-            frame_stack=1,
-            observation_spec=jax.ShapeDtypeStruct((1, config.environment.image_size, config.environment.image_size), jnp.uint8),
-            goal_state_size=3,
-            action_size=4,
-        )
-        self.plays_any, self.part_size, self.exploration = False, config.run.num_envs, Exploration()
-        self.parts_spec = [played_spec(self.env, config.run.num_envs, config.run.seeds)]
-        self.steps_per_iteration = config.run.num_envs * HORIZON
+        size, num_envs = config.environment.image_size, config.run.num_envs
+        self.config, self.layout, self.env = config, ONE_DEVICE, _make_env(size)
+        self.plays_any, self.part_size, self.exploration = False, num_envs, Exploration()
+        self.parts_spec = [played_spec(self.env, num_envs, config.run.seeds)]
+        self.steps_per_iteration = num_envs * HORIZON
         self.updates_per_iteration = 3
         self.num_iterations = math.ceil(config.run.env_steps / self.steps_per_iteration)
-        episodes = math.ceil(config.run.replay_transitions / self.steps_per_iteration) * config.run.num_envs
-        size = config.environment.image_size
-        self.replay = make_replay(config.run.replay_transitions, config.run.num_envs, HORIZON)
+        episodes = math.ceil(config.run.replay_transitions / self.steps_per_iteration) * num_envs
+        self.replay = make_replay(config.run.replay_transitions, num_envs, HORIZON)
         self.replay_bytes = episodes * ((HORIZON + 2) * (size * size + 3 * 4) + HORIZON * 4 * 4) + 4
+        self._sizes = _Sizes(size, num_envs, config.run.seeds, episodes, nan_at, break_state, filtered_share)
+        vars(self).update(_jitted(self._sizes))
 
-        def init_one(key):
-            parameters = {"layer": {"kernel": jax.random.uniform(key, (4, 3)) - 0.5, "bias": jnp.zeros(3)}}
-            agent = {
-                "actor": parameters,
-                "critic": parameters,
-                "optimizers": ((jnp.zeros((), jnp.int32), parameters), ()),
-                "updates": jnp.zeros((), jnp.int32),
-            }
-            train = TrainState(agent, NormalizerState(jnp.zeros(()), jnp.zeros((1, size, size)), jnp.ones((1, size, size))))
-            replay = Episodes(
-                observations=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
-                states=jnp.zeros((episodes, HORIZON + 2, 3)),
-                actions=jnp.zeros((episodes, HORIZON, 4)),
-            )
-            return LoopState(train, ReplayState(replay, jnp.zeros((), jnp.int32)), key, jnp.zeros((), jnp.int32))
+    @property
+    def traces(self) -> int:
+        """How often this process has traced `learn` of these sizes."""
+        return _TRACES[self._sizes]
 
-        def noise_of(key):
-            # One draw, spread out by arithmetic that compiles faster than many draws.
-            return jax.random.uniform(key, ())
 
-        def play_one(train, key):
-            def spread(like):
-                count = jnp.arange(config.run.num_envs * math.prod(like.shape[1:]), dtype=jnp.uint32)
-                words = (count * jnp.uint32(2654435761)) ^ (noise_of(key) * 2.0**24).astype(jnp.uint32)
-                values = ((words ^ (words >> 15)) >> 8).reshape((config.run.num_envs, *like.shape[1:]))
-                return values.astype(like.dtype) if like.dtype == jnp.uint8 else values.astype(jnp.float32) / 2.0**24 - 0.5
+@functools.cache
+def _jitted(sizes: _Sizes) -> dict[str, Any]:
+    """Make `init`, `keys`, `play`, `learn` and `evaluate`."""
+    size, episodes = sizes.image, sizes.episodes
+    played = played_spec(_make_env(size), sizes.num_envs, sizes.seeds)
 
-            episodes, outcome = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), self.parts_spec[0])
-            return jax.tree.map(spread, episodes), {name: jnp.zeros(leaf.shape) for name, leaf in outcome.items()}
+    def init_one(key):
+        parameters = {"layer": {"kernel": jax.random.uniform(key, (4, 3)) - 0.5, "bias": jnp.zeros(3)}}
+        agent = {
+            "actor": parameters,
+            "critic": parameters,
+            "optimizers": ((jnp.zeros((), jnp.int32), parameters), ()),
+            "updates": jnp.zeros((), jnp.int32),
+        }
+        train = TrainState(agent, NormalizerState(jnp.zeros(()), jnp.zeros((1, size, size)), jnp.ones((1, size, size))))
+        replay = Episodes(
+            observations=jnp.zeros((episodes, HORIZON + 2, 1, size, size), jnp.uint8),
+            states=jnp.zeros((episodes, HORIZON + 2, 3)),
+            actions=jnp.zeros((episodes, HORIZON, 4)),
+        )
+        return LoopState(train, ReplayState(replay, jnp.zeros((), jnp.int32)), key, jnp.zeros((), jnp.int32))
 
-        def learn_one(loop, parts):
-            self.traces += 1
-            noise = noise_of(jax.random.fold_in(loop.key, loop.iteration))
-            ((new, _),) = parts
-            old = loop.replay.episodes
-            start = (loop.iteration * config.run.num_envs) % episodes
-            bad = loop.iteration == (-1 if nan_at is None else nan_at)
-            if break_state:
-                new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
-            replay = jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, start, 0), old, new)
-            step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.observations.mean()
-            agent = loop.train.agent
-            actor = {"layer": agent["actor"]["layer"] | {"kernel": agent["actor"]["layer"]["kernel"] + step}}
-            loss = jnp.where(bad, jnp.nan, step**2)
-            critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, agent["critic"])
-            train = loop.train.replace(agent=agent | {"actor": actor, "critic": critic, "updates": agent["updates"] + 3})
-            memory = ReplayState(replay, jnp.minimum(loop.replay.size + config.run.num_envs, episodes))
-            metrics = {
-                "train/critic_loss": loss,
-                "train/success": jax.nn.sigmoid(loop.iteration / 3.0 - 1.0),
-                "train/goal_distance": 0.2 / (1.0 + loop.iteration),
-                "train/filtered_share": jnp.float32(filtered_share),
-                "guard/nonfinite": jnp.sum(~jnp.isfinite(loss)).astype(jnp.float32),
-            }
-            return Learned(LoopState(train, memory, loop.key, loop.iteration + 1), metrics)
+    def noise_of(key):
+        # One draw, spread out by arithmetic that compiles faster than many draws.
+        return jax.random.uniform(key, ())
 
-        def evaluate_one(train, key):
-            kernel, updates = train.agent["actor"]["layer"]["kernel"], train.agent["updates"]
-            score = jax.nn.sigmoid(updates / 9.0 - 1.0 + 0.1 * kernel.sum())
-            y, x = jnp.mgrid[0:size, 0:size]
-            t = jnp.arange(HORIZON + 1)[:, None, None]
-            ball = ((y - 3 - t) ** 2 + (x - 4 - t) ** 2 < 9) * 120
-            frames = jnp.broadcast_to((200 - ball).astype(jnp.uint8)[None, :, None], (3, HORIZON + 1, 1, size, size))
-            images = {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
-            return Evaluation({"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}, images)
+    def play_one(train, key):
+        def spread(like):
+            count = jnp.arange(sizes.num_envs * math.prod(like.shape[1:]), dtype=jnp.uint32)
+            words = (count * jnp.uint32(2654435761)) ^ (noise_of(key) * 2.0**24).astype(jnp.uint32)
+            values = ((words ^ (words >> 15)) >> 8).reshape((sizes.num_envs, *like.shape[1:]))
+            return values.astype(like.dtype) if like.dtype == jnp.uint8 else values.astype(jnp.float32) / 2.0**24 - 0.5
 
-        play_seeds = jax.vmap(play_one)
-        self.init = jax.jit(jax.vmap(init_one, out_axes=_SEED_AXES))
-        self.keys = jax.jit(jax.vmap(jax.random.fold_in, in_axes=(0, None)))
-        self.play = jax.jit(lambda train, keys, first, exploration: play_seeds(train, keys))
-        self.learn = jax.jit(jax.vmap(learn_one, (_SEED_AXES, 0), Learned(_SEED_AXES, 0)), donate_argnums=0)
-        self.evaluate = jax.jit(jax.vmap(evaluate_one, in_axes=(0, None)))
+        episodes, outcome = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), played)
+        return jax.tree.map(spread, episodes), {name: jnp.zeros(leaf.shape) for name, leaf in outcome.items()}
+
+    def learn_one(loop, parts):
+        _TRACES[sizes] += 1
+        noise = noise_of(jax.random.fold_in(loop.key, loop.iteration))
+        ((new, _),) = parts
+        old = loop.replay.episodes
+        start = (loop.iteration * sizes.num_envs) % episodes
+        bad = loop.iteration == (-1 if sizes.nan_at is None else sizes.nan_at)
+        if sizes.break_state:
+            new = new.replace(states=jnp.where(bad, jnp.nan, new.states))
+        replay = jax.tree.map(lambda whole, part: jax.lax.dynamic_update_slice_in_dim(whole, part, start, 0), old, new)
+        step = 0.1 * (noise - 0.5) + 1e-3 * replay.states.mean() + 1e-4 * replay.observations.mean()
+        agent = loop.train.agent
+        actor = {"layer": agent["actor"]["layer"] | {"kernel": agent["actor"]["layer"]["kernel"] + step}}
+        loss = jnp.where(bad, jnp.nan, step**2)
+        critic = jax.tree.map(lambda leaf: leaf + 0.0 * loss, agent["critic"])
+        train = loop.train.replace(agent=agent | {"actor": actor, "critic": critic, "updates": agent["updates"] + 3})
+        memory = ReplayState(replay, jnp.minimum(loop.replay.size + sizes.num_envs, episodes))
+        metrics = {
+            "train/critic_loss": loss,
+            "train/success": jax.nn.sigmoid(loop.iteration / 3.0 - 1.0),
+            "train/goal_distance": 0.2 / (1.0 + loop.iteration),
+            "train/filtered_share": jnp.float32(sizes.filtered_share),
+            "guard/nonfinite": jnp.sum(~jnp.isfinite(loss)).astype(jnp.float32),
+        }
+        return Learned(LoopState(train, memory, loop.key, loop.iteration + 1), metrics)
+
+    def evaluate_one(train, key):
+        kernel, updates = train.agent["actor"]["layer"]["kernel"], train.agent["updates"]
+        score = jax.nn.sigmoid(updates / 9.0 - 1.0 + 0.1 * kernel.sum())
+        y, x = jnp.mgrid[0:size, 0:size]
+        t = jnp.arange(HORIZON + 1)[:, None, None]
+        ball = ((y - 3 - t) ** 2 + (x - 4 - t) ** 2 < 9) * 120
+        frames = jnp.broadcast_to((200 - ball).astype(jnp.uint8)[None, :, None], (3, HORIZON + 1, 1, size, size))
+        images = {"frames": frames, "goals": frames[:, -1], "success": jnp.array([1.0, 0.0, 1.0])}
+        return Evaluation({"eval/success": score, "eval/goal_distance": 0.2 * (1.0 - score)}, images)
+
+    play_seeds = jax.vmap(play_one)
+    return {
+        "init": jax.jit(jax.vmap(init_one, out_axes=_SEED_AXES)),
+        "keys": jax.jit(jax.vmap(jax.random.fold_in, in_axes=(0, None))),
+        "play": jax.jit(lambda train, keys, first, exploration: play_seeds(train, keys)),
+        "learn": jax.jit(jax.vmap(learn_one, (_SEED_AXES, 0), Learned(_SEED_AXES, 0)), donate_argnums=0),
+        "evaluate": jax.jit(jax.vmap(evaluate_one, in_axes=(0, None))),
+    }
 
 
 def make_fake_trainer(

@@ -9,6 +9,7 @@ and missing options are distinguished from given ones.
 import ast
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
 import itertools
@@ -297,6 +298,7 @@ def describe_options(record: type) -> list[tuple[fields.Field, str]]:
     return [(field, texts[field.record].get(field.name, "")) for field in described]
 
 
+@functools.cache
 def _docstrings(record: type) -> dict[str, str]:
     """Return the docstrings below the fields of a dataclass, inherited ones included, as single lines."""
     texts: dict[str, str] = {}

@@ -223,7 +223,7 @@ def guess_accelerator() -> bool:
     requested = [word.strip() for word in os.environ.get("JAX_PLATFORMS", "").split(",") if word.strip()]
     if requested:
         return requested[0] != "cpu"
-    return any(_is_installed(packages) and _exists(files) for packages, files in (_NVIDIA, _TPU))
+    return any(_exists(files) and _is_installed(packages) for packages, files in (_NVIDIA, _TPU))
 
 
 def _is_installed(packages: tuple[str, ...]) -> bool:

@@ -146,16 +146,18 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
 
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     """Encode a looping GIF. All frames share one palette, without dithering: no flicker, and good compression."""
-    samples = images[:: max(1, len(images) // 16)] + images[-1:]
+    # Each fourth pixel in each direction shows the same colours: images are enlarged by whole numbers.
+    quarter = (max(1, images[0].width // 4), max(1, images[0].height // 4))
+    samples = [image.resize(quarter, Image.Resampling.NEAREST) for image in images[:: max(1, len(images) // 16)] + images[-1:]]
     # Swatches reserve palette entries for the colours of borders and texts, however colourful the images are.
     swatches = (REACHED, MISSED, PLAIN, BACKGROUND, TEXT, FAINT)
     height = samples[0].height
-    montage = Image.new("RGB", (samples[0].width, height * len(samples) + 48 * len(swatches)))
+    montage = Image.new("RGB", (samples[0].width, height * len(samples) + 12 * len(swatches)))
     for i, sample in enumerate(samples):
         montage.paste(sample, (0, i * height))
     for i, colour in enumerate(swatches):
-        top = height * len(samples) + 48 * i
-        montage.paste(colour, (0, top, montage.width, top + 48))
+        top = height * len(samples) + 12 * i
+        montage.paste(colour, (0, top, montage.width, top + 12))
     palette = montage.quantize(255, method=Image.Quantize.MEDIANCUT)
     frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # GIF counts in hundredths of a second, and players slow down anything below two.

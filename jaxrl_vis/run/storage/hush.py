@@ -17,8 +17,10 @@ def hushed() -> Iterator[None]:
     absl.disabled, sys.unraisablehook = True, lambda _: None
     try:
         yield
-    finally:
+    except BaseException:
         gc.collect()  # abandoned coroutines print warnings when they are collected
+        raise
+    finally:
         absl.disabled, sys.unraisablehook = disabled, before
 
 
