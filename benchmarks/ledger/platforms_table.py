@@ -48,7 +48,7 @@ def _row(record: dict[str, Any]) -> tuple[str, ...]:
     failed = [name for name, passed in checks.items() if not passed]
     ran = f"doctor: {len(checks) - len(failed)} of {len(checks)} checks" + (f" (failed: {', '.join(failed)})" if failed else "")
     if training is not None:
-        ran += f"; {training['task']}, {training['preset']}: {training['env_steps_per_s']:,.0f} steps/s"
+        ran += f"; {training['task']}, debug: {training['env_steps_per_s']:,.0f} steps/s"
     versions = record["versions"]
     place = f"{machine} ({record['machine']}, {record['system']})"
     return record["date"], place, record["driver"] or "", versions["python"], versions["jax"], ran

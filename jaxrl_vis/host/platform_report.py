@@ -67,7 +67,6 @@ class Training:
         speed, done, wall = float(row["time/env_steps_per_s"]), int(row["env_steps"]), time.perf_counter() - start
         self.figures = {
             "task": _TASK,
-            "preset": "debug",
             "env_steps": done,
             "env_steps_per_s": round(speed, 1),
             "wall_s": round(wall, 1),

@@ -14,6 +14,7 @@ from jaxrl_vis.run.exported.golden import FILE as GOLDEN
 from jaxrl_vis.run.exported.layers import INPUTS, OUTPUT
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.run.trained.policy import Policy
+from jaxrl_vis.run.trained.results import describe
 from jaxrl_vis_envs.render import Scene
 
 FILE, SCHEMA = "contract.json", 1
@@ -100,8 +101,7 @@ def make_contract(
             "id": record.get("run_id"),
             "seed": policy.seed,
             "iteration": policy.iteration,
-            "algorithm": config.run.algorithm,
-            "preset": config.run.preset,
+            "training": f"{config.run.algorithm}, {describe(config)}",
         },
     }
 

@@ -40,7 +40,7 @@ def record_run(run_dir: Path | str, episodes: int = 50, seed: int = 0, trust: bo
         "depth_range": None if depth_range is None else [float(end) for end in depth_range],
         "distance_unit": env.distance_unit,
         "threshold": float(env.threshold),
-        "method": trainer.config.reward.method,
+        "reward": trainer.config.reward.method,
         "run_seed": trainer.config.run.seed,
         "iteration": restored.iteration,
         "episode_seed": seed,
