@@ -1,0 +1,213 @@
+"""All weightings on supervised data: a small network with several heads on the digits of scikit-learn.
+
+    python -m benchmarks.weighted_digits [--only NAME ...] [--json FILE]
+
+    pairs       two digits over each other: which is the upper, which the lower one?
+    questions   five questions about one digit: which, even, above four, how many holes, how much ink
+    helped      the same with 100 images: which digit it is counts, the other four questions are to help
+
+Each method is trained with Adam at `RATES` on seeds 0 to 4; the rate with the best accuracy on validation images is used for
+seeds 100 to 114, whose accuracy on test images is reported. Methods with a main loss take part in ``helped`` alone, where only
+the main loss's accuracy counts. The record is written after each method, and what it holds is not trained again.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from scipy.stats import permutation_test
+from sklearn.datasets import load_digits
+
+import jaxrl_vis.weighting as jw
+from jaxrl_vis.host import provenance
+from jaxrl_vis.host.files import write_atomically
+
+RATES = (1e-3, 3e-3, 1e-2)
+TUNING_SEEDS, TEST_SEEDS = range(5), range(100, 115)
+STEPS, BATCH, WIDTH = 2000, 64, 32
+BASELINE = "sum"
+TARGET = Path(__file__).parent / "results" / "weighted_digits.json"
+_HOLES = np.array([1, 0, 0, 0, 1, 0, 1, 0, 2, 1])  # of the digits as they are usually written
+_LABELLED = 100
+
+Split = dict[str, np.ndarray]  # inputs under x, and labels of each task under its name
+
+
+class Problem(NamedTuple):
+    """Data of one comparison.
+
+    Attributes:
+        classes: Number of classes of each task.
+        splits: ``train``, ``valid`` and ``test``.
+        scored: Tasks whose mean accuracy counts.
+    """
+
+    classes: dict[str, int]
+    splits: dict[str, Split]
+    scored: tuple[str, ...]
+
+
+def problems() -> dict[str, Problem]:
+    """Return the three problems by name; no image is in two splits."""
+    data = load_digits()
+    images, digits = data.images.astype(np.float32) / 16.0, data.target
+    order = np.random.default_rng(0).permutation(len(images))
+    rows = dict(zip(("train", "valid", "test"), np.split(order, (1000, 1300)), strict=True))
+    ink = images.mean(axis=(1, 2))
+    answers = {
+        "digit": digits,
+        "even": digits % 2,
+        "high": (digits > 4).astype(np.int64),
+        "holes": _HOLES[digits],
+        "ink": np.digitize(ink, np.quantile(ink[rows["train"]], (0.25, 0.5, 0.75))),
+    }
+    classes = {"digit": 10, "even": 2, "high": 2, "holes": 3, "ink": 4}
+
+    def asked(chosen: np.ndarray, digit: str = "digit") -> Split:
+        named = {digit if name == "digit" else name: values[chosen] for name, values in answers.items()}
+        return {"x": images[chosen].reshape(-1, 64), **named}
+
+    def pair(chosen: np.ndarray, seed: int) -> Split:
+        upper, lower = chosen, np.random.default_rng(seed).permutation(chosen)
+        canvas = np.zeros((len(chosen), 10, 10), np.float32)
+        canvas[:, :8, :8] = images[upper]
+        canvas[:, 2:, 2:] = np.maximum(canvas[:, 2:, 2:], images[lower])
+        return {"x": canvas.reshape(-1, 100), "upper": digits[upper], "lower": digits[lower]}
+
+    few = {**rows, "train": rows["train"][:_LABELLED]}
+    return {
+        "pairs": Problem(
+            {"upper": 10, "lower": 10},
+            {name: pair(np.tile(chosen, 4), seed) for seed, (name, chosen) in enumerate(rows.items())},
+            ("upper", "lower"),
+        ),
+        "questions": Problem(classes, {name: asked(chosen) for name, chosen in rows.items()}, tuple(classes)),
+        "helped": Problem(
+            {jw.MAIN if name == "digit" else name: count for name, count in classes.items()},
+            {name: asked(chosen, jw.MAIN) for name, chosen in few.items()},
+            (jw.MAIN,),
+        ),
+    }
+
+
+def initialize(key: jax.Array, problem: Problem) -> Any:
+    """Draw the parameters: a trunk of two layers and a linear head for each task."""
+
+    def layer(key: jax.Array, rows: int, columns: int) -> jax.Array:
+        return jax.random.normal(key, (rows, columns)) / np.sqrt(rows)
+
+    first, second, *others = jax.random.split(key, 2 + len(problem.classes))
+    inputs = problem.splits["train"]["x"].shape[1]
+    heads = {name: layer(key, WIDTH, count) for key, (name, count) in zip(others, problem.classes.items(), strict=True)}
+    return {"trunk": [layer(first, inputs, 64), layer(second, 64, WIDTH)], "heads": heads}
+
+
+def logits(params: Any, x: jax.Array) -> dict[str, jax.Array]:
+    """Return the logits [N, classes] of each task for images ``x`` [N, pixels]."""
+    first, second = params["trunk"]
+    features = jax.nn.relu(jax.nn.relu(x @ first) @ second)
+    return {name: features @ head for name, head in params["heads"].items()}
+
+
+def losses(params: Any, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Return the mean cross-entropy of each task."""
+    outputs = logits(params, batch["x"])
+    return {
+        name: jnp.mean(optax.softmax_cross_entropy_with_integer_labels(values, batch[name])) for name, values in outputs.items()
+    }
+
+
+def make_training(problem: Problem, weighting: jw.Weighting) -> Callable[[jax.Array, jax.Array], dict[str, jax.Array]]:
+    """Return the compiled training of runs side by side: (rates [R], seeds [R]) -> accuracies [R] of each split but train's."""
+    gradient = jw.weighted_grad(losses, weighting, shared=lambda params: params["trunk"])
+    optimizer = optax.scale_by_adam()
+    known = {name: jnp.asarray(values) for name, values in problem.splits["train"].items()}
+
+    def accuracy(params: Any, split: Split) -> jax.Array:
+        outputs = logits(params, jnp.asarray(split["x"]))
+        return jnp.mean(jnp.stack([jnp.mean(jnp.argmax(outputs[name], axis=-1) == split[name]) for name in problem.scored]))
+
+    def run(rate: jax.Array, seed: jax.Array) -> dict[str, jax.Array]:
+        params_key, state_key, data_key = jax.random.split(jax.random.key(seed), 3)
+        params = initialize(params_key, problem)
+        state = weighting.init(tuple(problem.classes), params["trunk"])
+        state = state if state.key is None else state.replace(key=state_key)
+
+        def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
+            params, moments, state = carry
+            rows = jax.random.randint(key, (BATCH,), 0, len(known["x"]))
+            result = gradient(params, state, {name: values[rows] for name, values in known.items()})
+            change, moments = optimizer.update(result.gradient, moments)
+            params = jax.tree.map(lambda leaf, slope: leaf - rate * slope, params, change)
+            return (params, moments, result.state), None
+
+        carry = (params, optimizer.init(params), state)
+        (params, _, _), _ = jax.lax.scan(step, carry, jax.random.split(data_key, STEPS))
+        return {name: accuracy(params, problem.splits[name]) for name in ("valid", "test")}
+
+    return jax.jit(jax.vmap(run))
+
+
+def measure(problem: Problem, name: str) -> dict[str, Any]:
+    """Tune and test one method; return its rate, its validation accuracy at each rate, and its test accuracies."""
+    train = make_training(problem, jw.make_weighting(name))
+    rates, seeds = (part.ravel() for part in np.meshgrid(np.float32(RATES), np.array(TUNING_SEEDS), indexing="ij"))
+    valid = np.asarray(train(rates, seeds)["valid"]).reshape(len(RATES), -1).mean(axis=1)
+    best = int(np.argmax(valid))
+    started = time.perf_counter()  # the programme is compiled: there are as many runs as before
+    test = np.asarray(train(np.full(len(TEST_SEEDS), RATES[best], np.float32), np.array(TEST_SEEDS))["test"])
+    return {
+        "method": name,
+        "rate": RATES[best],
+        "valid": [round(float(value), 4) for value in valid],
+        "test": [round(float(value), 4) for value in test],
+        "seconds": round(time.perf_counter() - started, 2),
+    }
+
+
+def methods(problem: Problem) -> Iterator[str]:
+    """Yield the weightings that a problem suits, the baseline first."""
+    has_main = jw.MAIN in problem.classes
+    names = [BASELINE, *(name for name in jw.WEIGHTINGS if name != BASELINE)]
+    return (name for name in names if has_main or not jw.make_weighting(name).main)
+
+
+def difference(values: list[float], baseline: list[float]) -> tuple[float, float]:
+    """Return the mean difference over seeds, and its p-value by the exact paired permutation test."""
+    pair = (np.asarray(values), np.asarray(baseline))
+    test = permutation_test(
+        pair, lambda a, b, axis: np.mean(a - b, axis=axis), permutation_type="samples", vectorized=True, n_resamples=np.inf
+    )
+    return float(np.mean(pair[0] - pair[1])), float(test.pvalue)
+
+
+def main() -> int:
+    """Read the command line, train what is missing, and write the record."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=sorted(jw.WEIGHTINGS), help="methods; all if not given")
+    parser.add_argument("--json", type=Path, default=TARGET, help="the record")
+    options = parser.parse_args()
+    record: dict[str, Any] = json.loads(options.json.read_text()) if options.json.exists() else {"problems": {}}
+    for title, problem in problems().items():
+        rows = record["problems"].setdefault(title, [])
+        for name in methods(problem):
+            if any(row["method"] == name for row in rows) or (options.only and name not in options.only):
+                continue
+            rows.append(measure(problem, name))
+            print(f"{title:10} {name:16} rate {rows[-1]['rate']:g}  test {np.mean(rows[-1]['test']):.4f}", flush=True)
+            about = {"device": provenance.device_name(), "versions": provenance.versions(), "revision": provenance.revision()}
+            sizes = {"steps": STEPS, "batch": BATCH, "rates": RATES, "labelled": _LABELLED}
+            write_atomically(options.json, json.dumps({**about, **sizes, "problems": record["problems"]}, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
