@@ -51,7 +51,11 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/phenotyping.md": {"lenses": stalks_table.lens_table, "coverage": stalks_table.coverage_table},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table},
     "docs/where_it_ran.md": {"platforms": platforms_table.platforms_table, "not run": platforms_table.not_run_table},
-    "docs/weighting.md": {"torchjd": weighting_table.torchjd_table, "cost": weighting_table.cost_table},
+    "docs/weighting.md": {
+        "digits": weighting_table.digits_table,
+        "torchjd": weighting_table.torchjd_table,
+        "cost": weighting_table.cost_table,
+    },
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }

@@ -1,8 +1,15 @@
-"""Tables of docs/weighting.md: our weightings beside TorchJD's, from the records of `benchmarks.peers.torchjd`."""
+"""Tables of docs/weighting.md: our weightings beside TorchJD's, from the records of `benchmarks.peers.torchjd`, and all of them
+on supervised data, from that of `benchmarks.weighted_digits`."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from benchmarks.weighted_digits import BASELINE
 
 _RECORD = "weighting_parity.json"
 
@@ -55,3 +62,50 @@ def _of_device(record: dict[str, Any]) -> str:
 
 def _pair(seconds: float, peer: float | None) -> str:
     return f"{1e6 * seconds:,.0f}" + ("" if peer is None else f" / {1e6 * peer:,.0f}")
+
+
+def digits_table(results: Path) -> str | None:
+    """Write the test accuracies of all weightings on supervised data, and what they gain over the sum, as Markdown.
+
+    A gain is told as such where the exact paired permutation test over seeds says so at 5 % after Holm's correction for the
+    number of methods in the column. None without a record.
+    """
+    path = results / "weighted_digits.json"
+    if not path.exists():
+        return None
+    record = json.loads(path.read_text())
+    columns = {title: _of_problem(rows) for title, rows in record["problems"].items()}
+    names = list(dict.fromkeys(name for column in columns.values() for name in column))
+    lines = ["| method | " + " | ".join(f"`{title}`" for title in columns) + " |", "|---|" + "---|" * len(columns)]
+    lines += [f"| `{name}` | " + " | ".join(column.get(name, "") for column in columns.values()) + " |" for name in names]
+    seeds = len(next(iter(record["problems"].values()))[0]["test"])
+    versions = record["versions"]
+    lines += [
+        "",
+        f"Test accuracy in %, mean of {seeds} seeds, and the difference from `{BASELINE}` with its 95 % interval over seeds. "
+        f"**Bold**: a difference by Holm's correction. {record['revision'][:7]} on {record['device']}, JAX {versions['jax']}.",
+    ]
+    return "\n".join(lines)
+
+
+def _of_problem(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Return the cells of a problem by method."""
+    scores = {row["method"]: np.asarray(row["test"]) for row in rows}
+    baseline = scores[BASELINE]
+    others = {name: values - baseline for name, values in scores.items() if name != BASELINE}
+    p_values = {name: _p_value(differences) for name, differences in others.items()}
+    cells, rejects = {BASELINE: f"{100 * baseline.mean():.1f}"}, True
+    for rank, name in enumerate(sorted(others, key=lambda name: p_values[name])):
+        rejects = rejects and p_values[name] * (len(others) - rank) <= 0.05
+        differences = 100 * others[name]
+        half = scipy.stats.t.ppf(0.975, len(differences) - 1) * differences.std(ddof=1) / math.sqrt(len(differences))
+        change = f"{differences.mean():+.1f} ± {half:.1f}"
+        cells[name] = f"{100 * scores[name].mean():.1f} ({f'**{change}**' if rejects else change})"
+    return cells
+
+
+def _p_value(differences: np.ndarray) -> float:
+    """Return the p-value of a mean of differences [S] by all changes of their signs."""
+    signs = 1 - 2 * (np.arange(2 ** len(differences))[:, None] >> np.arange(len(differences)) & 1)
+    means = np.abs(signs @ differences)
+    return float(np.mean(means >= np.abs(differences.sum()) - 1e-9))
