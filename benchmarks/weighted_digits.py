@@ -30,7 +30,7 @@ from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import write_atomically
 
 RATES = (1e-3, 3e-3, 1e-2)
-TUNING_SEEDS, TEST_SEEDS = jnp.arange(15), jnp.arange(100, 115)  # as many, so that one program serves both
+TUNING_SEEDS, TEST_SEEDS = range(15), range(100, 115)  # as many, so that one program serves both
 STEPS, BATCH, WIDTH = 2000, 64, 32
 BASELINE = "sum"
 TARGET = Path(__file__).parent / "results" / "weighted_digits.json"
@@ -159,10 +159,10 @@ def measure(problem: Problem, name: str) -> dict[str, Any]:
     """Tune and test one method; return its rate, its validation accuracy at each rate, and its test accuracies."""
     train = make_training(problem, jw.make_weighting(name))
     rates = [jnp.full(len(TUNING_SEEDS), rate) for rate in RATES]
-    valid = [float(jnp.mean(train(rate, TUNING_SEEDS)["valid"])) for rate in rates]
+    valid = [float(jnp.mean(train(rate, jnp.array(TUNING_SEEDS))["valid"])) for rate in rates]
     best = int(np.argmax(valid))
     started = time.perf_counter()  # it is compiled
-    test = np.asarray(train(rates[best], TEST_SEEDS)["test"])
+    test = np.asarray(train(rates[best], jnp.array(TEST_SEEDS))["test"])
     return {
         "method": name,
         "rate": RATES[best],

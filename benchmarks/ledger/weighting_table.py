@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from benchmarks.weighted_digits import BASELINE
-
 _RECORD = "weighting_parity.json"
+_BASELINE = "sum"
 
 
 def torchjd_table(results: Path) -> str | None:
@@ -82,7 +81,7 @@ def digits_table(results: Path) -> str | None:
     versions = record["versions"]
     lines += [
         "",
-        f"Test accuracy in %, mean of {seeds} seeds, and the difference from `{BASELINE}` with its 95 % interval over seeds. "
+        f"Test accuracy in %, mean of {seeds} seeds, and the difference from `{_BASELINE}` with its 95 % interval over seeds. "
         f"**Bold**: a difference by Holm's correction. {record['revision'][:7]} on {record['device']}, JAX {versions['jax']}.",
     ]
     return "\n".join(lines)
@@ -91,10 +90,10 @@ def digits_table(results: Path) -> str | None:
 def _of_problem(rows: list[dict[str, Any]]) -> dict[str, str]:
     """Return the cells of a problem by method."""
     scores = {row["method"]: np.asarray(row["test"]) for row in rows}
-    baseline = scores[BASELINE]
-    others = {name: values - baseline for name, values in scores.items() if name != BASELINE}
+    baseline = scores[_BASELINE]
+    others = {name: values - baseline for name, values in scores.items() if name != _BASELINE}
     p_values = {name: _p_value(differences) for name, differences in others.items()}
-    cells, rejects = {BASELINE: f"{100 * baseline.mean():.1f}"}, True
+    cells, rejects = {_BASELINE: f"{100 * baseline.mean():.1f}"}, True
     for rank, name in enumerate(sorted(others, key=lambda name: p_values[name])):
         rejects = rejects and p_values[name] * (len(others) - rank) <= 0.05
         differences = 100 * others[name]
