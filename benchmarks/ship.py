@@ -52,7 +52,9 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
         write_atomically(folder / RunFolder(folder).config.name, json.dumps(record, indent=2) + "\n")
         size = (folder / policy_file.FILE_NAME).stat().st_size
         if size > MOST_BYTES:
-            raise RequestError(f"the policy of {run_dir} takes {size / 1e6:.1f} MB: ship one of {MOST_BYTES / 1e6:.0f} MB or less")
+            raise RequestError(
+                f"the policy of {run_dir} takes {size / 1e6:.1f} MB: ship one of {MOST_BYTES / 1e6:.0f} MB or less"
+            )
         halved = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
         remark = (
             f"The episodes are fresh ones, drawn from key {FRESH_KEY} after the training. The weights are shipped in float16 "

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
@@ -21,6 +21,8 @@ class Play:
     folder if not given, or in one of the policy's name here."""
     html: bool = False
     """Show the robot and its goal in three dimensions, on a page with brax's viewer (needs brax; the page needs a network)."""
+    live: bool = False
+    """Show the policy at work on a page of this machine, with a goal to drag (needs the extra live). --out names recordings."""
     aux: bool = False
     """Also show the predictions of auxiliary tasks: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
@@ -38,7 +40,11 @@ def run(options: Play) -> int:
     checkpoint = read_checkpoint(options.checkpoint)
     if options.html and options.aux:
         raise RequestError("--html shows the robot, --aux its images: give one of them")
+    if options.live and (options.html or options.aux):
+        raise RequestError(f"--live is a page of its own: leave out --{'html' if options.html else 'aux'}")
     trust = may_run_code(run_dir, options.trust)
+    if options.live:
+        return _play_live(run_dir, options, checkpoint, trust)
     out = options.out or workplace(run_dir) / ("play.html" if options.html else "play_aux.gif" if options.aux else "play.gif")
     from jaxrl_vis.run.trained import play_auxiliary, restored_run
 
@@ -55,4 +61,17 @@ def run(options: Play) -> int:
             checkpoint=checkpoint,
         )
     print(out)
+    return 0
+
+
+def _play_live(run_dir: Path, options: Play, checkpoint: int | Literal["best"] | None, trust: bool) -> int:
+    """Serve the page of a policy until Ctrl-C."""
+    from jaxrl_vis.report import videos
+    from jaxrl_vis.run.trained import live
+    from jaxrl_vis.run.trained.policy import load_policy
+
+    live.require()
+    out = options.out or workplace(run_dir) / "live.gif"
+    videos.check_output(out)
+    live.play_live(load_policy(run_dir, checkpoint=checkpoint, trust=trust), run_dir.resolve().name, out)
     return 0

@@ -123,6 +123,8 @@ class FetchReach(PulledArm):
                 mj_model.geom(name).rgba = _GREY
         self._fingers = np.array([mj_model.joint(name).qposadr[0] for name in ("right_finger", "left_finger")])
         super().__init__(config, mj_model, "gripper", observer)
+        centre = np.asarray(self._start.site_xpos[self._grip])
+        self.goal_box = (centre - config.goal_range, centre + config.goal_range)
 
     @classmethod
     def select_camera(cls, config: FetchReachConfig) -> str:
