@@ -104,6 +104,7 @@ class Algorithm(NamedTuple):
             update=update,
             policy_params=lambda agent, _: agent,
             aim=self.aim,
+            networks=self.networks,
         )
 
 
