@@ -133,7 +133,8 @@ class Page:
         self._server, self._session, self._out = server, session, out
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._recorded: list[tuple[np.ndarray, bool]] | None = None
-        self._note = ""
+        self._dragged: np.ndarray | None = None
+        self._note, self._is_dragging = "", False
         env, data = session.env, session.state.data
         self._scene = live_scene.LiveScene(server, env.mj_model, *_poses(data), env.camera)
         self._handle = self._add_handle() if env.goal_box is not None else None
@@ -188,20 +189,18 @@ class Page:
         handle = self._server.scene.add_transform_controls(
             "/handle", size, line_width=4.0, disable_rotations=True, depth_test=False, translation_limits=limits
         )
-        dragged: list[np.ndarray] = []  # the last place alone counts: a place takes longer than a movement of the mouse
-
-        def place() -> None:
-            if dragged:
-                point = dragged[-1]
-                dragged.clear()
-                self._session.place_goal(point)
-
-        @handle.on_update
-        def _(_: Any) -> None:
-            dragged.append(np.array(handle.position))
-            self._asked.put(place)
-
+        handle.on_update(lambda _: self.drag(np.array(handle.position)))
         return handle
+
+    def drag(self, point: np.ndarray) -> None:
+        """Ask for a goal at a point [3] (m, world); of several since the last step the latest counts."""
+        self._dragged = point
+        self._asked.put(self._place)
+
+    def _place(self) -> None:
+        if self._dragged is not None:
+            point, self._dragged, self._is_dragging = self._dragged, None, True
+            self._session.place_goal(point)
 
     def _add_button(self, label: str, action: Callable[[], None]) -> None:
         self._server.gui.add_button(label).on_click(lambda _: self._asked.put(action))
@@ -209,10 +208,9 @@ class Page:
     def _show_goal(self) -> None:
         session = self._session
         self._scene.show(*_poses(session.goal_data), is_goal=True)
-        if self._handle is not None:
-            place = np.asarray(session.state.goal_state, float)
-            if np.linalg.norm(place - np.array(self._handle.position)) > session.env.threshold:  # drawn, and not dragged
-                self._handle.position = place
+        if self._handle is not None and not self._is_dragging:
+            self._handle.position = np.asarray(session.state.goal_state, float)
+        self._is_dragging = False
         if self._shows_images:
             self._goal_image.image = self._drawn(session.goal)
 
@@ -295,4 +293,5 @@ def play_live(policy: Policy, title: str, out: Path) -> None:
     except KeyboardInterrupt:
         print()
     finally:
-        server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
