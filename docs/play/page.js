@@ -6,7 +6,7 @@ import { Renderer } from "./renderer.js";
 const DATA = new URL("data/", import.meta.url);
 const GREEN = [62, 207, 142], LIGHT = [244, 245, 247];
 const VIEW = 320; // pixels, of the large view
-const VIEW_AT = [1.12, 0.75, 0.62], DISTANCE = 1.75, AZIMUTH = 0.65, ELEVATION = 0.38; // m, rad
+const VIEW_AT = [1.1, 0.75, 0.56], DISTANCE = 1.8, AZIMUTH = 0.65, ELEVATION = 0.38; // m, rad
 const WHEEL = 0.0004; // m per unit of a mouse's wheel
 const place = document.getElementById("reach");
 
@@ -159,10 +159,6 @@ class Page {
 }
 
 async function main() {
-  if (location.protocol === "file:") {
-    place.textContent = "Browsers run no WebAssembly from a folder. Serve the site from this machine: python -m http.server -d build/site";
-    return;
-  }
   place.textContent = "Loading physics and policy (28 MB) ...";
   try {
     const reach = await load();

@@ -114,3 +114,13 @@ def test_policies_of_the_package_are_small_and_their_cards_true(name: str) -> No
     assert row and float(row[2]) == pytest.approx(success, abs=1e-3) and int(row[3]) >= 256
     assert result["dataset"]["name"] == config.environment.env and f"key {FRESH_KEY}" in text
     assert success >= LEAST_SUCCESS[name]
+    page = Path(__file__).parents[2] / "docs" / "play.md"
+    (described,) = re.findall(rf"^\| `{name}` \|.*$", page.read_text(), re.MULTILINE)
+    low, high = row.string[row.start() : row.end()].split("|")[3].split(" to ")
+    for figure in (
+        f"{row[1]} steps",
+        f"{row[2]} ({low.strip()} to {high.strip()})",
+        f"of {row[3]} fresh",
+        config.environment.env,
+    ):
+        assert figure in described
