@@ -4,6 +4,7 @@ import dataclasses
 import socket
 import sys
 import time
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -92,39 +93,101 @@ def test_tasks_without_poses_are_refused(policy: Policy) -> None:
         live.Session(dataclasses.replace(policy, env=probes.GoWhereTold()))
 
 
+class Handle(types.SimpleNamespace):
+    """What a call of viser adds to the page: its arguments, and what is called when somebody uses it."""
+
+    def on_click(self, call: Any) -> None:
+        self.use = call
+
+    on_update = on_click
+
+
+class Server:
+    """As much of `viser.ViserServer` as a page uses. viser itself is tried where it is installed, below."""
+
+    def __init__(self) -> None:
+        self.added: dict[str, Handle] = {}
+        self.scene = self.gui = self
+        self.initial_camera = Handle()
+
+    def __getattr__(self, name: str) -> Any:
+        if not name.startswith(("add_", "set_", "configure_")):
+            raise AttributeError(name)
+        images = {"add_image": "image", "add_markdown": "content"}
+
+        def add(first: Any = None, *_: Any, **options: Any) -> Handle:
+            handle = Handle(**{"position": (0.0, 0.0, 0.0), **options})
+            if name in images:
+                setattr(handle, images[name], first)
+            self.added[first if isinstance(first, str) else options.get("label", name)] = handle
+            return handle
+
+        return add
+
+
 @pytest.fixture
-def page(session: live.Session, tmp_path: Path) -> Iterator[live.Page]:
-    """The page of the session on a port of its own."""
+def server() -> Server:
+    return Server()
+
+
+@pytest.fixture
+def page(server: Server, session: live.Session, tmp_path: Path) -> live.Page:
+    """The page of the session."""
+    return live.Page(server, session, "ball", tmp_path / "seen.gif")
+
+
+def test_viser_shows_the_page_to_this_machine_alone(session: live.Session, tmp_path: Path) -> None:
     viser = pytest.importorskip("viser")
-    server = viser.ViserServer(host=live.HOST, port=18_059, verbose=False)
-    yield live.Page(server, session, "ball", tmp_path / "seen.gif")
-    server.stop()
+    real = viser.ViserServer(host=live.HOST, port=18_059, verbose=False)
+    try:
+        page = live.Page(real, session, "ball", tmp_path / "seen.gif")
+        page.drag(np.zeros(3))
+        page.advance()
+        with socket.create_connection((live.HOST, real.get_port()), timeout=5):
+            pass
+        assert real.get_host() == "127.0.0.1" and not real.get_clients()
+    finally:
+        real.stop()
 
 
-def test_the_page_is_for_this_machine_alone(page: live.Page) -> None:
-    address = (live.HOST, page._server.get_port())
-    with socket.create_connection(address, timeout=5):
-        pass
-    assert page._server.get_host() == "127.0.0.1"
-
-
-def test_a_dragged_goal_reaches_the_robot_and_the_page(page: live.Page, session: live.Session) -> None:
+def test_buttons_do_what_they_say(server: Server, page: live.Page, session: live.Session) -> None:
     page.advance()
-    before = page._goal_image.image.copy()
+    goal, place = np.asarray(session.state.goal_state), np.asarray(session.state.data.qpos)
+    server.added["New goal"].use(None)
+    page.advance()
+    assert not np.allclose(session.state.goal_state, goal)
+    np.testing.assert_allclose(server.added["/handle"].position, session.state.goal_state)
+    for _ in range(5):
+        page.advance()
+    assert not np.allclose(session.state.data.qpos, place)
+    goal = np.asarray(session.state.goal_state)
+    moved = float(np.linalg.norm(session.state.data.qpos))
+    server.added["Reset the robot"].use(None)
+    page.advance()
+    assert float(np.linalg.norm(session.state.data.qpos)) < moved, "one step from the start, which is at 0"
+    np.testing.assert_array_equal(session.state.goal_state, goal)
+
+
+def test_a_dragged_goal_reaches_the_robot_and_the_page(server: Server, page: live.Page, session: live.Session) -> None:
+    page.advance()
+    seen, handle = server.added["Goal, as the robot sees it"], server.added["/handle"]
+    before = seen.image.copy()
     for place in ((-0.1, 0.2, 0.0), (0.25, 0.25, 0.0)):
-        page.drag(np.array(place))
+        handle.position = place
+        handle.use(None)
     page.advance()
     np.testing.assert_allclose(session.state.goal_state, [0.25, 0.25, 0])
-    assert not np.array_equal(page._goal_image.image, before)
+    assert not np.array_equal(seen.image, before)
     body = session.env.mj_model.body("ball").id
-    np.testing.assert_allclose(page._scene._goal[body].position, [0.25, 0.25, 0.1], atol=1e-6)
-    np.testing.assert_allclose(page._scene._robot[body].position, session.state.data.xpos[body], atol=1e-6)
-    assert "from the goal" in page._status.content
+    np.testing.assert_allclose(server.added[f"/goal/{body}"].position, [0.25, 0.25, 0.1], atol=1e-6)
+    np.testing.assert_allclose(server.added[f"/robot/{body}"].position, session.state.data.xpos[body], atol=1e-6)
+    assert handle.position == (0.25, 0.25, 0.0), "what is dragged stays where the pointer is"
+    assert "cm from the goal" in page._status.content
 
 
-def test_a_recorded_episode_begins_at_the_start_and_is_never_written_over(page: live.Page, tmp_path: Path) -> None:
+def test_a_recorded_episode_is_whole_and_never_written_over(server: Server, page: live.Page, tmp_path: Path) -> None:
     for name in ("seen.gif", "seen-2.gif"):
-        page._begin_recording()
+        server.added["Record an episode"].use(None)
         for _ in range(page._session.env.horizon + 1):
             assert not (tmp_path / name).exists()
             page.advance()
@@ -161,12 +224,12 @@ def test_the_command_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsy
 def test_control_c_ends_it_in_order(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stopped = []
 
-    class Server:
+    class Interrupted:
         def __init__(self, **options: Any) -> None:
             assert options["host"] == "127.0.0.1"
 
         def __getattr__(self, name: str) -> Any:
-            return Server.anything
+            return Interrupted.anything
 
         @staticmethod
         def anything(*_: Any, **__: Any) -> Any:
@@ -175,8 +238,8 @@ def test_control_c_ends_it_in_order(policy: Policy, tmp_path: Path, monkeypatch:
         def stop(self) -> None:
             stopped.append(time.monotonic())
 
-    monkeypatch.setattr(live, "require", lambda: type("viser", (), {"ViserServer": Server}))
+    monkeypatch.setattr(live, "require", lambda: type("viser", (), {"ViserServer": Interrupted}))
     monkeypatch.setattr(live, "Session", lambda policy: None)
-    monkeypatch.setattr(live, "Page", lambda *_: type("Page", (), {"advance": Server.anything}))
+    monkeypatch.setattr(live, "Page", lambda *_: type("Page", (), {"advance": Interrupted.anything}))
     live.play_live(policy, "ball", tmp_path / "x.gif")
     assert len(stopped) == 1
