@@ -24,7 +24,7 @@ from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 
 FRESH_KEY = 59_000_000
 """Seed of the fresh episodes: beyond all seeds of runs, and not that of evaluations."""
-MOST_BYTES = 2_000_000
+MOST_BYTES = 2 * 1024**2
 
 
 def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, episodes: int) -> Score:
@@ -53,7 +53,7 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
         size = (folder / policy_file.FILE_NAME).stat().st_size
         if size > MOST_BYTES:
             raise RequestError(
-                f"the policy of {run_dir} takes {size / 1e6:.1f} MB: ship one of {MOST_BYTES / 1e6:.0f} MB or less"
+                f"the policy of {run_dir} takes {size / 2**20:.1f} MiB: ship one of {MOST_BYTES / 2**20:.0f} MiB or less"
             )
         halved = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
         remark = (

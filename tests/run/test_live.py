@@ -195,6 +195,18 @@ def test_a_recorded_episode_is_whole_and_never_written_over(server: Server, page
             assert video.n_frames == page._session.env.horizon + 1
 
 
+def test_a_task_of_states_has_a_page_without_images(policy: Policy, tmp_path: Path) -> None:
+    env = point_mass.StatePointMass(point_mass.PointMassConfig())
+    algorithm = policy.algorithm._replace(act=lambda *_: jnp.ones((1, 2)), aim=lambda params, goals: goals)
+    session, server = live.Session(dataclasses.replace(policy, env=env, algorithm=algorithm)), Server()
+    page = live.Page(server, session, "ball", tmp_path / "seen.gif")
+    page.advance()
+    assert np.shape(session.observation) == np.shape(session.goal) == (4,)
+    assert {"New goal", "Reset the robot"} <= server.added.keys()
+    assert not {"Record an episode", "/handle", "Now, as the robot sees it"} & server.added.keys()
+    assert np.asarray(session.state.data.qpos).min() > 0
+
+
 def test_every_shape_has_its_size() -> None:
     xml = """<mujoco><asset><mesh name="m" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/></asset><worldbody>
     <geom type="box" size=".1 .2 .3"/><geom type="sphere" size=".1"/><geom type="ellipsoid" size=".1 .2 .3"/>

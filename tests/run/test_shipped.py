@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import safetensors
 import yaml
+from safetensors.numpy import save
 from test_policy import SETTINGS, register
 
 import jaxrl_vis
@@ -61,6 +63,7 @@ def test_what_is_shipped_acts_as_the_run(made: tuple[Path, Path], package: Path)
     assert not np.allclose(halved(image, 255 - image), jaxrl_vis.load_policy(made[0], seed=3)(image, 255 - image), atol=2e-3)
     with safetensors.safe_open(package / "told" / "policy.safetensors", framework="numpy") as file:
         kinds = {file.get_slice(name).get_dtype() for name in file.keys() if name.startswith("actor")}
+        assert "observations/mean" in file.keys() and "goals/mean" not in file.keys(), "equal arrays are written once"
     assert kinds == {"F16"}
 
 
@@ -91,6 +94,21 @@ def test_a_run_folder_of_that_name_goes_first(package: Path, here: Path) -> None
     assert shipped.find("told") == Path("told")
     with pytest.raises(RequestError, match="told/config.json"):
         jaxrl_vis.load_policy("told")
+
+
+@pytest.mark.parametrize(
+    "same", [["goals/mean"], {"goals/mean": 3}, {"goals/mean": "goals/mean"}, {"goals/mean": "observations/count"}, {"a": "b"}]
+)
+def test_a_file_that_names_no_equal_array_is_refused(same: object, package: Path, tmp_path: Path) -> None:
+    for file in ("config.json", "policy.safetensors"):
+        shutil.copy(package / "told" / file, tmp_path)
+    path = tmp_path / "policy.safetensors"
+    with safetensors.safe_open(path, framework="numpy") as file:
+        about, arrays = json.loads(file.metadata()["about"]), {name: file.get_tensor(name) for name in file.keys()}
+    assert about["same"]["goals/mean"] == "observations/mean"
+    path.write_bytes(save(arrays, {"about": json.dumps({**about, "same": same})}))
+    with pytest.raises(RequestError, match="holds no weights"):
+        jaxrl_vis.load_policy(tmp_path)
 
 
 def test_what_is_too_large_is_not_shipped(made: tuple[Path, Path], package: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import is_count
@@ -16,6 +17,7 @@ from jaxrl_vis.types import NormalizerState, TrainState
 
 FILE_NAME = "policy.safetensors"
 _WRITER = "jaxrl-vis push"
+_SAME = "same"  # in the description: arrays that are not in the file -> those that they equal
 
 
 class Source(NamedTuple):
@@ -69,7 +71,12 @@ def write(folder: Path, parameters: PolicyParams, source: Source, bits: Literal[
         is_leaf=lambda part: isinstance(part, NormalizerState),
     )
     exact = [name for name, is_statistic in _named(statistics).items() if is_statistic]
-    write_parameters(folder / FILE_NAME, _named(parameters), source._asdict(), bits, exact)
+    arrays, same = {name: np.asarray(leaf) for name, leaf in _named(parameters).items()}, {}
+    for index, name in enumerate(exact):  # goals mostly have the statistics of observations
+        first = next((other for other in exact[:index] if np.array_equal(arrays[other], arrays[name])), None)
+        same |= {} if first is None else {name: first}
+    written = {name: array for name, array in arrays.items() if name not in same}
+    write_parameters(folder / FILE_NAME, written, {**source._asdict(), _SAME: same}, bits, exact)
 
 
 def read_source(folder: Path) -> Source:
@@ -101,12 +108,21 @@ def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
     shapes = trainer.shapes.train
     wanted = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), shapes.agent)
 
+    same: dict[str, str] = {}
+
     def declare(about: dict[str, Any]) -> tuple[Source, dict[str, Any]]:
-        return _source(folder, about), _named(wanted)
+        named = _named(wanted)
+        found = about.pop(_SAME, {})
+        if not isinstance(found, dict) or not all(isinstance(other, str) for other in found.values()):
+            raise ValueError(_SAME)
+        same.update(found)
+        if any(named[name].shape != named[other].shape or other in same for name, other in same.items()):
+            raise ValueError("an array is not the same as another one")
+        return _source(folder, about), {name: leaf for name, leaf in named.items() if name not in same}
 
     nested, source, _ = read_parameters(folder / FILE_NAME, _WRITER, declare)
     read_leaves = _named(nested)
-    leaves = [read_leaves[name].astype(leaf.dtype)[None] for name, leaf in _named(wanted).items()]
+    leaves = [read_leaves[same.get(name, name)].astype(leaf.dtype)[None] for name, leaf in _named(wanted).items()]
     nothing_seen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return nothing_seen.replace(agent=jax.tree.unflatten(jax.tree.structure(wanted), leaves)), source
 
