@@ -21,7 +21,7 @@ from PIL import Image
 import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.report import live_scene
+from jaxrl_vis.report import live_scene, videos
 from jaxrl_vis.run.storage.checkpoint import LIGHT, Restored
 from jaxrl_vis.run.trained import live
 from jaxrl_vis.run.trained.policy import Policy, make_policy
@@ -84,6 +84,7 @@ def test_goals_are_placed_shown_and_kept_within_their_box(session: live.Session)
     np.testing.assert_array_equal(session.state.data.qpos, place, err_msg="a goal moves no robot")
     session.reset()
     np.testing.assert_allclose(session.state.goal_state, [0.3, -0.1, 0], err_msg="a reset moves no goal")
+    assert session.distance == pytest.approx(np.hypot(0.3, 0.1)), "from the start to that goal"
     session.new_goal()
     assert not np.allclose(session.state.goal_state, [0.3, -0.1, 0])
 
@@ -150,6 +151,17 @@ def test_viser_shows_the_page_to_this_machine_alone(session: live.Session, tmp_p
         real.stop()
 
 
+def test_a_full_disk_is_told_on_the_page(server: Server, page: live.Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(videos, "write_video", full)
+    server.added["Record an episode"].use(None)
+    for _ in range(page._session.env.horizon + 2):
+        page.advance()
+    assert "No space left on device" in page._status.content
+
+
 def test_buttons_do_what_they_say(server: Server, page: live.Page, session: live.Session) -> None:
     page.advance()
     goal, place = np.asarray(session.state.goal_state), np.asarray(session.state.data.qpos)
@@ -185,12 +197,20 @@ def test_a_dragged_goal_reaches_the_robot_and_the_page(server: Server, page: liv
     assert "cm from the goal" in page._status.content
 
 
-def test_a_recorded_episode_is_whole_and_never_written_over(server: Server, page: live.Page, tmp_path: Path) -> None:
+def test_a_recorded_episode_is_whole_and_never_written_over(
+    server: Server, page: live.Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written, write_video = [], videos.write_video
+    monkeypatch.setattr(videos, "write_video", lambda shown, *rest: (written.append(shown), write_video(shown, *rest)))
     for name in ("seen.gif", "seen-2.gif"):
         server.added["Record an episode"].use(None)
+        seen = []
         for _ in range(page._session.env.horizon + 1):
             assert not (tmp_path / name).exists()
             page.advance()
+            seen.append(np.asarray(page._session.observation))
+        np.testing.assert_array_equal(written[-1].frames[0, 1:], seen[:-1], err_msg="the first is that of the start")
+        assert written[-1].success.shape == (1, page._session.env.horizon + 1)
         with Image.open(tmp_path / name) as video:
             assert video.n_frames == page._session.env.horizon + 1
 

@@ -21,6 +21,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
 from jaxrl_vis.report import live_scene, videos
 from jaxrl_vis.run.trained.policy import Policy
+from jaxrl_vis_envs import goals
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
 
 HOST, PORT = "127.0.0.1", 8080  # of this machine alone; the next free port if it is taken
@@ -84,7 +85,7 @@ class Session:
     @property
     def distance(self) -> float:
         """Distance to the goal, in the task's unit."""
-        return float(self.state.metrics["goal_distance"])
+        return float(goals.goal_distance(self.state.achieved_state, self.state.goal_state))
 
     def reset(self) -> None:
         """Put the robot at a start; the goal stays."""
@@ -177,8 +178,8 @@ class Page:
                 self._asked.get_nowait()()
         if self._session.goal is not goal:
             self._show_goal()
-        self._session.step()
         self._record()
+        self._session.step()
         self._show()
 
     def _add_handle(self) -> Any:
@@ -250,7 +251,11 @@ class Page:
             np.stack(frames)[None, :, :channels], np.asarray(session.goal)[None, :channels], np.array([success])
         )
         path = _unused(self._out)
-        videos.write_video(shown, path, max(0.04, session.env.control_period))
+        try:
+            videos.write_video(shown, path, max(0.04, session.env.control_period))
+        except OSError as error:  # the page goes on
+            self._note = f"Cannot write `{path}`: {error.strerror or error}"
+            return
         self._note = f"Recorded: `{path}`"
         print(path, flush=True)
 
