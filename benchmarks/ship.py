@@ -2,7 +2,8 @@
 
 The folder jaxrl_vis/pretrained/NAME receives the run's config.json, the weights in float16 (statistics of observations in
 float32), and a card. The card's score is that of the shipped file, over fresh episodes: none of them was seen in the training
-or its evaluations. The score of the float32 weights over the same episodes stands beside it.
+or its evaluations. The score of the float32 weights over the same episodes stands beside it. The table in docs/play.md wants a
+row for each policy, which a test compares with its card.
 """
 
 import argparse
