@@ -24,7 +24,7 @@ BIN := .venv/bin
 STAMPS := .venv/stamps
 ACCELERATOR := $(shell nvidia-smi -L >/dev/null 2>&1 && echo gpu || echo base)
 
-.PHONY: help train test fuzz docs lint format bench-cpu tables stale verify-release pins clean
+.PHONY: help train test fuzz docs page page-check lint format bench-cpu tables stale verify-release pins clean
 .DEFAULT_GOAL := help
 
 help: ## Show this list
@@ -44,6 +44,12 @@ fuzz: $(STAMPS)/dev ## Try EXAMPLES=2000 spoilt files of each kind on their read
 docs: $(STAMPS)/docs ## Build the documentation's site into build/site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 	@echo "open build/site/index.html"
+
+page: $(STAMPS)/dev ## What the site's page that plays needs, into build/play/; needs npm. Then make docs
+	@JAX_PLATFORMS=cpu $(BIN)/python docs/tools/browser_page.py
+
+page-check: page docs ## Compare that page with renderer, policy and physics, in headless Chromium
+	@$(BIN)/python docs/tools/browser_check.py
 
 lint: $(STAMPS)/dev ## Check style, format and types
 	@$(BIN)/ruff check .

@@ -36,6 +36,7 @@ SMOKE = (
     ("jaxrl-vis dataset runs/smoke --format npz --out episodes.npz --episodes 2", "2 episodes of 50 steps"),
     ("jaxrl-vis push runs/smoke --to policy", "policy"),
     ("python -c \"import jaxrl_vis; print(jaxrl_vis.load_policy('policy').env_name)\"", "VisualReacher"),
+    ("jaxrl-vis play fetch --episodes 1", "fetch/play.gif"),
     ("python -c 'import jaxrl_vis.weighting as w; print(w.__name__)'", "jaxrl_vis.weighting"),
 )
 """Commands of the smoke test, and what each must show."""

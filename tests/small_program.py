@@ -31,8 +31,10 @@ def _program_of(config: Config) -> train_step.TrainStep:
     return dataclasses.replace(program, learn=jaxrl_vis_envs.jit(learn, **JIT_OPTIONS["learn"]))
 
 
-def make_train_step(env: GoalEnv, config: Config) -> train_step.TrainStep:
+def make_train_step(env: GoalEnv, config: Config, policy_alone: bool = False) -> train_step.TrainStep:
     """To take the place of `train_step.make_train_step`: the functions that an equal configuration has got before."""
+    if policy_alone:
+        return train_step.make_train_step(env, config, policy_alone=True)
     return dataclasses.replace(_program_of(_trained_alike(config)), config=config)
 
 

@@ -6,12 +6,15 @@ the path takes the place of the link.
 Columns of tables get no narrower than their text can be read in: `site.css` looks for the class ``long``. Long names in code
 may be broken at their dots and underscores. On a phone, rows of wide tables are shown as cards.
 
+The page that plays has its libraries and its policy from `browser_page.py`, if that was run before.
+
 Search runs in a worker, which browsers refuse to start from a file: a page without a server starts one from the worker's text.
 """
 
 import html
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -109,3 +112,6 @@ def on_post_build(config: Any, **_: Any) -> None:
     assets = Path(config.site_dir) / "assets"
     (worker,) = (assets / "javascripts" / "workers").glob("search.*.min.js")
     (assets / "local-iframe-worker.js").write_text(_WORKER % json.dumps(worker.read_text(encoding="utf-8")), encoding="utf-8")
+    built = Path(config.config_file_path).parent / "build" / "play"  # by browser_page.py, if it was run
+    if built.exists():
+        shutil.copytree(built, Path(config.site_dir) / "play" / "data", dirs_exist_ok=True)

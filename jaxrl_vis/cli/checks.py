@@ -11,6 +11,7 @@ from jaxrl_vis.host.files import check_path
 from jaxrl_vis.run import trust as trusting
 from jaxrl_vis.run.signals import shielded_children
 from jaxrl_vis.run.storage.folder import read_config
+from jaxrl_vis.run.trained import shipped
 
 
 def check_env(name: str, folder: str | None = None) -> None:
@@ -60,14 +61,24 @@ def _is_at_terminal() -> bool:
     return all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stderr))
 
 
-def check_run(folder: Path) -> None:
-    """Raise a `RequestError` unless ``folder`` is a run folder."""
-    check_path(folder / "config.json")
+def check_run(run: Path) -> Path:
+    """Return the folder of a run, or of a policy that comes with the package.
+
+    Args:
+        run: The folder, or the policy's name.
+
+    Raises:
+        RequestError: It is neither.
+    """
+    check_path(run / "config.json")
+    shipped.check(run)
+    folder = shipped.find(run)
     if not (folder / "config.json").exists():
         above = next((parent for parent in folder.parents if (parent / "config.json").exists()), None)
         if folder.exists() and above is not None:
             raise RequestError(f"{folder} lies in a run folder: name that, {above}")
         raise RequestError(f"{folder} is not a run folder (it holds no config.json); {PROGRAM} train makes one")
+    return folder
 
 
 def read_checkpoint(word: str | None) -> int | Literal["best"] | None:

@@ -36,13 +36,13 @@ def run(options: Dataset) -> int:
     if convert.holds_recordings(options.source):
         recordings = convert.read(options.source).first(options.episodes)
     else:
-        check_run(options.source)
+        run_dir = check_run(options.source)
         if not 0 <= options.seed < 2**32:
             raise RequestError(f"--seed must be from 0 to {2**32 - 1}, not {options.seed}")
-        trust = may_run_code(options.source, options.trust)
+        trust = may_run_code(run_dir, options.trust)
         from jaxrl_vis.run.trained.record import record_run
 
-        recordings = record_run(options.source, options.episodes or 50, options.seed, trust)
+        recordings = record_run(run_dir, options.episodes or 50, options.seed, trust)
     written = convert.write(recordings, options.out, options.format)
     reached = "" if recordings.success is None else f", {recordings.success.mean():.0%} reached their goals"
     print(f"{written}: {recordings.count} episodes of {recordings.horizon} steps{reached}")

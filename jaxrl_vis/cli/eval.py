@@ -16,7 +16,7 @@ class Eval:
     """Measure a trained run: success and distance at the last step, without exploration."""
 
     run_dir: Annotated[Path, AlsoPositional()]
-    """The run folder."""
+    """The run folder, or the name of a policy that comes with the package, such as fetch."""
     episodes: int | None = None
     """Number of episodes; that of the run if not given."""
     json: Path | None = None
@@ -29,15 +29,15 @@ class Eval:
 
 def run(options: Eval) -> int:
     """Evaluate a run and print the results."""
-    check_run(options.run_dir)
-    trust = may_run_code(options.run_dir, options.trust)
+    run_dir = check_run(options.run_dir)
+    trust = may_run_code(run_dir, options.trust)
     check_counts(episodes=options.episodes)
     checkpoint = read_checkpoint(options.checkpoint)
     if options.json is not None:
         check_writable(options.json, "--json")
     from jaxrl_vis.run.trained.restored_run import evaluate_run
 
-    figures = evaluate_run(options.run_dir, episodes=options.episodes, keep_programs=True, trust=trust, checkpoint=checkpoint)
+    figures = evaluate_run(run_dir, episodes=options.episodes, keep_programs=True, trust=trust, checkpoint=checkpoint)
     for name, per_seed in figures.items():
         print(f"{name:28}" + "".join(f" {value:9.4f}" for value in per_seed))
     if options.json is not None:

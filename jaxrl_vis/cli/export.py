@@ -21,11 +21,12 @@ class Export:
     """
 
     run_dir: Annotated[Path | None, AlsoPositional()] = None
-    """The run folder."""
+    """The run folder, or the name of a policy that comes with the package, such as fetch."""
     format: Literal["onnx", "stablehlo", "safetensors"] = "onnx"
     """Format: ONNX (needs the extra ``export``), StableHLO for JAX without this project, or weights by name."""
     out: Path | None = None
-    """Folder for the policy, contract.json and golden.npz; export/FORMAT in the run folder if not given."""
+    """Folder for the policy, contract.json and golden.npz; export/FORMAT in the run folder if not given, or in one of
+    the policy's name here."""
     seed: int | None = None
     """Seed, of a run with several; the first if not given."""
     overwrite: bool = False
@@ -49,16 +50,16 @@ def run(options: Export) -> int:
         return _report(check_file(options.check))
     if options.run_dir is None:
         raise RequestError("no run given: name its folder, or an exported file with --check")
-    check_run(options.run_dir)
+    run_dir = check_run(options.run_dir)
     if options.out is not None:
         check_path(options.out)
     checkpoint = read_checkpoint(options.checkpoint)
-    trust = may_run_code(options.run_dir, options.trust)
+    trust = may_run_code(run_dir, options.trust)
     from jaxrl_vis.run.exported.export import export_run
 
     return _report(
         export_run(
-            options.run_dir,
+            run_dir,
             options.format,
             options.out,
             seed=options.seed,

@@ -2,11 +2,12 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
 from jaxrl_vis.errors import RequestError
+from jaxrl_vis.run.trained.shipped import workplace
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,12 +15,14 @@ class Play:
     """Make a video of a trained run: each observation beside the goal."""
 
     run_dir: Annotated[Path, AlsoPositional()]
-    """The run folder."""
+    """The run folder, or the name of a policy that comes with the package, such as fetch."""
     out: Path | None = None
     """A .gif, .mp4 or .html file, or a .png of some steps; play.gif (play.html with --html, play_aux.gif with --aux) in the run
-    folder if not given."""
+    folder if not given, or in one of the policy's name here."""
     html: bool = False
     """Show the robot and its goal in three dimensions, on a page with brax's viewer (needs brax; the page needs a network)."""
+    live: bool = False
+    """Show the policy at work on a page of this machine, with a goal to drag (needs the extra live). --out names recordings."""
     aux: bool = False
     """Also show the predictions of auxiliary tasks: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
@@ -32,20 +35,24 @@ class Play:
 
 def run(options: Play) -> int:
     """Draw a run's episodes."""
-    check_run(options.run_dir)
+    run_dir = check_run(options.run_dir)
     check_counts(episodes=options.episodes)
     checkpoint = read_checkpoint(options.checkpoint)
     if options.html and options.aux:
         raise RequestError("--html shows the robot, --aux its images: give one of them")
-    trust = may_run_code(options.run_dir, options.trust)
-    out = options.out or options.run_dir / ("play.html" if options.html else "play_aux.gif" if options.aux else "play.gif")
+    if options.live and (options.html or options.aux):
+        raise RequestError(f"--live is a page of its own: leave out --{'html' if options.html else 'aux'}")
+    trust = may_run_code(run_dir, options.trust)
+    if options.live:
+        return _play_live(run_dir, options, checkpoint, trust)
+    out = options.out or workplace(run_dir) / ("play.html" if options.html else "play_aux.gif" if options.aux else "play.gif")
     from jaxrl_vis.run.trained import play_auxiliary, restored_run
 
     if options.aux:
-        play_auxiliary.play_auxiliary(options.run_dir, out, episodes=options.episodes, trust=trust, checkpoint=checkpoint)
+        play_auxiliary.play_auxiliary(run_dir, out, episodes=options.episodes, trust=trust, checkpoint=checkpoint)
     else:
         restored_run.play_run(
-            options.run_dir,
+            run_dir,
             out,
             episodes=options.episodes,
             three_dimensional=options.html,
@@ -54,4 +61,17 @@ def run(options: Play) -> int:
             checkpoint=checkpoint,
         )
     print(out)
+    return 0
+
+
+def _play_live(run_dir: Path, options: Play, checkpoint: int | Literal["best"] | None, trust: bool) -> int:
+    """Serve the page of a policy until Ctrl-C."""
+    from jaxrl_vis.report import videos
+    from jaxrl_vis.run.trained import live
+    from jaxrl_vis.run.trained.policy import load_policy
+
+    live.require()
+    out = options.out or workplace(run_dir) / "live.gif"
+    videos.check_output(out)
+    live.play_live(load_policy(run_dir, checkpoint=checkpoint, trust=trust), run_dir.resolve().name, out)
     return 0

@@ -24,10 +24,10 @@ class Push:
 
 def run(options: Push) -> int:
     """Push a policy."""
-    check_run(options.run_dir)
-    trust = may_run_code(options.run_dir, options.trust)
+    run_dir = check_run(options.run_dir)
+    trust = may_run_code(run_dir, options.trust)
     from jaxrl_vis.run.pushed.push import check_target, push
 
     check_target(options.to)
-    print(push(options.run_dir, options.to, options.seed, trust))
+    print(push(run_dir, options.to, options.seed, trust))
     return 0

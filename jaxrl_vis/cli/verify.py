@@ -28,12 +28,12 @@ class Verify:
 
 def run(options: Verify) -> int:
     """Verify a run, and print the results."""
-    check_run(options.run_dir)
-    trust = may_run_code(options.run_dir, options.trust)
+    run_dir = check_run(options.run_dir)
+    trust = may_run_code(run_dir, options.trust)
     check_counts(iterations=options.iterations)
     from jaxrl_vis.run.verifying.verification import verify_run
 
-    report = verify_run(options.run_dir, options.iterations, keep_programs=True, say=print, trust=trust)
+    report = verify_run(run_dir, options.iterations, keep_programs=True, say=print, trust=trust)
     for title, lines in (("not verified", report.unverified), ("note", report.notes), ("elsewhere", report.elsewhere)):
         for line in lines:
             print(f"{title}: {line}")

@@ -4,7 +4,7 @@ import json
 import math
 import reprlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -31,7 +31,13 @@ _LONGEST_HEADER = 1 << 20  # bytes; those of our networks have some 15,000
 Settings = TypeVar("Settings")
 
 
-def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16) -> None:
+def write_parameters(
+    path: Path,
+    params: Mapping[str, Any],
+    about: Mapping[str, Any],
+    bits: Literal[10, 16, 32] = 16,
+    exact: Collection[str] = (),
+) -> None:
     """Write parameters to a file, which is complete whenever it can be read.
 
     Args:
@@ -40,6 +46,7 @@ def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, 
         about: What they are and where they come from; anything that JSON holds.
         bits: Bits of a number. With 10, arrays of two axes or more and 4,096 numbers or more become integers from -511 to 511
             and a factor for each index of the last axis, and the others keep 16.
+        exact: Names of arrays that keep 32 bits.
 
     Raises:
         OSError: The file cannot be written.
@@ -50,7 +57,7 @@ def write_parameters(path: Path, params: Mapping[str, Any], about: Mapping[str, 
         if bits == 10 and array.ndim > 1 and array.size >= _FEWEST_QUANTISED:
             arrays |= _quantised(name, array)
         else:
-            arrays[name] = array.astype(np.float32 if bits == 32 else np.float16)
+            arrays[name] = array.astype(np.float32 if bits == 32 or name in exact else np.float16)
     _write(path, arrays, about)
 
 
@@ -103,11 +110,8 @@ def read_parameters(
                 f"{path} was written by an earlier version: convert it with `python -m jaxrl_vis.host.weights_file {path} "
                 f"{path.with_suffix(SUFFIX)}`, and pass the result"
             )
-        _check_header(path)
+        about = read_about(path, command)
         with safetensors.safe_open(path, framework="numpy") as file:
-            about = parse_json((file.metadata() or {})[_ABOUT])
-            if not isinstance(about, dict):
-                raise ValueError(f"{_ABOUT} is no table")
             settings, shapes = declare(about)
             names = set(file.keys())
             wanted = {name: tuple(leaf.shape) for name, leaf in _named(shapes).items()}
@@ -143,6 +147,29 @@ def read_parameters(
             place = place.setdefault(folder, {})
         place[last] = array.astype(np.float32)
     return jax.device_put(params), settings, about
+
+
+def read_about(path: Path, command: str) -> dict[str, Any]:
+    """Read the description in a file of `write_parameters`.
+
+    Args:
+        path: The file.
+        command: Command that creates such files, for messages.
+
+    Raises:
+        RequestError: The file is missing, or has none.
+    """
+    try:
+        _check_header(path)
+        with safetensors.safe_open(path, framework="numpy") as file:
+            about = parse_json((file.metadata() or {})[_ABOUT])
+        if not isinstance(about, dict):
+            raise ValueError(f"{_ABOUT} is no table")
+        return about
+    except OSError as error:
+        raise RequestError(f"cannot read the weights {path}: {error.strerror or error}") from error
+    except (ValueError, KeyError, safetensors.SafetensorError) as error:
+        raise RequestError(f"{path} holds no weights: name a file that `{command}` wrote") from error
 
 
 def _check_header(path: Path) -> None:

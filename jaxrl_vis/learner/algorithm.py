@@ -88,6 +88,25 @@ class Algorithm(NamedTuple):
     diagnose: Callable[[Agent, Statistics, jax.Array], Metrics] = lambda agent, statistics, goals: {}
     networks: Any = None
 
+    def of_policies(self, statistics: Statistics) -> "Algorithm":
+        """Return the same algorithm for agents that are policy parameters alone: they act, and cannot learn.
+
+        Args:
+            statistics: Those of a learner that has seen nothing.
+        """
+
+        def update(*_: Any) -> tuple[Agent, Metrics]:
+            raise NotImplementedError("a policy alone does not learn")
+
+        return Algorithm(
+            init=lambda key: self.policy_params(self.init(key), statistics),
+            act=self.act,
+            update=update,
+            policy_params=lambda agent, _: agent,
+            aim=self.aim,
+            networks=self.networks,
+        )
+
 
 def scan_batches(step: Callable[[Agent, Statistics, Batch, jax.Array], tuple[Agent, Metrics]]) -> Update:
     """Build `Algorithm.update` from a single gradient step.

@@ -37,7 +37,7 @@ from jaxrl_vis.learner.networks import normalizer
 from jaxrl_vis.learner.networks.networks import Networks, compute_dtype
 from jaxrl_vis.learner.parallel.sharding import Layout, make_layout
 from jaxrl_vis.learner.resolved import Resolved, resolve
-from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
+from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, Statistics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_default_device
 
@@ -179,13 +179,14 @@ class TrainStep:
         )
 
 
-def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) -> TrainStep:
+def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, policy_alone: bool = False) -> TrainStep:
     """Build the programs of a run. Nothing is compiled or allocated yet.
 
     Args:
         env: The environment.
         config: The run; what belongs to the environment is taken from ``env``.
         layout: Placement on devices; None: as ``config`` says.
+        policy_alone: Agents are policy parameters (`Algorithm.of_policies`), for what plays and does not train.
 
     Raises:
         RequestError: The configuration is contradictory.
@@ -197,6 +198,10 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     setup = Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards)
     maker = find("algorithm", config.run.algorithm, ALGORITHMS, config.environment.env_folder)
     algorithm = call("algorithm", config.run.algorithm, maker, setup, of=Algorithm)
+    statistics = normalizer.init(env.observation_spec)
+    unseen = Statistics(statistics, statistics if config.study.normalizers == "separate" else None)
+    if policy_alone:
+        algorithm = algorithm.of_policies(unseen)
     acting = Acting(env, algorithm, config.environment.observation_noise)
     stacked = env.frame_stack if len(env.observation_spec.shape) == 3 else 1
     replay = make_replay(config.run.replay_transitions, config.run.num_envs, env.horizon, stacked, config.study.replay_mean_age)
@@ -210,9 +215,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None) 
     num_played = part_size(config.run.num_envs) if plays_any else config.run.num_envs // shards.count
 
     def init_learner(key: jax.Array) -> TrainState:
-        statistics = normalizer.init(env.observation_spec)
-        of_goals = normalizer.init(env.observation_spec) if config.study.normalizers == "separate" else None
-        return TrainState(algorithm.init(key), statistics, of_goals)
+        return TrainState(algorithm.init(key), *unseen)
 
     def init(keys: jax.Array) -> LoopState:
         # Of all seeds at once. Those of one seed, repeated under `vmap`, would lie in memory beside them.

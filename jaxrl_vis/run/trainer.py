@@ -176,6 +176,7 @@ def make_trainer(
     overwrite: bool = False,
     log: Sequence[str] | None = None,
     keep_programs: bool = False,
+    policy_alone: bool = False,
 ) -> Trainer:
     """Build the environment and the programs of a configuration. Nothing is compiled, allocated or written.
 
@@ -187,6 +188,7 @@ def make_trainer(
         log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
         keep_programs: Trace nothing that an earlier process has traced. For processes that have replaced nothing in this
             package's modules, which would not be seen (`jaxrl_vis.run.compiled.trace_cache`).
+        policy_alone: The learner is a policy, which plays and cannot be trained (`Algorithm.of_policies`).
 
     Raises:
         RequestError: The configuration is contradictory, or differs from the saved run.
@@ -204,5 +206,5 @@ def make_trainer(
                 locate_env(config)  # imports MuJoCo, meanwhile
             check_devices()
         config = locate_env(config)
-        program = make_train_step(make_env(config), config)
+        program = make_train_step(make_env(config), config, policy_alone=policy_alone)
     return Trainer(config, program, run_dir, resume, overwrite, log, keep_programs)

@@ -19,6 +19,7 @@ from jaxrl_vis.recordings import convert
 from jaxrl_vis.run.pushed.card import score
 from jaxrl_vis.run.pushed.push import check_target, push
 from jaxrl_vis.run.trained.record import record_run
+from jaxrl_vis.run.trained.restored_run import evaluate_run
 
 
 @pytest.fixture(autouse=True)
@@ -120,8 +121,20 @@ def test_targets_are_checked_before_the_work(pushed: Path, tmp_path: Path, monke
 
 
 def test_commands_that_need_the_whole_run_say_so(pushed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval", str(pushed)]) == 2
-    assert "holds a policy alone, for jaxrl_vis.load_policy" in capsys.readouterr().err
+    for words in (["verify", str(pushed)], ["play", str(pushed), "--aux"]):
+        assert cli.main(words) == 2
+        assert "holds a policy alone, and" in capsys.readouterr().err
+
+
+def test_a_pushed_policy_is_evaluated_and_recorded_as_the_run_is(run: Path, pushed: Path) -> None:
+    of_run, of_policy = evaluate_run(run), evaluate_run(pushed)
+    assert {name: values[1:] for name, values in of_run.items()} == of_policy
+    assert all(len(values) == 2 for values in of_run.values())
+    with pytest.raises(RequestError, match="the policy of seed 4 after iteration 3 alone"):
+        evaluate_run(pushed, checkpoint=2)
+    recorded = record_run(pushed, episodes=3, seed=7)
+    assert recorded.about["run_seed"] == 4
+    np.testing.assert_array_equal(recorded.goals, record_run(run, episodes=3, seed=7).goals)
 
 
 def test_weights_of_another_network_are_refused(pushed: Path, tmp_path: Path) -> None:

@@ -219,7 +219,8 @@ def test_metrics_file_survives_a_torn_line(tmp_path):
 def test_evaluate_and_play_a_run(straight, tmp_path, monkeypatch):
     path, _, reports = straight
 
-    def fake_make_trainer(config, *arguments, **options):
+    def fake_make_trainer(config, *arguments, policy_alone, **options):
+        assert not policy_alone
         return trainer.Trainer(config, FakeProgram(config), *arguments, **options)
 
     monkeypatch.setattr(restored_run, "make_trainer", fake_make_trainer)

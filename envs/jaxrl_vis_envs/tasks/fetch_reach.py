@@ -15,6 +15,7 @@ State: grip position in the world, m. Action: displacement of the gripper along 
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Literal, get_args
 
@@ -128,6 +129,11 @@ class FetchReach(PulledArm):
     def select_camera(cls, config: FetchReachConfig) -> str:
         is_theirs = isinstance(config, VisualFetchReachConfig) and config.view == "contrastive_rl"
         return _THEIR_CAMERA if is_theirs else cls.camera
+
+    @functools.cached_property
+    def goal_box(self) -> tuple[np.ndarray, np.ndarray]:
+        centre = np.asarray(self._start.site_xpos[self._grip])
+        return centre - self.config.goal_range, centre + self.config.goal_range
 
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
         """Pull the stretched arm to the setup point, as Gym does once at construction.

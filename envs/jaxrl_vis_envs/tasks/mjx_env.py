@@ -13,6 +13,7 @@ from typing import Any, Self
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from jaxrl_vis_envs import randomization
 from jaxrl_vis_envs.base import GoalEnv, State, push_history, sanitize_action, start_history
@@ -28,6 +29,9 @@ class MjxGoalEnv(GoalEnv):
     """`GoalEnv` whose `State.data` is an `mjx.Data` with poses consistent with its ``qpos``."""
 
     camera: str  # model camera of the visual task, unless `select_camera` is overridden
+    goal_box: tuple[np.ndarray, np.ndarray] | None = (
+        None  # corners [3] of the goals of `goal_configuration`, m; None: it has none
+    )
     exact_contacts: bool = False  # whether physics steps are those of `mjx_model.step` with ``exact``
 
     def __init__(self, config: Any, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None) -> None:
@@ -92,6 +96,14 @@ class MjxGoalEnv(GoalEnv):
     def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
         """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``; by default, what that achieves."""
         return self.achieved(goal_data)
+
+    def goal_configuration(self, goal: jax.Array) -> mjx.Data:
+        """Return the robot at rest at a goal within `goal_box`, [3] float32 (m, world), with its poses.
+
+        Raises:
+            NotImplementedError: Goals of this task are no points in space.
+        """
+        raise NotImplementedError(f"goals of {type(self).__name__} are no points in space")
 
     @abc.abstractmethod
     def observe_state(self, data: mjx.Data) -> jax.Array:

@@ -82,6 +82,8 @@ class SawyerReach(PulledArm):
             observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         super().__init__(config, mjx_model.load_model("sawyer_reach.xml"), "hand", observer)
+        centre, half = np.array(config.goal_centre), np.array(config.goal_size) / 2
+        self.goal_box = (centre - half, centre + half)
 
     def _settled(self, mj_model: mujoco.MjModel, config: SawyerReachConfig) -> mujoco.MjData:
         """Pull the arm from its ready pose until its grip is at the centre of the goals, and stop it there."""

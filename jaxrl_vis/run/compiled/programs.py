@@ -172,7 +172,7 @@ class Programs:
     def _open_traces(self) -> TraceCache | None:
         """Open the cache of programs traced for this configuration; None if nothing is to be cached."""
         cache = enable_compilation_cache() if self._caches else ""
-        identity = fingerprint(self.config, self.env) if cache and self._may_keep else None
+        identity = fingerprint(self.config, self.env, self.shapes.train) if cache and self._may_keep else None
         if identity is None:
             return None
         return TraceCache(Path(cache) / "programs", identity, self.shapes, JIT_OPTIONS)

@@ -53,8 +53,14 @@ _SIGNATURES = (Episodes(0, 0, 0), Exploration(), Learned(0, {}), Evaluation({}, 
 _WITHOUT_EFFECT = ("cache", "log", "dump", "dir", "timeout", "traceback")
 
 
-def fingerprint(config: Config, env: GoalEnv) -> str | None:
-    """Compute a hexadecimal digest of everything that a run's programs depend on; None if they are not to be cached."""
+def fingerprint(config: Config, env: GoalEnv, learner: Any = None) -> str | None:
+    """Compute a hexadecimal digest of everything that a run's programs depend on; None if they are not to be cached.
+
+    Args:
+        config: The run.
+        env: Its environment.
+        learner: Tree of the learner, which may be a policy alone; only its structure counts.
+    """
     is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not own_names(config)
     if not is_ours or os.environ.get(VARIABLE) == "0":
         return None
@@ -63,7 +69,7 @@ def fingerprint(config: Config, env: GoalEnv) -> str | None:
         target = [target_platform(), use_gpu_kernels()]
     # The seed is an argument, in the form of keys.
     compiled_in = {name: value for name, value in config.flat().items() if name not in (*marked(HOST), "seed")}
-    depends_on = [compiled_in, versions(), device_record(), target, settings, _code()]
+    depends_on = [compiled_in, str(jax.tree.structure(learner)), versions(), device_record(), target, settings, _code()]
     return hashlib.sha256(json.dumps(depends_on, sort_keys=True, default=repr).encode()).hexdigest()
 
 

@@ -18,6 +18,7 @@ from jaxrl_vis.run.exported.layers import COMPUTATION, INPUTS, Layers, forward, 
 from jaxrl_vis.run.storage.folder import EXPORT_FOLDER
 from jaxrl_vis.run.trained.policy import Policy, choose_seed, make_policy
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
+from jaxrl_vis.run.trained.shipped import find, workplace
 
 _EPISODES = 8
 
@@ -55,7 +56,7 @@ def export_run(
     The folder receives the policy, contract.json and golden.npz. The policy is that of `load_policy`, in float32.
 
     Args:
-        run_dir: The run folder.
+        run_dir: The run folder, or the name of a policy that comes with the package.
         kind: ``onnx``, ``stablehlo`` or ``safetensors``.
         out: The folder; None: export/KIND in the run folder.
         seed, checkpoint, trust: As of `load_policy`.
@@ -70,8 +71,8 @@ def export_run(
         raise RequestError(f"--format {kind} is unknown: choose one of {', '.join(FORMATS)}")
     if kind == "onnx":
         onnx_file.require()
-    run_dir = Path(run_dir)
-    folder = run_dir / EXPORT_FOLDER / kind if out is None else Path(out)
+    run_dir = find(run_dir)
+    folder = workplace(run_dir) / EXPORT_FOLDER / kind if out is None else Path(out)
     _check_folder(folder, overwrite)
     # Of networks that compute in bfloat16 or TF32, no other library would repeat the roundings.
     trainer = open_run(run_dir, True, trust, eval_episodes=num_recorded(_EPISODES), compute_dtype="float32")

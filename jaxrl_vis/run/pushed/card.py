@@ -38,7 +38,14 @@ def score(row: Mapping[str, Any], episodes: int) -> Score:
 
 
 def card(
-    config: Config, record: Mapping[str, Any], seed: int, scores: Mapping[int, Score], unit: str, pictures: Mapping[str, str]
+    config: Config,
+    record: Mapping[str, Any],
+    seed: int,
+    scores: Mapping[int, Score],
+    unit: str,
+    pictures: Mapping[str, str] | None = None,
+    name_here: str | None = None,
+    remark: str = "",
 ) -> str:
     """Write the card.
 
@@ -49,11 +56,13 @@ def card(
         scores: By seed; empty if none was evaluated where the weights were saved.
         unit: Unit of distances.
         pictures: File by caption.
+        name_here: Name under which the package has the policy; None: it is in a folder by itself, with metrics.jsonl.
+        remark: Further sentence about the scores.
     """
     task, name = config.environment.env, f"{config.environment.env}, {config.reward.method}, {config.run.algorithm}"
     lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in _front(task, name, scores.get(seed)).items()), "---", ""]
     lines += [f"# {name}", "", f"A policy that reaches goals of the task {task}, trained by jaxrl-vis.", ""]
-    lines += [f"![{caption}]({file})\n" for caption, file in pictures.items()]
+    lines += [f"![{caption}]({file})\n" for caption, file in (pictures or {}).items()]
     lines += ["| seed | environment steps | success | 95 % interval | episodes | mean distance |", "|---|---|---|---|---|---|"]
     for number, each in scores.items():
         here = " (these weights)" if number == seed else ""
@@ -67,14 +76,14 @@ def card(
     device = (record.get("device") or {}).get("name", "unknown")
     lines += [
         "",
-        "Success is measured at the last step of an episode, without exploration; the interval is Wilson's.",
+        f"Success is measured at the last step of an episode, without exploration; the interval is Wilson's. {remark}".rstrip(),
         "",
         "## Use",
         "",
         "```python",
         "import jaxrl_vis",
         "",
-        'policy = jaxrl_vis.load_policy("FOLDER")  # this folder; observation, goal -> action in [-1, 1]',
+        f'policy = jaxrl_vis.load_policy("{name_here or "FOLDER"}")  # observation, goal -> action in [-1, 1]',
         "```",
         "",
         "## Training",
@@ -85,7 +94,8 @@ def card(
         "",
         f"Revision {record.get('git_revision') or 'unknown'}; "
         + ", ".join(f"{package} {versions[package]}" for package in ("python", "jax", "mujoco") if package in versions)
-        + f"; {device}. The configuration is in config.json, evaluations are in metrics.jsonl.",
+        + f"; {device}. The configuration is in config.json"
+        + ("." if name_here else ", evaluations are in metrics.jsonl."),
     ]
     if ":" in task:
         lines += ["", f"The task {task} is code of its own, which is not in this folder."]

@@ -6,12 +6,12 @@
 The folder is assembled whole; then it takes its place, or is uploaded.
 """
 
-import dataclasses
 import json
 import re
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.host.files import write_atomically
@@ -96,11 +96,8 @@ def assemble(run_dir: Path, policy: Policy, folder: Path) -> None:
     """
     run, config = RunFolder(run_dir), policy.config
     policy_file.write(folder, policy.parameters, policy_file.Source(policy.seed, policy.iteration))
-    record = read_record(run_dir)
-    # Where a task of one's own lay on this machine is of no use on another.
-    environment = {**dataclasses.asdict(config)["environment"], "env_folder": None}
-    shown = {**record, "config": {**record["config"], "environment": environment}}
-    write_atomically(folder / run.config.name, json.dumps(shown, indent=2) + "\n")
+    record = public_record(run_dir)
+    write_atomically(folder / run.config.name, json.dumps(record, indent=2) + "\n")
     for file in (run.metrics, run.curve, run.video):
         if file.is_file():
             shutil.copyfile(file, folder / file.name)
@@ -115,6 +112,13 @@ def assemble(run_dir: Path, policy: Policy, folder: Path) -> None:
     pictures = {caption: name for caption, name in captions.items() if (folder / name).exists()}
     text = card(config, record, policy.seed, scores, policy.env.distance_unit, pictures)
     write_atomically(folder / "README.md", text)
+
+
+def public_record(run_dir: Path) -> dict[str, Any]:
+    """Return the contents of a run's config.json for others: where a task of one's own lay here is of no use elsewhere."""
+    record = read_record(run_dir)
+    environment = {**record["config"].get("environment", {}), "env_folder": None}
+    return {**record, "config": {**record["config"], "environment": environment}}
 
 
 def _upload(folder: Path, repository: str) -> str:

@@ -16,6 +16,7 @@ from jaxrl_vis.learner.auxtasks.egomotion import MAX_ANGLE
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.report import auxiliary_video, videos
 from jaxrl_vis.run.storage.folder import read_config
+from jaxrl_vis.run.trained.policy_file import check_whole
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 from jaxrl_vis.types import Batch, Episodes, TrainState
 
@@ -45,6 +46,7 @@ def play_auxiliary(
     videos.check_output(out)
     if out.suffix.lower() == ".png":
         raise RequestError(f"--aux makes a video: use {out.stem}.gif, .mp4 or .html instead of {out.name}")
+    check_whole(run_dir, "--aux")
     tasks = read_config(Path(run_dir)).auxiliary.aux_tasks
     if not tasks:
         raise RequestError(f"the run in {run_dir} has no auxiliary tasks to show: train with --aux-tasks, or leave out --aux")

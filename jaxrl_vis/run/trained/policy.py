@@ -1,6 +1,6 @@
 """Trained policies as functions.
 
-policy = load_policy("runs/mine")
+policy = load_policy("runs/mine")               # or the name of one that comes with the package
 action = policy(observation, goal)              # one environment: planar [C, H, W] uint8, or [S] float32
 actions = jax.vmap(policy)(observations, goals) # many
 """
@@ -21,6 +21,7 @@ from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
 from jaxrl_vis.run.storage.checkpoint import Restored
 from jaxrl_vis.run.trained import policy_file
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
+from jaxrl_vis.run.trained.shipped import find
 from jaxrl_vis.run.trainer import Trainer
 from jaxrl_vis_envs.base import GoalEnv
 
@@ -112,7 +113,7 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: Choice
     """Load the policy of a run, on any platform that JAX supports.
 
     Args:
-        run_dir: The run folder, or a folder of `jaxrl-vis push`.
+        run_dir: The run folder, a folder of `jaxrl-vis push`, or the name of a policy that comes with the package.
         seed: Seed, for a run with several; None: the first.
         checkpoint: Iteration of an existing checkpoint; ``best``: the one that ``best_by`` keeps; None: the newest valid one.
         trust: Allow the run's own code, which a task ``module:Name`` executes; not needed for runs that were trained here.
@@ -121,12 +122,10 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: Choice
         RequestError: There is no run, no such seed or checkpoint, or no usable one; or its task is not available here, or is
             untrusted code.
     """
+    run_dir = find(run_dir)
+    if policy_file.holds_policy(run_dir):
+        policy_file.check_source(policy_file.read_source(run_dir), seed, checkpoint)
     trainer = open_run(run_dir, trust=trust)
-    if policy_file.holds_policy(Path(run_dir)):
-        pushed, source = policy_file.read(Path(run_dir), trainer)
-        policy_file.check_seed(source, seed, checkpoint)
-        enable_compilation_cache()
-        return Policy(trainer.env, trainer.config, source.seed, source.iteration, pushed, trainer.program.algorithm)
     seed = choose_seed(trainer, run_dir, seed)
     return make_policy(trainer, load(trainer, run_dir, checkpoint), seed)
 

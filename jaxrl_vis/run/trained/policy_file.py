@@ -1,17 +1,23 @@
 """A policy's weights in one file beside config.json: a folder of these two can be loaded as a run can."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import is_count
-from jaxrl_vis.host.weights_file import read_parameters, write_parameters
+from jaxrl_vis.host.weights_file import read_about, read_parameters, write_parameters
 from jaxrl_vis.learner.algorithm import PolicyParams
+from jaxrl_vis.run.trained.shipped import find
 from jaxrl_vis.run.trainer import Trainer
+from jaxrl_vis.types import NormalizerState, TrainState
 
 FILE_NAME = "policy.safetensors"
+_WRITER = "jaxrl-vis push"
+_SAME = "same"  # in the description: arrays that are not in the file -> those that they equal
 
 
 class Source(NamedTuple):
@@ -31,46 +37,97 @@ def holds_policy(folder: Path) -> bool:
     return (folder / FILE_NAME).is_file() and not (folder / "checkpoints").exists()
 
 
+def check_whole(run_dir: Path | str, use: str) -> None:
+    """Raise a `RequestError` if a folder holds a policy alone.
+
+    Args:
+        run_dir: The folder.
+        use: Use that needs the rest of the learner, for the message.
+    """
+    if holds_policy(find(run_dir)):
+        raise RequestError(f"{run_dir} holds a policy alone, and {use} needs the whole run: name that which it was made of")
+
+
 def _named(parameters: PolicyParams) -> dict[str, Any]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(parameters)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
-def write(folder: Path, parameters: PolicyParams, source: Source) -> None:
-    """Write the parameters of a policy, float32, into ``folder``.
+def write(folder: Path, parameters: PolicyParams, source: Source, bits: Literal[16, 32] = 32) -> None:
+    """Write the parameters of a policy into ``folder``.
+
+    Args:
+        folder: The folder.
+        parameters: The parameters, float32.
+        source: Their origin.
+        bits: Bits of a number. Observation statistics always keep 32: their sums exceed float16.
 
     Raises:
         OSError: The file cannot be written.
     """
-    write_parameters(folder / FILE_NAME, _named(parameters), source._asdict(), bits=32)
+    statistics = jax.tree.map(
+        lambda part: jax.tree.map(lambda _: isinstance(part, NormalizerState), part),
+        parameters,
+        is_leaf=lambda part: isinstance(part, NormalizerState),
+    )
+    exact = [name for name, is_statistic in _named(statistics).items() if is_statistic]
+    arrays, same = {name: np.asarray(leaf) for name, leaf in _named(parameters).items()}, {}
+    for index, name in enumerate(exact):  # goals mostly have the statistics of observations
+        first = next((other for other in exact[:index] if np.array_equal(arrays[other], arrays[name])), None)
+        same |= {} if first is None else {name: first}
+    written = {name: array for name, array in arrays.items() if name not in same}
+    write_parameters(folder / FILE_NAME, written, {**source._asdict(), _SAME: same}, bits, exact)
 
 
-def read(folder: Path, trainer: Trainer) -> tuple[PolicyParams, Source]:
-    """Read the parameters of a policy.
+def read_source(folder: Path) -> Source:
+    """Read the origin of a folder's policy.
+
+    Raises:
+        RequestError: The file is damaged.
+    """
+    return _source(folder, read_about(folder / FILE_NAME, _WRITER))
+
+
+def _source(folder: Path, about: dict[str, Any]) -> Source:
+    source = Source(about.pop("seed", None), about.pop("iteration", None))
+    if not all(map(is_count, source)):
+        raise RequestError(f"{folder / FILE_NAME} does not say of which seed and iteration it is: push the run again")
+    return source
+
+
+def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
+    """Read a policy as a learner of one seed, whose agent is the policy's parameters.
 
     Args:
         folder: A folder of `write`.
-        trainer: Trainer of the configuration in the folder.
+        trainer: Trainer of the configuration in the folder, for a policy alone (`make_trainer`).
 
     Raises:
         RequestError: The file is damaged, or belongs to another configuration.
     """
-    train = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), trainer.shapes.train)
-    wanted = jax.eval_shape(trainer.program.algorithm.policy_params, train.agent, train.statistics)
+    shapes = trainer.shapes.train
+    wanted = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), shapes.agent)
+
+    same: dict[str, str] = {}
 
     def declare(about: dict[str, Any]) -> tuple[Source, dict[str, Any]]:
-        source = Source(about.pop("seed"), about.pop("iteration"))
-        if not all(map(is_count, source)):
-            raise ValueError("seed and iteration must be whole numbers")
-        return source, _named(wanted)
+        named = _named(wanted)
+        found = about.pop(_SAME, {})
+        if not isinstance(found, dict) or not all(isinstance(other, str) for other in found.values()):
+            raise ValueError(_SAME)
+        same.update(found)
+        if any(named[name].shape != named[other].shape or other in same for name, other in same.items()):
+            raise ValueError("an array is not the same as another one")
+        return _source(folder, about), {name: leaf for name, leaf in named.items() if name not in same}
 
-    nested, source, _ = read_parameters(folder / FILE_NAME, "jaxrl-vis push", declare)
+    nested, source, _ = read_parameters(folder / FILE_NAME, _WRITER, declare)
     read_leaves = _named(nested)
-    leaves = [read_leaves[name].astype(leaf.dtype) for name, leaf in _named(wanted).items()]
-    return jax.tree.unflatten(jax.tree.structure(wanted), leaves), source
+    leaves = [read_leaves[same.get(name, name)].astype(leaf.dtype)[None] for name, leaf in _named(wanted).items()]
+    nothing_seen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return nothing_seen.replace(agent=jax.tree.unflatten(jax.tree.structure(wanted), leaves)), source
 
 
-def check_seed(source: Source, seed: int | None, checkpoint: int | str | None) -> None:
+def check_source(source: Source, seed: int | None = None, checkpoint: int | str | None = None) -> None:
     """Raise a `RequestError` if another seed or checkpoint is asked for than the folder holds."""
     if seed not in (None, source.seed) or checkpoint not in (None, source.iteration):
         raise RequestError(f"the folder holds the policy of seed {source.seed} after iteration {source.iteration} alone")

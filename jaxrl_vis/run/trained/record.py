@@ -10,6 +10,7 @@ from jaxrl_vis.host import provenance
 from jaxrl_vis.recordings.episodes import Recordings
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.run.trained.restored_run import load, open_run
+from jaxrl_vis.run.trained.shipped import find
 
 
 def record_run(run_dir: Path | str, episodes: int = 50, seed: int = 0, trust: bool = False) -> Recordings:
@@ -44,7 +45,7 @@ def record_run(run_dir: Path | str, episodes: int = 50, seed: int = 0, trust: bo
         "run_seed": trainer.config.run.seed,
         "iteration": restored.iteration,
         "episode_seed": seed,
-        "trained_by": read_record(Path(run_dir)).get("git_revision"),
+        "trained_by": read_record(find(run_dir)).get("git_revision"),
         "recorded_by": provenance.revision(),
     }
     return Recordings.of_rollout(recorded, outcome["success"], about)

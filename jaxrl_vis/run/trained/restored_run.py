@@ -1,4 +1,7 @@
-"""Use of trained runs: evaluating them again, and playing episodes."""
+"""Use of trained runs, and of policies alone: evaluating them again, and playing episodes.
+
+A run is named by its folder, or by the name of a policy that comes with the package (`shipped`).
+"""
 
 from pathlib import Path
 from typing import Literal
@@ -13,6 +16,7 @@ from jaxrl_vis.run.compiled.memory import check_compiled
 from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, Checkpoints, Restored
 from jaxrl_vis.run.storage.folder import read_config, read_run_id
 from jaxrl_vis.run.trained import policy_file
+from jaxrl_vis.run.trained.shipped import find
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
 
@@ -29,10 +33,14 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
     Raises:
         RequestError: There is no run, its code is not trusted, or its trainer cannot be created any more.
     """
-    saved = read_config(Path(run_dir))
-    check_trusted(Path(run_dir), saved, trust)
+    folder = find(run_dir)
+    saved = read_config(folder)
+    check_trusted(folder, saved, trust)
     config = saved.replace(devices=1, data_devices=None, **changes)
-    return make_trainer(config, keep_programs=keep_programs)
+    alone = policy_file.holds_policy(folder)
+    if alone:
+        config = config.replace(seed=policy_file.read_source(folder).seed, seeds=1)
+    return make_trainer(config, keep_programs=keep_programs, policy_alone=alone)
 
 
 Choice = int | Literal["best"] | None
@@ -50,7 +58,12 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Re
     Raises:
         RequestError: There is no such checkpoint, or no usable one.
     """
-    checkpoints = Checkpoints(Path(run_dir) / "checkpoints", read_only=True, run_id=read_run_id(Path(run_dir)))
+    run_dir = find(run_dir)
+    if policy_file.holds_policy(run_dir):
+        train, source = policy_file.read(run_dir, trainer)
+        policy_file.check_source(source, checkpoint=checkpoint)
+        return Restored(LIGHT, source.iteration, train, None, {})
+    checkpoints = Checkpoints(run_dir / "checkpoints", read_only=True, run_id=read_run_id(run_dir))
     if checkpoint == "best":
         return _load_best(trainer, run_dir, checkpoints)
     saved = sorted({*checkpoints.iterations(LIGHT), *checkpoints.iterations(FULL)})
@@ -63,8 +76,6 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Re
         checkpoints.close()
     if restored is None and saved and checkpoint is not None:
         raise RequestError(f"checkpoint {checkpoint} of the run in {run_dir} is damaged: leave it out for the newest good one")
-    if restored is None and policy_file.holds_policy(Path(run_dir)):
-        raise RequestError(f"{run_dir} holds a policy alone, for jaxrl_vis.load_policy: name the run that it was pushed from")
     if restored is None:
         raise RequestError(f"the run in {run_dir} has no usable checkpoint: train it first")
     return restored

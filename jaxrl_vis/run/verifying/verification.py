@@ -27,6 +27,7 @@ from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.storage.recent import Unusable
 from jaxrl_vis.run.storage.sums import FILE_NAME as SUMS_NAME
 from jaxrl_vis.run.storage.sums import compare_sums
+from jaxrl_vis.run.trained.policy_file import check_whole
 from jaxrl_vis.run.trained.results import describe
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
@@ -67,6 +68,7 @@ def verify_run(
         RequestError: There is no run, or it is not trusted, cannot be created any more, or needs more memory than is available.
     """
     path = Path(run_dir)
+    check_whole(path, "verify")
     record = read_record(path)
     try:
         config = config_from_dict(record.get("config", {}))

@@ -12,6 +12,7 @@ from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host import plugins
 from jaxrl_vis.learner.ddpg.learned_reward import make_learned_reward
 from jaxrl_vis.learner.memory.rewards import make_reward
+from jaxrl_vis.run.trained.policy_file import check_whole
 from jaxrl_vis.run.trained.restored_run import load, open_run
 from jaxrl_vis.studies.audit.episodes import Reward
 from jaxrl_vis.types import Batch
@@ -32,6 +33,7 @@ def _of_run(run_dir: Path, trust: bool) -> Reward:
     Raises:
         RequestError: The run's rewards are of another kind.
     """
+    check_whole(run_dir, "an audit of its reward")
     trainer = open_run(run_dir, trust=trust)
     program, resolved = trainer.program, trainer.program.resolved
     if not resolved.method.is_learned:

@@ -1,0 +1,111 @@
+"""Opens the page that plays in headless Chromium and compares it with our renderer, policy and physics: `make page-check`.
+
+The site must be built, with the page's data: `make page docs`. Prints each figure with its bound. Exit status: 0 all within
+their bounds; 1 one is not, or the page does not run; 2 there is nothing to open, or nothing to open it with.
+"""
+
+import argparse
+import functools
+import http.server
+import json
+import queue
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+# Figure of check.js -> least and greatest value. Of images: the share of pixels with another shape, and mean levels.
+BOUNDS: dict[str, tuple[float, float]] = {
+    "frames": (32, 32),
+    "image_edges": (0, 0.002),
+    "image_colour": (0, 0.5),
+    "image_depth": (0, 0.5),
+    "goal_edges": (0, 0.005),
+    "goal_colour": (0, 0.5),
+    "goal_depth": (0, 0.5),
+    "action": (0, 1e-4),
+    "chosen_median": (0, 0.02),
+    "goal_joints": (0, 0.01),
+    "drift": (0, 0.005),
+    "goals": (50, 50),
+    "success": (0.9, 1),
+}
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    """Serves the site, and receives the page's result."""
+
+    def __init__(self, *args: Any, results: "queue.Queue[dict[str, Any]]", **options: Any):
+        self._results = results
+        super().__init__(*args, **options)
+
+    def do_POST(self) -> None:
+        """Take the result."""
+        self._results.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+        self.send_response(204)
+        self.end_headers()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing."""
+
+
+def measure(site: Path, browser: str, seconds: float) -> dict[str, Any]:
+    """Open the page and return its figures; ``error`` if it does not run."""
+    results: queue.Queue[dict[str, Any]] = queue.Queue()
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler, directory=str(site), results=results))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with tempfile.TemporaryDirectory() as profile:
+        address = f"http://127.0.0.1:{server.server_port}/browser.html?check"
+        # Nothing but this machine can be reached: the page must work offline.
+        options = ["--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
+        options += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]
+        opened = subprocess.Popen([browser, *options, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            return results.get(timeout=seconds)
+        except queue.Empty:
+            return {"error": f"no result within {seconds:.0f} s"}
+        finally:
+            opened.terminate()
+            opened.wait()
+            server.shutdown()
+
+
+def main() -> int:
+    """Check the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--site", type=Path, default=ROOT / "build" / "site")
+    parser.add_argument("--seconds", type=float, default=300, help="time that the page has")
+    options = parser.parse_args()
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        print(f"there is none of {', '.join(BROWSERS)} to open the page with", file=sys.stderr)
+        return 2
+    if not (options.site / "play" / "data" / "task.json").exists():
+        print(f"{options.site} was built without the page's data: make page docs", file=sys.stderr)
+        return 2
+    figures = measure(options.site, browser, options.seconds)
+    if "error" in figures:
+        print(f"the page does not run: {figures['error']}", file=sys.stderr)
+        return 1
+    broken = 0
+    for name, value in figures.items():
+        low, high = BOUNDS.get(name, (float("-inf"), float("inf")))
+        is_kept = low <= value <= high
+        broken += not is_kept
+        print(
+            f"{name:16} {value:12.6g}"
+            + (f"   {low:g} to {high:g}   {'kept' if is_kept else 'BROKEN'}" if name in BOUNDS else "")
+        )
+    missing = BOUNDS.keys() - figures.keys()
+    if missing:
+        print(f"missing: {', '.join(sorted(missing))}", file=sys.stderr)
+    return int(bool(broken or missing))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
