@@ -26,6 +26,7 @@ import optax
 from sklearn.datasets import load_digits
 
 import jaxrl_vis.weighting as jw
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import write_atomically
 
@@ -173,10 +174,15 @@ def measure(problem: Problem, name: str) -> dict[str, Any]:
 
 
 def methods(problem: Problem) -> Iterator[str]:
-    """Yield the weightings that a problem suits, the baseline first."""
-    has_main = jw.MAIN in problem.classes
-    names = [BASELINE, *(name for name in jw.WEIGHTINGS if name != BASELINE)]
-    return (name for name in names if has_main or not jw.make_weighting(name).main)
+    """Yield the weightings that a problem suits, the baseline first: those with a main loss want one among the tasks."""
+    for name in (BASELINE, *(name for name in jw.WEIGHTINGS if name != BASELINE)):
+        weighting = jw.make_weighting(name)
+        if jw.MAIN not in problem.classes:
+            try:
+                weighting.init(tuple(problem.classes), initialize(jax.random.key(0), problem)["trunk"])
+            except RequestError:
+                continue
+        yield name
 
 
 def main() -> int:

@@ -19,7 +19,7 @@ from typing import Any
 import jaxrl_vis
 from jaxrl_vis.cli import audit, bench, doctor, encoder, envs, figure, search, sweep, train
 from jaxrl_vis.cli.parsing import PROGRAM, parse
-from jaxrl_vis.cli.runs import dataset, eval, export, play, push, verify
+from jaxrl_vis.cli.trained import dataset, eval, export, play, push, verify
 from jaxrl_vis.errors import NonFiniteError, RequestError, StorageError, Terminated, WorkerError, nearest
 from jaxrl_vis.host import distributed
 from jaxrl_vis.host.streams import SafeStream, detach_broken_streams, reserve_standard_files, safe_streams

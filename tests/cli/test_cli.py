@@ -15,9 +15,9 @@ from jaxrl_vis.cli import train
 from jaxrl_vis.cli.bench import Bench, Benchmark
 from jaxrl_vis.cli.envs import Envs
 from jaxrl_vis.cli.parsing import parse
-from jaxrl_vis.cli.runs.eval import Eval
-from jaxrl_vis.cli.runs.play import Play
 from jaxrl_vis.cli.train import Train, training_config
+from jaxrl_vis.cli.trained.eval import Eval
+from jaxrl_vis.cli.trained.play import Play
 from jaxrl_vis.config import PRESETS, Config, fields, preset
 from jaxrl_vis.config.methods import METHODS, MethodName
 from jaxrl_vis.errors import NonFiniteError, StorageError, Terminated
