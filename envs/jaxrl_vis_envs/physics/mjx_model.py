@@ -243,5 +243,8 @@ def point_velocity(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: j
 
 def hinge_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
     """Return the derivative of a ``point`` [3] (m, world) and of the rotation of ``body`` per radian of each hinge: [nv, 6]."""
-    moves = ancestor_joints(mj_model, body)[:, None]
-    return jnp.where(moves, jnp.concatenate([jnp.cross(data.xaxis, point - data.xanchor), data.xaxis], axis=1), 0.0)
+    moves = ancestor_joints(mj_model, body)
+    axis, anchor = data.xaxis, data.xanchor
+    if mj_model.nv > mj_model.njnt:  # free joints elsewhere have one axis for six degrees of freedom
+        axis, anchor = axis[mj_model.dof_jntid], anchor[mj_model.dof_jntid]
+    return jnp.where(moves[:, None], jnp.concatenate([jnp.cross(axis, point - anchor), axis], axis=1), 0.0)
