@@ -16,7 +16,7 @@ from mujoco import mjx
 from mujoco.mjx._src import sensor, smooth
 
 from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, targets_cpu, use_gpu_kernels
-from jaxrl_vis_envs.physics import constraints, newton, rotations, scalar
+from jaxrl_vis_envs.physics import box_contacts, constraints, newton, rotations, scalar
 from jaxrl_vis_envs.physics.kinematics import kinematics
 
 __all__ = [
@@ -151,7 +151,8 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     """Compute accelerations from positions, velocities and controls, as `mjx.forward` does; for ``exact`` see `step`."""
     data = smooth.com_pos(model, kinematics(model, data))
     data = smooth.crb(model, smooth.tendon(model, data))
-    data = mjx.collision(model, smooth.tendon_armature(model, data))
+    data = smooth.tendon_armature(model, data)
+    data = box_contacts.collide(model, data) if box_contacts.supports(model) else mjx.collision(model, data)
     pairs = np.stack([model.pair_geom1, model.pair_geom2])
     if exact and np.any(np.all(model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_CAPSULE, axis=0)):
         data = _place_capsule_contacts(model, data)

@@ -32,10 +32,15 @@ _START_JOINTS = (0.0123826, -0.5894173, -0.0054354, 1.4531368, 0.0021391, 0.6991
 _START_VELOCITIES = (0.0053221, 0.0027478, -0.0039692, 0.0077923, 0.000282, 0.0216374, 0.0030754, 0.0000063, 0.0018714)
 _START_BOX, _START_BOX_VELOCITY = (1.25, 0.53, 0.4247021), (0.0, 0.0, 0.0011707)
 _FINGER_HALF_SIZE = (0.0385, 0.007, 0.0135)  # m
-# The original's mixtures of the softness and friction of two shapes.
-_FINGER_CONTACT = dict(condim=4, friction=(1, 1, 0.05, 0.01, 0.01), solref=(0.015, 1), solimp=(0.945, 0.97, 0.0055, 0.5, 2))
-_BOX_ON_TABLE = dict(condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, 1), solimp=(0.9, 0.95, 0.001, 0.5, 2))
-_MARGIN = 0.001  # of contacts of the fingers, m
+# The original's mixtures of the softness and friction of two shapes. MuJoCo up to 3.2 took half the distance between two boxes
+# for their distance: twice the margin and width, and a damping ratio that halves the stiffness, make up for that.
+_SOFTER = 2**0.5
+_FINGER_CONTACT = dict(
+    condim=4, friction=(1, 1, 0.05, 0.01, 0.01), solref=(0.015, _SOFTER), solimp=(0.945, 0.97, 0.011, 0.5, 2), margin=0.002
+)
+_BOX_ON_TABLE = dict(
+    condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, _SOFTER), solimp=(0.9, 0.95, 0.002, 0.5, 2)
+)
 _CANDIDATES = 32  # positions drawn at once; none is acceptable in 2 of 10^15 episodes
 
 
@@ -190,7 +195,7 @@ def _add_box(spec: mujoco.MjSpec) -> None:
     for side in ("right", "left"):
         for other in ("table", "box"):
             spec.add_pair(
-                name=f"{side}_finger_on_{other}", geomname1=other, geomname2=f"{side}_finger", margin=_MARGIN, **_FINGER_CONTACT
+                name=f"{side}_finger_on_{other}", geomname1=other, geomname2=f"{side}_finger", **_FINGER_CONTACT
             )
 
 
