@@ -71,7 +71,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         acting = acting_stiffness(residual)
         inertial = _product(mass, acceleration) - data.qfrc_smooth
         slope = inertial + _product(jacobian.T, acting * residual)
-        curvature = mass + jnp.sum((acting[:, None] * jacobian)[:, :, None] * jacobian[:, None, :], axis=0)
+        curvature = mass + _weighted_square(jacobian, acting)
         direction = -solve_positive(curvature, slope)
         along = _product(jacobian, direction)
         first, second = jnp.sum(direction * inertial), jnp.sum(direction * _product(mass, direction))
@@ -88,6 +88,14 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _product(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     """Multiply ``matrix`` [M, N] by ``vector`` [N] without a library call, which takes longer than these few sums."""
     return jnp.sum(matrix * vector, axis=1)
+
+
+def _weighted_square(matrix: jax.Array, weights: jax.Array) -> jax.Array:
+    """Return the sum of the outer squares of the rows of ``matrix`` [M, N], with ``weights`` [M]: [N, N]."""
+    weighted = weights[:, None] * matrix
+    if len(weights) > _MOST_CORNERS:  # a library's call pays from here on
+        return jnp.matmul(matrix.T, weighted, precision="highest")
+    return jnp.sum(weighted[:, :, None] * matrix[:, None, :], axis=0)
 
 
 def unconstrained_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
