@@ -11,6 +11,7 @@ from benchmarks.tasks import environments, one_step
 
 DATA = pathlib.Path(__file__).parents[1] / "data"
 RECORDINGS = {
+    "fetch_push": "FetchPush",
     "fetch_reach": "FetchReach",
     "fetch_reach_table": "FetchReach",  # benchmarks/record_originals.py FetchReach --seed 3 --lower .25
     "finger": "FingerTurn",

@@ -61,17 +61,14 @@ class FetchPushConfig(PulledArmConfig):
     """Draws, as the original, goals that the box meets where it starts, too. False draws only others."""
     goal_lift: float = 0.14
     """Height of the gripper above its start in a goal image, m."""
-    solver_iterations: int = 4
+    solver_iterations: int = 6
     """Newton iterations per physics step."""
-    line_search_iterations: int = 8
-    """Line search iterations per Newton iteration."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.positive(self, "object_range")
         checks.not_negative(self, "object_distance", "goal_range", "goal_lift")
         checks.boolean(self, "met_goals")
-        checks.whole(self, "line_search_iterations")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +93,6 @@ class FetchPush(FetchArm):
             observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
         """
         mj_model = mjx_model.load_model("fetch_reach.xml", _add_box)
-        mj_model.opt.ls_iterations = config.line_search_iterations
         self._box = mj_model.body("box").id
         self._box_position = int(mj_model.joint("box").qposadr[0])
         self._box_velocity = int(mj_model.joint("box").dofadr[0])
@@ -123,6 +119,10 @@ class FetchPush(FetchArm):
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         place, _ = self._places(key)
+        return self.start_with_box(place)
+
+    def start_with_box(self, place: jax.Array) -> mjx.Data:
+        """Return the start of an episode with the box at ``place`` [2] float32 (m, world)."""
         return self._with_box(self._start, self._start.qpos, place)
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
