@@ -119,6 +119,11 @@ class GoalEnv(abc.ABC):
         preceding observations, or repeat the episode's first image, so a replay needs to store only the newest image of each.
         """
 
+    @property
+    def converts_goals(self) -> bool:
+        """Return True if `as_goal` changes observations: they stack images, or show more than a goal is about."""
+        return self.frame_stack > 1
+
     def as_goal(self, frame: jax.Array) -> jax.Array:
         """Convert an observation to the goal of reaching it, with the same shape: its newest image, repeated F times.
 

@@ -97,7 +97,7 @@ class FetchPush(FetchArm):
         self._box_position = int(mj_model.joint("box").qposadr[0])
         self._box_velocity = int(mj_model.joint("box").dofadr[0])
         super().__init__(config, mj_model, observer)
-        self._goal_pose = self._lifted(mj_model)
+        self._goal_pose, self._goal_grip = self._lifted(mj_model)
 
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
         """Return the original's start, in which the fingers are still pressed 2.5 mm into the table."""
@@ -107,15 +107,17 @@ class FetchPush(FetchArm):
         mujoco.mj_forward(mj_model, mj_data)
         return mj_data
 
-    def _lifted(self, mj_model: mujoco.MjModel) -> jax.Array:
-        """Return ``qpos`` of the arm of goal images, above the middle of the table, and of the box where it settled."""
+    def _lifted(self, mj_model: mujoco.MjModel) -> tuple[jax.Array, jax.Array]:
+        """Return ``qpos`` of goal images, but for the place of the box, and the position [3] (m, world) of the grip in them."""
         mj_data = mujoco.MjData(mj_model)
         mj_data.qpos[:] = self._start.qpos
         mujoco.mj_forward(mj_model, mj_data)
         box = mj_data.joint("box").qpos.copy()
         self._pull_grip(mj_model, mj_data, mj_data.body("gripper").xpos + [0.0, 0.0, self.config.goal_lift])
         mj_data.joint("box").qpos[:] = box
-        return self._with_closed_fingers(self._start.replace(qpos=jnp.asarray(mj_data.qpos, jnp.float32))).qpos
+        mj_data.qpos[self._fingers] = 0.0
+        mujoco.mj_kinematics(mj_model, mj_data)
+        return jnp.asarray(mj_data.qpos, jnp.float32), jnp.asarray(mj_data.site("grip").xpos, jnp.float32)
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         place, _ = self._places(key)
@@ -152,6 +154,20 @@ class FetchPush(FetchArm):
 
     def achieved(self, data: mjx.Data) -> jax.Array:
         return data.xpos[self._box]
+
+    @property
+    def converts_goals(self) -> bool:
+        return self._draw is None or super().converts_goals
+
+    def as_goal(self, frame: jax.Array) -> jax.Array:
+        """Return the observation of the goal that a box at its place would meet: with the arm as in goal images, at rest.
+
+        So a policy that observes states is told where the box should be, and nothing else, as in the original.
+        """
+        if self._draw is not None:
+            return super().as_goal(frame)
+        box = frame[3:6]
+        return jnp.concatenate([self._goal_grip, box, box - self._goal_grip, jnp.zeros(frame.shape[0] - 9, frame.dtype)])
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
         """Return the original's observation: [25] float32, lengths in m, angles in rad, velocities per control step.
