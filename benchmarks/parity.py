@@ -15,6 +15,7 @@ bound is broken; 2 there is nothing to compare (no such task or file, or a key i
 """
 
 import argparse
+import functools
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -111,14 +112,20 @@ def fetch_push(recording: Recording) -> list[Figure]:
 
 def play_push(env: Any, actions: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Observations [N, T + 1, 25] of FetchPush under actions [N, T, 4], where the box starts at ``places`` [N, 2] (m)."""
-    begin = jaxrl_vis_envs.jit(jax.vmap(lambda place: env.state_at(env.start_with_box(place), jnp.zeros(3))))
-    see = jaxrl_vis_envs.jit(jax.vmap(env.observe_state))
+    begin, see = _push_programs(env)
     state = jax.device_get(begin(places))
     observations = [see(state.data)]
     for time in range(actions.shape[1]):
         state = environments.advance(env, state, actions[:, time])
         observations.append(see(state.data))
     return np.stack(observations, axis=1)
+
+
+@functools.cache
+def _push_programs(env: Any) -> tuple[Callable, Callable]:
+    """Place of the box [N, 2] -> State, and physics -> observations [N, 25]."""
+    begin = jax.vmap(lambda place: env.state_at(env.start_with_box(place), jnp.zeros(3)))
+    return jaxrl_vis_envs.jit(begin), jaxrl_vis_envs.jit(jax.vmap(env.observe_state))
 
 
 def _first_move(observations: np.ndarray) -> np.ndarray:
