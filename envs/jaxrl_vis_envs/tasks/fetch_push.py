@@ -19,9 +19,11 @@ import jax.numpy as jnp
 import mujoco
 
 from jaxrl_vis_envs import checks
+from jaxrl_vis_envs.base import State
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig
+from jaxrl_vis_envs.randomization import Domain
 from jaxrl_vis_envs.tasks.fetch_arm import FetchArm
 from jaxrl_vis_envs.tasks.mjx_env import register_task
 from jaxrl_vis_envs.tasks.pulled_arm import PulledArmConfig
@@ -41,6 +43,7 @@ _FINGER_CONTACT = dict(
 _BOX_ON_TABLE = dict(
     condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, _SOFTER), solimp=(0.9, 0.95, 0.002, 0.5, 2)
 )
+_MOVED = 0.001  # displacement in a control step that counts as a move of the box, m; it settles by less
 _CANDIDATES = 32  # positions drawn at once; none is acceptable in 2 of 10^15 episodes
 
 
@@ -84,6 +87,7 @@ class FetchPush(FetchArm):
 
     config: FetchPushConfig
     camera = "front"
+    metric_names = ("success", "goal_distance", "moved")
 
     def __init__(self, config: FetchPushConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
         """Build the model and compute the start.
@@ -122,6 +126,17 @@ class FetchPush(FetchArm):
     def sample_start(self, key: jax.Array) -> mjx.Data:
         place, _ = self._places(key)
         return self.start_with_box(place)
+
+    def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: Domain | None = None) -> State:
+        state = super().state_at(data, goal_state, domain)
+        return state.replace(metrics={**state.metrics, "moved": jnp.zeros(())})
+
+    def advance(self, state: State, action: jax.Array) -> State:
+        """Advance as `GoalEnv.advance`; ``metrics["moved"]`` is 1 once the box has moved by a millimetre in a control step."""
+        after = super().advance(state, action)
+        moves = jnp.linalg.norm(after.achieved_state - state.achieved_state) > _MOVED
+        moved = jnp.maximum(state.metrics["moved"], moves.astype(jnp.float32))
+        return after.replace(metrics={**after.metrics, "moved": moved})
 
     def start_with_box(self, place: jax.Array) -> mjx.Data:
         """Return the start of an episode with the box at ``place`` [2] float32 (m, world)."""
