@@ -203,9 +203,7 @@ def _euler_angles(rotation: jax.Array) -> jax.Array:
     cosine = jnp.hypot(rotation[2, 2], rotation[1, 2])
     is_regular = cosine > 1e-6
     roll = jnp.where(is_regular, -jnp.arctan2(rotation[1, 2], rotation[2, 2]), 0.0)
-    yaw = jnp.where(
-        is_regular, -jnp.arctan2(rotation[0, 1], rotation[0, 0]), -jnp.arctan2(-rotation[1, 0], rotation[1, 1])
-    )
+    yaw = jnp.where(is_regular, -jnp.arctan2(rotation[0, 1], rotation[0, 0]), -jnp.arctan2(-rotation[1, 0], rotation[1, 1]))
     return jnp.stack([roll, jnp.arctan2(rotation[0, 2], cosine), yaw])
 
 
@@ -225,9 +223,7 @@ def _add_box(spec: mujoco.MjSpec) -> None:
     spec.add_pair(name="box_on_table", geomname1="table", geomname2="box", **_BOX_ON_TABLE)
     for side in ("right", "left"):
         for other in ("table", "box"):
-            spec.add_pair(
-                name=f"{side}_finger_on_{other}", geomname1=other, geomname2=f"{side}_finger", **_FINGER_CONTACT
-            )
+            spec.add_pair(name=f"{side}_finger_on_{other}", geomname1=other, geomname2=f"{side}_finger", **_FINGER_CONTACT)
 
 
 def _add_solid(body: Any, name: str, position: Any, half_size: Any, colour: Any, mass: float = 0.0) -> None:

@@ -150,7 +150,7 @@ class Sampler:
             reached = jax.vmap(self.as_goal)(batch.observation_tp1)
             batch = batch.replace(reached=reached)
             if batch.goal.ndim == 2:  # of states; the replay repeats a goal's newest image itself
-                batch = batch.replace(goal=jax.vmap(self.as_goal)(batch.goal))
+                batch = batch.replace(observations=batch.observations.at[1].set(jax.vmap(self.as_goal)(batch.goal)))
         if self.config.study.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
