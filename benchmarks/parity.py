@@ -112,7 +112,7 @@ def fetch_push(recording: Recording) -> list[Figure]:
 
 def play_push(env: Any, actions: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Observations [N, T + 1, 25] of FetchPush under actions [N, T, 4], where the box starts at ``places`` [N, 2] (m)."""
-    begin, see = _push_programs(env)
+    begin, see = push_programs(env)
     state = jax.device_get(begin(places))
     observations = [see(state.data)]
     for time in range(actions.shape[1]):
@@ -122,7 +122,7 @@ def play_push(env: Any, actions: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _push_programs(env: Any) -> tuple[Callable, Callable]:
+def push_programs(env: Any) -> tuple[Callable, Callable]:
     """Place of the box [N, 2] -> State, and physics -> observations [N, 25]."""
     begin = jax.vmap(lambda place: env.state_at(env.start_with_box(place), jnp.zeros(3)))
     return jaxrl_vis_envs.jit(begin), jaxrl_vis_envs.jit(jax.vmap(env.observe_state))

@@ -2,14 +2,14 @@
 
     python benchmarks/record_originals.py ENV FILE.npz [--sequences 24] [--seed 0] [--lower 0] [--control]
 
-ENV is FetchPush, FetchReach, HandReach, Reacher (Gymnasium) or FingerTurn (dm_control). Needs an environment of its own, with the MuJoCo
-that the originals were published for: later ones treat the weld that pulls FetchReach's gripper differently.
+ENV is FetchPush, FetchReach, HandReach, Reacher (Gymnasium) or FingerTurn (dm_control). Needs an environment of its own, with
+the MuJoCo that the originals were published for: later ones treat the weld that pulls FetchReach's gripper differently.
 
     pip install gymnasium-robotics==1.4.2 dm_control==1.0.27 mujoco==3.2.7
 
 Actions are of three kinds in turn: independent, held for ten steps, and wandering. ``--lower`` is taken off the third component
-of each: .25 takes FetchReach's gripper to the table. FetchPush's actions are those of a scripted pusher that sees the object, or,
-with ``--control``, of one that passes over it.
+of each: .25 takes FetchReach's gripper to the table. FetchPush's actions are those of a scripted pusher that sees the object,
+or, with ``--control``, of one that passes over it.
 """
 
 import argparse

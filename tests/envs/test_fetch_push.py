@@ -1,4 +1,4 @@
-"""FetchPush: starts, goals, what goals are told by, contacts of boxes, and a box that falls off the table."""
+"""FetchPush: starts, goals, what goals are told by, and contacts of boxes; its physics: tests/physics/test_physics_parity.py."""
 
 import functools
 

@@ -69,6 +69,20 @@ def test_a_step_of_the_push():
     assert np.median(multiples) < 0.1 and (multiples <= 1.0).mean() > 0.85
 
 
+def test_a_box_that_is_pushed_off_the_table_lies_on_the_floor():
+    env = environments.make("FetchPush")
+    begin, _ = parity.push_programs(env)
+    # On the table, half over its edge, mostly over it, beside it.
+    state = jax.device_get(begin(np.float32([[1.25, 0.6], [1.54, 0.75], [1.57, 0.75], [1.7, 0.75]])))
+    heights = []
+    for _ in range(18):
+        state = environments.advance(env, state, np.zeros((4, 4)))
+        heights.append(state.achieved_state[:, 2])
+    np.testing.assert_allclose(heights[-1][[0, 1, 3]], [0.4248, 0.4248, 0.0248], atol=2e-3)
+    assert heights[-1][2] < 0.2  # it turns over the edge, and may still tumble
+    np.testing.assert_array_equal(state.metrics["moved"], [0, 0, 1, 1])
+
+
 def test_contacts_matter_to_the_hand():
     figures = {figure.name: figure.value for figure in compared("hand_reach")}
     for finger in ("ring finger", "little finger"):

@@ -31,8 +31,9 @@ _ROOT_STEPS = 8
 def supports(model: mjx.Model) -> bool:
     """Return True if this solver can replace MJX's for a model.
 
-    It supports up to 12 hinges and slides and one free joint, pyramidal cones, no dry friction, no activations, and the integrators
-    RK4 (without a free joint) and Euler, the latter implicit in the damping (MuJoCo's default), with and without warm starts.
+    It supports up to 12 hinges and slides and one free joint, pyramidal cones, no dry friction, no activations, and the
+    integrators RK4 (without a free joint) and Euler, the latter implicit in the damping (MuJoCo's default), with and without
+    warm starts.
     """
     is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
     has_few_joints = model.nv - 6 * is_free.sum() <= _MAX_JOINTS and is_free.sum() <= 1 and model.nq == model.nv + is_free.sum()
@@ -145,7 +146,7 @@ def _line_search(
 
 
 def _bracketed_root(slope_at: Callable[[jax.Array], tuple[jax.Array, jax.Array]]) -> jax.Array:
-    """Return the length at which the slope of the cost is 0, by Newton's method between lengths known to be too short and too long.
+    """Return the length at which the slope of the cost is 0, by Newton's method between a length too short and one too long.
 
     Args:
         slope_at: Length -> slope and curvature of the cost; the slope increases and is not positive at 0.

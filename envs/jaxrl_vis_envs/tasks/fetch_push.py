@@ -29,7 +29,7 @@ from jaxrl_vis_envs.tasks.mjx_env import register_task
 from jaxrl_vis_envs.tasks.pulled_arm import PulledArmConfig
 
 _HALF_SIZE, _MASS = 0.025, 2.0  # of the box, m and kg
-# The original's state after its set-up: joints of arm and fingers (rad, m) in the model's order, and the box, which settles (m).
+# The original's state after its set-up: joints of arm and fingers (rad, m) in the model's order, and the settling box (m).
 _START_JOINTS = (0.0123826, -0.5894173, -0.0054354, 1.4531368, 0.0021391, 0.6991474, 0.0075805, -0.0000025, 0.0012136)
 _START_VELOCITIES = (0.0053221, 0.0027478, -0.0039692, 0.0077923, 0.000282, 0.0216374, 0.0030754, 0.0000063, 0.0018714)
 _START_BOX, _START_BOX_VELOCITY = (1.25, 0.53, 0.4247021), (0.0, 0.0, 0.0011707)
@@ -43,6 +43,7 @@ _FINGER_CONTACT = dict(
 _BOX_ON_TABLE = dict(
     condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, _SOFTER), solimp=(0.9, 0.95, 0.002, 0.5, 2)
 )
+_BOX_ON_FLOOR = dict(condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, 1), solimp=(0.9, 0.95, 0.001, 0.5, 2))
 _MOVED = 0.001  # displacement in a control step that counts as a move of the box, m; it settles by less
 _CANDIDATES = 32  # positions drawn at once; none is acceptable in 2 of 10^15 episodes
 
@@ -187,8 +188,8 @@ class FetchPush(FetchArm):
     def observe_state(self, data: mjx.Data) -> jax.Array:
         """Return the original's observation: [25] float32, lengths in m, angles in rad, velocities per control step.
 
-        Positions of grip and box and of the box from the grip, of the two fingers, and the box's Euler angles; velocities of the
-        box relative to the grip, of the box's rotation, of the grip, and of the fingers.
+        Positions of grip and box and of the box from the grip, of the two fingers, and the box's Euler angles; velocities of
+        the box relative to the grip, of the box's rotation, of the grip, and of the fingers.
         """
         grip, box = data.site_xpos[self._grip], data.xpos[self._box]
         grip_velocity = mjx_model.point_velocity(self.mj_model, data, self._hand, grip)
@@ -221,6 +222,10 @@ def _add_box(spec: mujoco.MjSpec) -> None:
     box.add_joint(name="box", type=mujoco.mjtJoint.mjJNT_FREE, damping=(0.01, 0.0, 0.0), armature=0.0)
     _add_solid(box, "box", (0.0, 0.0, 0.0), (_HALF_SIZE,) * 3, (0.1, 0.35, 0.8, 1.0), _MASS)
     spec.add_pair(name="box_on_table", geomname1="table", geomname2="box", **_BOX_ON_TABLE)
+    # A box in place of the floor's plane, for a box that is pushed off the table.
+    _add_solid(spec.worldbody, "ground", (0.0, 0.0, -0.5), (3.0, 3.0, 0.5), (0.0, 0.0, 0.0, 0.0))
+    spec.geom("ground").group = 3
+    spec.add_pair(name="box_on_floor", geomname1="ground", geomname2="box", **_BOX_ON_FLOOR)
     for side in ("right", "left"):
         for other in ("table", "box"):
             spec.add_pair(name=f"{side}_finger_on_{other}", geomname1=other, geomname2=f"{side}_finger", **_FINGER_CONTACT)
