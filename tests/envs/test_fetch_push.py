@@ -1,4 +1,4 @@
-"""FetchPush: starts, goals, what goals are told by, and contacts of boxes; its physics: tests/physics/test_physics_parity.py."""
+"""FetchPush: starts, goals, what goals tell, and contacts of boxes. Its physics: tests/physics/test_physics_parity.py."""
 
 import functools
 
