@@ -88,6 +88,7 @@ class FetchPush(FetchArm):
 
     config: FetchPushConfig
     camera = "front"
+    chance, difficulty = 0.073, 3.4  # benchmarks/tasks/task_difficulty.py FetchPush --episodes 1000
     metric_names = ("success", "goal_distance", "moved")
 
     def __init__(self, config: FetchPushConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
