@@ -74,7 +74,7 @@ def test_a_box_that_is_pushed_off_the_table_lies_on_the_floor():
     env = environments.make("FetchPush")
     begin, _ = parity.push_programs(env)
     # On the table, half over its edge, mostly over it, beside it.
-    state = jax.device_get(begin(np.float32([[1.25, 0.6], [1.54, 0.75], [1.57, 0.75], [1.7, 0.75]])))
+    state = jax.device_get(begin(np.array([[1.25, 0.6], [1.54, 0.75], [1.57, 0.75], [1.7, 0.75]], np.float32)))
     heights = []
     for _ in range(18):
         state = environments.advance(env, state, np.zeros((4, 4)))
