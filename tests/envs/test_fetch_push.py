@@ -47,6 +47,19 @@ def test_goals_that_are_met_where_the_box_starts():
     assert distance.min() > 0.05 and (distance < 0.06).any()
 
 
+@pytest.mark.parametrize(
+    ("overrides", "complaint"),
+    [
+        ({"object_distance": 0.2}, "object_distance must be at most"),
+        ({"met_goals": False, "goal_range": 0.01}, "needs a goal_range of at least the threshold"),
+        ({"met_goals": 1}, "met_goals"),
+    ],
+)
+def test_places_that_cannot_be_drawn(overrides, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        jaxrl_vis_envs.make("FetchPush", **overrides)
+
+
 def test_a_goal_tells_of_the_box_alone():
     """A relabelled goal has the form of those that are drawn, wherever arm and box were and however they moved."""
     env = environments.make("FetchPush")

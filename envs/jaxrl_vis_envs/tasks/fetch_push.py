@@ -73,6 +73,11 @@ class FetchPushConfig(PulledArmConfig):
         checks.positive(self, "object_range")
         checks.not_negative(self, "object_distance", "goal_range", "goal_lift")
         checks.boolean(self, "met_goals")
+        # Within these bounds at least a fifth of the square is left to draw from.
+        if self.object_distance > self.object_range:
+            raise ValueError(f"object_distance must be at most object_range, {self.object_range}, got {self.object_distance}")
+        if not self.met_goals and self.threshold > self.goal_range:
+            raise ValueError(f"met_goals=False needs a goal_range of at least the threshold, {self.threshold}")
 
 
 @dataclasses.dataclass(frozen=True)
