@@ -4,6 +4,7 @@
 
 A recording holds N sequences of T actions in [-1, 1], and the states at their T + 1 instants:
 
+    FetchPush    actions [N, T, 4], observations [N, T + 1, 25]; Gymnasium-Robotics
     FetchReach   actions [N, T, 4], grip_pos_m [N, T + 1, 3]; Gymnasium-Robotics
     FingerTurn   actions [N, T, 2], qpos_rad_nsubK and qvel_rad_s_nsubK [N, T + 1, 3] for K = 21, 2 or both; dm_control
     HandReach    actions [N, T, 20], qpos [N, T + 1, 24] (rad), tip_pos_m [N, T + 1, 15]; Gymnasium-Robotics
@@ -14,13 +15,16 @@ bound is broken; 2 there is nothing to compare (no such task or file, or a key i
 """
 
 import argparse
+import functools
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+import jaxrl_vis_envs
 from benchmarks.tasks import environments
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.base import State
@@ -42,7 +46,7 @@ class Figure(NamedTuple):
 
     def __str__(self) -> str:
         bound = "" if self.bound is None else f"   bound {self.bound:g}   {'BROKEN' if self.is_broken else 'kept'}"
-        return f"{self.name:<60} {self.value:10.5f} {self.unit:<3}{bound}"
+        return f"{self.name:<60} {self.value:10.5f} {self.unit:<5}{bound}"
 
 
 class NothingToCompareError(ValueError):
@@ -86,6 +90,48 @@ def fetch_reach(recording: Recording) -> list[Figure]:
         Figure("share of the recording that counts (near the start)", float(is_inside.mean()), ""),
         *distance_figures("grip", error, 0.005, 0.015, 99),
     ]
+
+
+def fetch_push(recording: Recording) -> list[Figure]:
+    """Grip position until the box first moves, when that is, and where the box ends; and whether it moves at all."""
+    env = environments.make("FetchPush")
+    actions, recorded = _take(recording, "actions", "observations")
+    ours = play_push(env, actions, recorded[:, 0, 3:5])
+    our_start, start = (_first_move(path) for path in (ours, recorded))
+    is_before = np.arange(recorded.shape[1]) < np.minimum(our_start, start)[:, None]
+    grip_error, box_error = (np.linalg.norm((ours - recorded)[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
+    moved = np.linalg.norm(recorded[:, -1, 3:6] - recorded[:, 0, 3:6], axis=-1)
+    return [
+        Figure("share of sequences in which the box moves less than 5 cm", float((moved < 0.05).mean()), "", 0.2),
+        Figure("grip until the box moves: median error", float(np.median(grip_error[is_before])), "m"),
+        Figure("grip until the box moves: greatest error", float(grip_error[is_before].max()), "m", 0.002),
+        Figure("first move of the box: greatest error", float(np.abs(our_start - start).max()), "steps", 1.0),
+        *distance_figures("box at the end", box_error[:, -1], 0.01, None, 95),
+    ]
+
+
+def play_push(env: Any, actions: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Observations [N, T + 1, 25] of FetchPush under actions [N, T, 4], where the box starts at ``places`` [N, 2] (m)."""
+    begin, see = push_programs(env)
+    state = jax.device_get(begin(places))
+    observations = [see(state.data)]
+    for time in range(actions.shape[1]):
+        state = environments.advance(env, state, actions[:, time])
+        observations.append(see(state.data))
+    return np.stack(observations, axis=1)
+
+
+@functools.cache
+def push_programs(env: Any) -> tuple[Callable, Callable]:
+    """Place of the box [N, 2] -> State, and physics -> observations [N, 25]."""
+    begin = jax.vmap(lambda place: env.state_at(env.start_with_box(place), jnp.zeros(3)))
+    return jaxrl_vis_envs.jit(begin), jaxrl_vis_envs.jit(jax.vmap(env.observe_state))
+
+
+def _first_move(observations: np.ndarray) -> np.ndarray:
+    """First instant at which the box is 1 mm from its start, or T + 1: [N] of observations [N, T + 1, 25]."""
+    has_moved = np.linalg.norm(observations[..., 3:6] - observations[:, :1, 3:6], axis=-1) > 0.001
+    return np.where(has_moved.any(axis=1), has_moved.argmax(axis=1), observations.shape[1])
 
 
 def finger_turn(recording: Recording) -> list[Figure]:
@@ -143,6 +189,7 @@ def reacher(recording: Recording) -> list[Figure]:
 
 
 COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
+    "FetchPush": fetch_push,
     "FetchReach": fetch_reach,
     "FingerTurn": finger_turn,
     "HandReach": hand_reach,

@@ -1,14 +1,15 @@
 """Recorder of the original environments, for the comparison by benchmarks/parity.py.
 
-    python benchmarks/record_originals.py ENV FILE.npz [--sequences 24] [--seed 0] [--lower 0]
+    python benchmarks/record_originals.py ENV FILE.npz [--sequences 24] [--seed 0] [--lower 0] [--control]
 
-ENV is FetchReach, HandReach, Reacher (Gymnasium) or FingerTurn (dm_control). Needs an environment of its own, with the MuJoCo
-that the originals were published for: later ones treat the weld that pulls FetchReach's gripper differently.
+ENV is FetchPush, FetchReach, HandReach, Reacher (Gymnasium) or FingerTurn (dm_control). Needs an environment of its own, with
+the MuJoCo that the originals were published for: later ones treat the weld that pulls FetchReach's gripper differently.
 
     pip install gymnasium-robotics==1.4.2 dm_control==1.0.27 mujoco==3.2.7
 
 Actions are of three kinds in turn: independent, held for ten steps, and wandering. ``--lower`` is taken off the third component
-of each: .25 takes FetchReach's gripper to the table.
+of each: .25 takes FetchReach's gripper to the table. FetchPush's actions are those of a scripted pusher that sees the object,
+or, with ``--control``, of one that passes over it.
 """
 
 import argparse
@@ -19,6 +20,10 @@ import mujoco
 import numpy as np
 
 STEPS = 50
+LIFTED = 0.5  # height of the grip at which the fingers pass over the object, m
+BEHIND = 0.065  # distance of the grip from the middle of the object before it pushes, m
+LEAST_PUSH = 0.08  # m
+MOST_OBLIQUE = 0.1  # standard deviation of the direction of a push from a face's normal, rad
 
 
 def sample_actions(rng: np.random.Generator, sequences: int, size: int, lower: float) -> np.ndarray:
@@ -115,6 +120,77 @@ def finger_turn() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
     return record
 
 
+class Pusher:
+    """A scripted pusher: over the object, down behind it, and along the table to a place."""
+
+    def __init__(self, rng: np.random.Generator, middle: np.ndarray, thing: np.ndarray, control: bool) -> None:
+        """Choose where to push ``thing`` [2] (m), within 15 cm of ``middle`` [2] on each axis; ``control`` passes over it."""
+        self.rng, self.control, self.is_down = rng, control, False
+        self.height, self.speed = rng.uniform((0.418, 0.3), (0.44, 1.0))
+        self.place = thing
+        while not np.linalg.norm(self.place - thing) > LEAST_PUSH or np.abs(self.place - middle).max() > 0.15:
+            # Against one of the four faces, for a push against a corner says little: the box turns either way.
+            angle = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, MOST_OBLIQUE)
+            self.place = thing + rng.uniform(LEAST_PUSH, 0.3) * np.array([np.cos(angle), np.sin(angle)])
+
+    def act(self, grip: np.ndarray, thing: np.ndarray) -> np.ndarray:
+        """An action [4] at the position of the grip [3] and of the object [3], m."""
+        way = self.place - thing[:2]
+        left = np.linalg.norm(way)
+        way = way / max(left, 1e-6)
+        behind = thing[:2] - BEHIND * way
+        aside = np.linalg.norm(behind - grip[:2])
+        self.is_down |= not self.control and grip[2] < self.height + 0.01 and aside < 0.03
+        action = np.zeros(4)
+        if self.is_down:
+            across = (thing[:2] - grip[:2]) - ((thing[:2] - grip[:2]) @ way) * way
+            action[:2] = 10.0 * across + (min(self.speed, 8.0 * left) if left > 0.01 else 0.0) * way
+            action[2] = 20.0 * (self.height - grip[2])
+        else:
+            is_high = grip[2] > LIFTED - 0.02
+            goes_down = not self.control and aside < 0.02
+            action[:2] = 20.0 * (behind - grip[:2]) if is_high or aside < 0.03 else 0.0
+            action[2] = 20.0 * ((self.height if goes_down else LIFTED) - grip[2])
+        # In steps of 1/128, so that a recording is small.
+        return (np.round(128.0 * np.clip(action + self.rng.normal(0, 0.1, 4), -1, 1)) / 128.0).astype(np.float32)
+
+
+def record_pushes(rng: np.random.Generator, sequences: int, control: bool) -> dict[str, np.ndarray]:
+    """Pushes of the object of FetchPush, N of them.
+
+    Returns:
+        ``actions`` [N, T, 4] and ``observations`` [N, T + 1, 25] float32, the latter to a hundredth of a millimetre; and
+        ``touches`` [N, T + 1] bool, where a finger touches the object at that instant.
+    """
+    import gymnasium  # pyright: ignore[reportMissingImports]
+    import gymnasium_robotics  # pyright: ignore[reportMissingImports]
+
+    gymnasium.register_envs(gymnasium_robotics)
+    env = gymnasium.make("FetchPush-v4").unwrapped
+    model, data = env.model, env.data
+    fingers = {model.geom(f"robot0:{side}_gripper_finger_link").id for side in "lr"}
+    thing = model.geom("object0").id
+
+    def read() -> dict[str, np.ndarray]:
+        touches = any(thing in contact.geom and fingers & set(contact.geom) for contact in data.contact[: data.ncon])
+        return {"observations": env._get_obs()["observation"], "touches": np.array(touches)}
+
+    episodes = []
+    for number in range(sequences):
+        env.reset(seed=number)
+        instants, actions = [read()], []
+        grip, start = np.split(instants[0]["observations"][:6], 2)
+        pusher = Pusher(rng, grip[:2], start[:2], control)
+        for _ in range(STEPS):
+            actions.append(pusher.act(*np.split(instants[-1]["observations"][:6], 2)))
+            env.step(actions[-1])
+            instants.append(read())
+        episode = {key: np.stack([instant[key] for instant in instants]) for key in instants[0]}
+        episodes.append({"actions": np.stack(actions), **episode})
+    recording = {key: np.stack([episode[key] for episode in episodes]) for key in episodes[0]}
+    return recording | {"observations": recording["observations"].round(5).astype(np.float32)}
+
+
 RECORDERS = {
     "FetchReach": (fetch_reach, 4),
     "HandReach": (hand_reach, 20),
@@ -126,12 +202,17 @@ RECORDERS = {
 def main() -> int:
     """Write the recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("env", choices=RECORDERS)
+    parser.add_argument("env", choices=[*RECORDERS, "FetchPush"])
     parser.add_argument("file")
     parser.add_argument("--sequences", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--lower", type=float, default=0.0)
+    parser.add_argument("--control", action="store_true")
     options = parser.parse_args()
+    if options.env == "FetchPush":
+        rng = np.random.default_rng(options.seed)
+        np.savez_compressed(options.file, **record_pushes(rng, options.sequences, options.control))
+        return 0
     make_recorder, size = RECORDERS[options.env]
     actions = sample_actions(np.random.default_rng(options.seed), options.sequences, size, options.lower)
     np.savez_compressed(options.file, actions=actions, **make_recorder()(actions))

@@ -35,6 +35,28 @@ def fetch_reach(env: Any) -> tuple[Policy, Any]:
     return act, None
 
 
+def fetch_push(env: Any) -> tuple[Policy, Any]:
+    """Over the box, down behind it, and along the table towards the goal; up again where it has lost the box."""
+    behind, high, low, lost = 0.06, 0.49, 0.425, 0.02  # m
+
+    def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
+        grip, box = env.observe_state(state.data)[:6].reshape(2, 3)
+        left = jnp.linalg.norm((state.goal_state - box)[:2])
+        way = (state.goal_state - box)[:2] / jnp.maximum(left, 1e-6)
+        before = (box - grip)[:2] @ way
+        across = (box - grip)[:2] - before * way
+        there = box[:2] - behind * way - grip[:2]
+        is_near, is_low = jnp.linalg.norm(there) < 0.03, grip[2] < 0.455
+        push = jnp.append(10.0 * across + jnp.clip(5.0 * left, 0.2, 0.6) * way, 20.0 * (low - grip[2]))
+        over = jnp.append(jnp.where(is_near | (grip[2] > 0.465), 20.0 * there, 0.0), 20.0 * (high - grip[2]))
+        down = jnp.append(20.0 * there, 20.0 * (low - grip[2]))
+        pushes = is_low & (jnp.linalg.norm(across) < lost) & (before > lost)
+        move = jnp.where(pushes, push, jnp.where(is_near, down, jnp.where(is_low, jnp.array([0.0, 0.0, 1.0]), over)))
+        return jnp.append(jnp.where(left < 0.015, 0.0, jnp.clip(move, -1.0, 1.0)), 0.0), memory
+
+    return act, None
+
+
 def sawyer_reach(env: Any) -> tuple[Policy, Any]:
     """Straight to the goal, as fast as it goes."""
 
@@ -93,6 +115,7 @@ def hand_reach(env: Any) -> tuple[Policy, Any]:
 
 
 POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
+    "FetchPush": fetch_push,
     "FetchReach": fetch_reach,
     "HandReach": hand_reach,
     "Reacher": reacher,

@@ -26,6 +26,7 @@ from jaxrl_vis_envs.render import Scene, render_planes  # noqa: E402
 
 # What an agent has to see, by the names of its geoms. Parts in one tuple count together.
 PARTS: dict[str, dict[str, tuple[str, ...]]] = {
+    "VisualFetchPush": {"box": ("box",), "gripper": ("palm", "left_finger", "right_finger")},
     "VisualFetchReach": {"gripper": ("palm", "left_finger", "right_finger"), "fingers": ("left_finger", "right_finger")},
     "VisualFingerTurn": {"spinner tip": ("tip_marker",), "fingertip": ("fingertip",)},
     "VisualHandReach": {f"{tip} tip": (f"{tip}tip",) for tip in ("ff", "mf", "rf", "lf", "th")},

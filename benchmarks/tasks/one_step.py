@@ -79,6 +79,21 @@ def fetch_states(env: Any) -> Visited:
     return visited_states(env.mj_model, starts, np.zeros((24, 10, 0)), every=13, mocap=targets)
 
 
+def push_states(env: Any) -> Visited:
+    """The gripper starts beside one of the faces of the box, and pushes or misses it."""
+    rng = np.random.default_rng(0)
+    start = env.sample_start(jax.random.key(0))
+    gripper, grip = np.asarray(start.xpos[env.mj_model.body("gripper").id]), np.asarray(start.site_xpos[0])
+    angles = 0.5 * np.pi * np.arange(24)
+    ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    starts = np.tile(np.asarray(start.qpos, np.float64), (24, 1))
+    starts[:, env.mj_model.joint("box").qposadr[0] :][:, :2] = grip[:2] + 0.042 * ways + rng.uniform(-0.01, 0.01, (24, 2))
+    targets = gripper + rng.uniform(-0.02, 0.02, (24, 10, 3))
+    targets[:, :, :2] += 0.01 * np.arange(1, 11)[:, None] * ways[:, None]
+    targets[:, :, 2] += 0.02
+    return visited_states(env.mj_model, starts, np.zeros((24, 10, 0)), every=13, mocap=targets)
+
+
 def finger_states(env: Any) -> Visited:
     """Random torques, from 24 starts of episodes."""
     starts = environments.reset(env, jax.random.split(jax.random.key(3), 24))[0].data.qpos
@@ -111,6 +126,7 @@ def sawyer_states(env: Any) -> Visited:
 
 
 STATES: dict[str, Callable[[Any], Visited]] = {
+    "FetchPush": push_states,
     "FetchReach": fetch_states,
     "FingerTurn": finger_states,
     "HandReach": hand_states,

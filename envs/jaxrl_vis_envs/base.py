@@ -38,7 +38,8 @@ class State:
         goal_state: [G] float32, value of that quantity in the goal image. Neither is shown to the agent.
         reward: [] float32, `goals.oracle_reward` of the two.
         done: [] float32, always 0: all episodes have the same length, and their end is a truncation.
-        metrics: ``success`` ([] float32, 0 or 1) and ``goal_distance`` ([] float32, unit of the state).
+        metrics: ``success`` ([] float32, 0 or 1), ``goal_distance`` ([] float32, unit of the state), and what else `GoalEnv`
+            says in ``metric_names``.
         obs: ``observation`` from `GoalEnv.observe`, ``achieved_goal`` and ``desired_goal`` in the form of `GoalEnv.as_goal`;
             None if the caller asked for no images (`GoalEnv.advance` passes it through unchanged).
         history: [F - 1, nq] float32, joint positions one, two, ... control steps ago, if an observation stacks F > 1 images;
@@ -81,6 +82,7 @@ class GoalEnv(abc.ABC):
     # Difficulty of the task before learning, measured by benchmarks/tasks/task_difficulty.py; None: not measured.
     chance: float | None = None  # success rate of uniformly random actions
     difficulty: float | None = None  # mean distance from start to goal, in multiples of `threshold`
+    metric_names: tuple[str, ...] = ("success", "goal_distance")  # of `State.metrics` whose means at the last step are logged
     frame_stack: int = 1  # F, number of most recent images stacked in an observation
 
     if not TYPE_CHECKING:  # hidden from type checkers, which would accept any attribute
@@ -118,6 +120,11 @@ class GoalEnv(abc.ABC):
         If images are stacked, C is F times the channels of one image, newest first. The older images are the newest ones of the
         preceding observations, or repeat the episode's first image, so a replay needs to store only the newest image of each.
         """
+
+    @property
+    def converts_goals(self) -> bool:
+        """Return True if `as_goal` changes observations: they stack images, or show more than a goal is about."""
+        return self.frame_stack > 1
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
         """Convert an observation to the goal of reaching it, with the same shape: its newest image, repeated F times.

@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Iterable
 
 TASKS = {
+    "FetchPush": "jaxrl_vis_envs.tasks.fetch_push",
     "FetchReach": "jaxrl_vis_envs.tasks.fetch_reach",
     "FingerTurn": "jaxrl_vis_envs.tasks.finger_turn",
     "HandReach": "jaxrl_vis_envs.tasks.hand_reach",

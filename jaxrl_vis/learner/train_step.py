@@ -208,7 +208,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
     replay = replay._replace(num_envs=config.run.num_envs // shards.count)
     stored = auxiliary.stored_spec(env.observation_spec, env.horizon)
     replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, stored)
-    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if stacked > 1 else None, auxiliary, shards)
+    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.converts_goals else None, auxiliary, shards)
     insert = iterations.make_insert(config, sampler, auxiliary)
     with tracing_for_default_device():
         plays_any = targets_cpu() and layout.mesh is None and shards.count == 1

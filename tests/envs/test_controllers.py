@@ -4,7 +4,15 @@ import pytest
 
 from benchmarks.tasks import controllers
 
-EPISODES = {"FetchReach": 24, "FingerTurn": 6, "HandReach": 16, "Reacher": 64, "SawyerReach": 64, "StalkReach": 64}
+EPISODES = {
+    "FetchPush": 32,
+    "FetchReach": 24,
+    "FingerTurn": 6,
+    "HandReach": 16,
+    "Reacher": 64,
+    "SawyerReach": 64,
+    "StalkReach": 64,
+}
 
 
 def test_every_task_has_a_controller():

@@ -10,8 +10,8 @@ import jaxrl_vis_envs
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
-# Two joints on one body, slides and hinges off the origin, a branch, a body without joints, a carried body with another on it,
-# a camera that rides on a body and one that looks at it, a reference position other than 0.
+# Two joints on one body, slides and hinges off the origin, a branch, a free body with another on it, a body without joints, a
+# carried body with another on it, a camera that rides on a body and one that looks at it, a reference position other than 0.
 TREE = """
 <mujoco>
   <worldbody>
@@ -36,6 +36,11 @@ TREE = """
           <camera name="rider" pos="0 0 .2" euler="30 0 0"/>
         </body>
       </body>
+      <body pos="0 .3 0"><joint axis="0 0 1"/><geom size=".1"/></body>
+    </body>
+    <body pos="0 0 2" euler="10 0 0">
+      <freejoint/>
+      <geom type="box" size=".1 .2 .05" pos=".1 0 0"/>
       <body pos="0 .3 0"><joint axis="0 0 1"/><geom size=".1"/></body>
     </body>
   </worldbody>

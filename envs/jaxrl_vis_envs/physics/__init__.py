@@ -3,6 +3,7 @@
     mjx_model           the MJX engine: loading a model and stepping it; `take_steps` and `simulate` choose between the engines
     constraints         accelerations under constraints for the MJX engine: by `newton`, or by MJX's own solver
     newton              a constraint solver for small trees in matrices, the fastest on CPUs
+    box_contacts        contacts between boxes
     kinematics          forward kinematics, all bodies at once
     rotations           quaternions and frames, from a private module of MJX
     inverse_kinematics  joint angles that bring the last link of a chain to a pose
@@ -12,9 +13,9 @@ MJX runs every model on every platform and is the reference. The scalar engine c
 supports (`scalar.supports`), as long as nothing disturbs them (`mjx_model.take_steps`), where it is faster:
 
     engine    NVIDIA GPUs                                  CPUs
-    scalar    all tasks that are shipped, in one kernel    FingerTurn (up to three joints, if `newton` does not support them)
-    MJX       models that `scalar` does not support,       FetchReach, Reacher, SawyerReach and StalkReach with `newton`,
-              randomized dynamics                          HandReach with MJX's own solver
+    scalar    all tasks but FetchPush, in one kernel       FingerTurn (up to three joints, if `newton` does not support them)
+    MJX       models that `scalar` does not support,       FetchPush, FetchReach, Reacher, SawyerReach and StalkReach with
+              randomized dynamics                          `newton`, HandReach with MJX's own solver
 
 Other accelerators run MJX. Importing this package makes MJX import faster and without its notice about Warp (`mjx_imports`).
 """

@@ -7,10 +7,11 @@ as long. Other models are left to MJX's own solver.
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import smooth, solver, support
 
-from jaxrl_vis_envs.physics import newton
+from jaxrl_vis_envs.physics import newton, rotations
 
 # Rows of contacts and equalities. Beyond, steps are MJX's own: grasping's results, with more contacts, are recorded with these,
 # and the shorter step rounds differently.
@@ -63,16 +64,35 @@ def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         return mjx.euler(model, _after_solving(data))
     timestep = model.opt.timestep
     velocity = data.qvel + timestep * _damped_accelerations(model, data)
-    position = data.qpos + timestep * velocity
+    position = _integrate(model, data.qpos, velocity)
     return data.replace(qpos=position, qvel=velocity, time=data.time + timestep, qacc_warmstart=data.qacc)
+
+
+def _integrate(model: mjx.Model, position: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Return ``qpos`` [nq] a time step later, at velocities [nv]."""
+    timestep = model.opt.timestep
+    if model.nq == model.nv:
+        return position + timestep * velocity
+    places, speeds = model.jnt_qposadr, model.jnt_dofadr
+    is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
+    moved = position.at[places[~is_free]].add(timestep * velocity[speeds[~is_free]])
+    for place, speed in zip(places[is_free], speeds[is_free], strict=True):
+        turn = velocity[speed + 3 : speed + 6]
+        axis, rate = rotations.normalize_with_norm(turn)
+        rotated = rotations.quat_mul(position[place + 3 : place + 7], rotations.axis_angle_to_quat(axis, timestep * rate))
+        moved = moved.at[place : place + 3].add(timestep * velocity[speed : speed + 3])
+        moved = moved.at[place + 3 : place + 7].set(rotations.normalize(rotated))
+    return moved
 
 
 def _has_short_step(model: mjx.Model, data: mjx.Data) -> bool:
     """Return True if `euler` takes its own step: for hinges and slides with damping, a dense mass matrix and few contacts."""
     is_damped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    if newton.supports(model):
+        return is_damped
     has_only_hinges_and_slides = model.nq == model.nv and not model.na
     coupled_rows = int(data._impl.nefc - data._impl.nf - data._impl.nl)
-    is_small = newton.supports(model) or (coupled_rows <= _MAX_COUPLED_ROWS and not support.is_sparse(model))
+    is_small = coupled_rows <= _MAX_COUPLED_ROWS and not support.is_sparse(model)
     return is_damped and has_only_hinges_and_slides and is_small
 
 

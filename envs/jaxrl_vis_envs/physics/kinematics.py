@@ -17,7 +17,7 @@ from mujoco.mjx._src import smooth, support
 
 from jaxrl_vis_envs.physics import rotations
 
-_ONE_DEGREE_OF_FREEDOM = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_SUPPORTED = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
 
 _rotate = jax.vmap(rotations.rotate)
 _multiply = jax.vmap(rotations.quat_mul)
@@ -37,12 +37,12 @@ class _Nodes(NamedTuple):
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute poses as `mjx.kinematics` does, in a fraction of the operations, and the poses of cameras on bodies.
 
-    Descendants of a mocap body move with it, as in MuJoCo (in MJX they stay). Models with ball or free joints are left to MJX.
+    Descendants of a mocap body move with it, as in MuJoCo (in MJX they stay). Models with ball joints are left to MJX.
     """
-    if not np.isin(model.jnt_type, _ONE_DEGREE_OF_FREEDOM).all():
+    if not np.isin(model.jnt_type, _SUPPORTED).all():
         return _place_cameras(model, mjx.kinematics(model, data))
     nodes = _nodes(model)
-    displacement = data.qpos - model.qpos0
+    displacement = (data.qpos - model.qpos0)[model.jnt_qposadr]
     position, rotation = _relative_poses(model, data, nodes, displacement)
     ancestor = nodes.parent
     for _ in range(int(np.ceil(np.log2(max(nodes.depth, 1))))):
@@ -56,6 +56,9 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     is_slide = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_SLIDE
     if is_slide.any():
         anchor = anchor - jnp.where(is_slide, displacement, 0.0)[:, None] * axis
+    is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
+    if is_free.any():
+        axis = jnp.where(is_free[:, None], model.jnt_axis, axis)
     xpos, xquat = position[nodes.body_nodes], rotation[nodes.body_nodes]
     to_global = jax.vmap(support.local_to_global)
     xipos, ximat = to_global(xpos, xquat, model.body_ipos, model.body_iquat)
@@ -91,12 +94,17 @@ def _relative_poses(model: mjx.Model, data: mjx.Data, nodes: _Nodes, displacemen
     rotation = jnp.concatenate([body_quat, jnp.array([[1.0, 0.0, 0.0, 0.0]])])[nodes.body]
     if not model.njnt:
         return position, rotation
-    is_slide = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_SLIDE
-    turn = jax.vmap(rotations.axis_angle_to_quat)(model.jnt_axis, jnp.where(is_slide, 0.0, displacement))
+    is_slide, is_free = (np.asarray(model.jnt_type) == kind for kind in _SUPPORTED[1:])
+    turn = jax.vmap(rotations.axis_angle_to_quat)(model.jnt_axis, jnp.where(is_slide | is_free, 0.0, displacement))
     shift = jnp.where(is_slide, displacement, 0.0)[:, None] * model.jnt_axis + model.jnt_pos - _rotate(model.jnt_pos, turn)
     joints = nodes.joint_nodes
     position = position.at[joints].add(_rotate(shift, rotation[joints]))
-    return position, rotation.at[joints].set(_multiply(rotation[joints], turn))
+    rotation = rotation.at[joints].set(_multiply(rotation[joints], turn))
+    for joint in np.flatnonzero(is_free):  # of a child of the world, whose pose its coordinates are
+        first = model.jnt_qposadr[joint]
+        position = position.at[joints[joint]].set(data.qpos[first : first + 3])
+        rotation = rotation.at[joints[joint]].set(rotations.normalize(data.qpos[first + 3 : first + 7]))
+    return position, rotation
 
 
 def _nodes(model: mjx.Model) -> _Nodes:

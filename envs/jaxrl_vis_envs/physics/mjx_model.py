@@ -16,7 +16,7 @@ from mujoco import mjx
 from mujoco.mjx._src import sensor, smooth
 
 from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, targets_cpu, use_gpu_kernels
-from jaxrl_vis_envs.physics import constraints, newton, rotations, scalar
+from jaxrl_vis_envs.physics import box_contacts, constraints, newton, rotations, scalar
 from jaxrl_vis_envs.physics.kinematics import kinematics
 
 __all__ = [
@@ -151,7 +151,8 @@ def _forward(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
     """Compute accelerations from positions, velocities and controls, as `mjx.forward` does; for ``exact`` see `step`."""
     data = smooth.com_pos(model, kinematics(model, data))
     data = smooth.crb(model, smooth.tendon(model, data))
-    data = mjx.collision(model, smooth.tendon_armature(model, data))
+    data = smooth.tendon_armature(model, data)
+    data = box_contacts.collide(model, data) if box_contacts.supports(model) else mjx.collision(model, data)
     pairs = np.stack([model.pair_geom1, model.pair_geom2])
     if exact and np.any(np.all(model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_CAPSULE, axis=0)):
         data = _place_capsule_contacts(model, data)
@@ -243,5 +244,8 @@ def point_velocity(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: j
 
 def hinge_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
     """Return the derivative of a ``point`` [3] (m, world) and of the rotation of ``body`` per radian of each hinge: [nv, 6]."""
-    moves = ancestor_joints(mj_model, body)[:, None]
-    return jnp.where(moves, jnp.concatenate([jnp.cross(data.xaxis, point - data.xanchor), data.xaxis], axis=1), 0.0)
+    moves = ancestor_joints(mj_model, body)
+    axis, anchor = data.xaxis, data.xanchor
+    if mj_model.nv > mj_model.njnt:  # free joints elsewhere have one axis for six degrees of freedom
+        axis, anchor = axis[mj_model.dof_jntid], anchor[mj_model.dof_jntid]
+    return jnp.where(moves[:, None], jnp.concatenate([jnp.cross(axis, point - anchor), axis], axis=1), 0.0)

@@ -8,6 +8,8 @@ acting. FetchReach, images included, is 1.2 times as fast on two CPU cores with 
 Source: the primal problem of MuJoCo's documentation, "Computation", constraint model, and its Newton solver.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -21,17 +23,24 @@ _MAX_JOINTS = 12
 # Of 800 Newton steps in FetchReach, with joints beyond their limits and fingers in the table, none was longer than 5. Where
 # only rounding errors are left, their quotients reach 1,000 and lead away from the solution.
 _MAX_STEP = 8.0
+# With more constraints, the exact line search, whose cost grows with the square of their number, gives way to an iteration.
+_MOST_CORNERS = 64
+_ROOT_STEPS = 8
 
 
 def supports(model: mjx.Model) -> bool:
     """Return True if this solver can replace MJX's for a model.
 
-    It supports up to 12 hinges and slides, pyramidal cones, no dry friction, no activations, and the integrators RK4 and Euler,
-    the latter implicit in the damping (MuJoCo's default), with and without warm starts.
+    It supports up to 12 hinges and slides and one free joint, pyramidal cones, no dry friction, no activations, and the
+    integrators RK4 (without a free joint) and Euler, the latter implicit in the damping (MuJoCo's default), with and without
+    warm starts.
     """
+    is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
+    has_few_joints = model.nv - 6 * is_free.sum() <= _MAX_JOINTS and is_free.sum() <= 1 and model.nq == model.nv + is_free.sum()
     is_newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    is_small = model.nq == model.nv <= _MAX_JOINTS and model.na == 0
-    is_explicit = model.opt.integrator in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
+    is_small = has_few_joints and model.na == 0
+    is_euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    is_explicit = is_euler or (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and not is_free.any())
     is_damped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     has_friction = np.any(model._impl.dof_hasfrictionloss) or np.any(model._impl.tendon_hasfrictionloss)
     return bool(is_newton and is_small and is_explicit and is_damped and not has_friction)
@@ -63,7 +72,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         acting = acting_stiffness(residual)
         inertial = _product(mass, acceleration) - data.qfrc_smooth
         slope = inertial + _product(jacobian.T, acting * residual)
-        curvature = mass + jnp.sum((acting[:, None] * jacobian)[:, :, None] * jacobian[:, None, :], axis=0)
+        curvature = mass + _weighted_square(jacobian, acting)
         direction = -solve_positive(curvature, slope)
         along = _product(jacobian, direction)
         first, second = jnp.sum(direction * inertial), jnp.sum(direction * _product(mass, direction))
@@ -80,6 +89,14 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _product(matrix: jax.Array, vector: jax.Array) -> jax.Array:
     """Multiply ``matrix`` [M, N] by ``vector`` [N] without a library call, which takes longer than these few sums."""
     return jnp.sum(matrix * vector, axis=1)
+
+
+def _weighted_square(matrix: jax.Array, weights: jax.Array) -> jax.Array:
+    """Return the sum of the outer squares of the rows of ``matrix`` [M, N], with ``weights`` [M]: [N, N]."""
+    weighted = weights[:, None] * matrix
+    if len(weights) > _MOST_CORNERS:  # a library's call pays from here on
+        return jnp.matmul(matrix.T, weighted, precision="highest")
+    return jnp.sum(weighted[:, :, None] * matrix[:, None, :], axis=0)
 
 
 def unconstrained_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
@@ -113,6 +130,8 @@ def _line_search(
         acting = jnp.where(is_equality | (moved < 0), stiffness, 0.0) * along
         return first + second * length + jnp.sum(acting * moved), second + jnp.sum(acting * along)
 
+    if len(residual) > _MOST_CORNERS:
+        return jnp.clip(_bracketed_root(slope_at), 0.0, _MAX_STEP)
     # The slope increases along the line and is linear between the corners where a constraint starts or stops acting.
     corners = jnp.where(is_equality | (along == 0), -1.0, -residual / jnp.where(along == 0, 1.0, along))
     slopes = jax.vmap(slope_at)(corners)[0]
@@ -124,6 +143,25 @@ def _line_search(
     slope, curvature = slope_at(middle)
     length = middle - slope / jnp.where(curvature > 0, curvature, 1.0)  # 0 where every direction is level
     return jnp.clip(length, 0.0, _MAX_STEP)
+
+
+def _bracketed_root(slope_at: Callable[[jax.Array], tuple[jax.Array, jax.Array]]) -> jax.Array:
+    """Return the length at which the slope of the cost is 0, by Newton's method between a length too short and one too long.
+
+    Args:
+        slope_at: Length -> slope and curvature of the cost; the slope increases and is not positive at 0.
+    """
+
+    def improve(bracket: tuple, _: None) -> tuple[tuple, None]:
+        low, high, length = bracket
+        slope, curvature = slope_at(length)
+        low, high = jnp.where(slope <= 0, length, low), jnp.where(slope > 0, length, high)
+        newton = length - slope / jnp.where(curvature > 0, curvature, 1.0)
+        is_between = (newton >= low) & (newton <= high)
+        return (low, high, jnp.where(is_between, newton, 0.5 * (low + high))), None
+
+    start = (jnp.zeros(()), jnp.float32(_MAX_STEP), jnp.ones(()))
+    return jax.lax.scan(improve, start, length=_ROOT_STEPS)[0][2]
 
 
 @jax.custom_jvp

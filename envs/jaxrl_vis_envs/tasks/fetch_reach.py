@@ -28,15 +28,12 @@ from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.physics import inverse_kinematics, mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.pixels import Observer, PixelsConfig
+from jaxrl_vis_envs.tasks.fetch_arm import FetchArm
 from jaxrl_vis_envs.tasks.mjx_env import register_task
-from jaxrl_vis_envs.tasks.pulled_arm import PulledArm, PulledArmConfig, pull
+from jaxrl_vis_envs.tasks.pulled_arm import PulledArmConfig
 
-# Quaternion of the gripper pointing down. Adding it to the link's unit quaternion, as the original does, turns the target about
-# 60 % of the rotation back to this orientation in each control step.
-_DOWN = (1.0, 0.0, 1.0, 0.0)
 # Offset of every episode's start from the grip site of the stretched arm, m.
 _SETUP_OFFSET = (-0.498, 0.005, -0.231)
-_SETTLING_SUBSTEPS = 200
 _DOWN_ROTATION = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # rotation matrix of the gripper pointing down
 _TABLE_TOP = 0.4  # m
 _GREY = (0.356, 0.361, 0.376, 1.0)  # colour of the original's gripper
@@ -96,15 +93,10 @@ class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
         checks.choice(self, "finger_colour", get_args(FingerColour))
 
 
-class FetchReach(PulledArm):
+class FetchReach(FetchArm):
     """The task. ``observer`` determines what the agent sees."""
 
     config: FetchReachConfig
-    action_size = 4
-    action_meaning = (
-        "displacement of the gripper along the world's x, y and z from where it is, in multiples of action_scale (m); the last "
-        "component is ignored"
-    )
     camera = "front"
     chance, difficulty = 0.008, 2.8  # benchmarks/tasks/task_difficulty.py FetchReach --episodes 1000
 
@@ -122,8 +114,7 @@ class FetchReach(PulledArm):
         if isinstance(config, VisualFetchReachConfig) and config.finger_colour == "grey":
             for name in ("left_finger", "right_finger"):
                 mj_model.geom(name).rgba = _GREY
-        self._fingers = np.array([mj_model.joint(name).qposadr[0] for name in ("right_finger", "left_finger")])
-        super().__init__(config, mj_model, "gripper", observer)
+        super().__init__(config, mj_model, observer)
 
     @classmethod
     def select_camera(cls, config: FetchReachConfig) -> str:
@@ -142,9 +133,7 @@ class FetchReach(PulledArm):
         """
         mj_data = mujoco.MjData(mj_model)
         mujoco.mj_forward(mj_model, mj_data)
-        position = mj_data.site("grip").xpos + np.array(_SETUP_OFFSET)
-        pull(mj_model, mj_data, position, np.array(_DOWN) / np.linalg.norm(_DOWN), _SETTLING_SUBSTEPS)
-        mujoco.mj_forward(mj_model, mj_data)
+        self._pull_grip(mj_model, mj_data, mj_data.site("grip").xpos + np.array(_SETUP_OFFSET))
         return mj_data
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
@@ -184,18 +173,6 @@ class FetchReach(PulledArm):
     def _with_cross_hair(self, data: mjx.Data, position: jax.Array) -> mjx.Data:
         """Return ``data`` with the mocap body at ``position`` [3] (m, world)."""
         return mjx_model.kinematics(self._model, data.replace(mocap_pos=position[None]))
-
-    def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        # The target is relative to the gripper, not to the previous target, so tracking errors do not accumulate.
-        position = data.xpos[self._hand] + self.config.action_scale * action[:3]
-        quaternion = data.xquat[self._hand] + jnp.asarray(_DOWN, jnp.float32)
-        data = data.replace(mocap_pos=position[None], mocap_quat=quaternion[None])
-        data = mjx_model.take_steps(self._model, data, self.config.substeps)
-        return mjx_model.kinematics(self._model, self._with_closed_fingers(data))
-
-    def _with_closed_fingers(self, data: mjx.Data) -> mjx.Data:
-        """Reset the finger positions but not their velocities, as the original does after each control step."""
-        return data.replace(qpos=data.qpos.at[self._fingers].set(0.0))
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """Return the robot at rest with its grip as near to ``goal`` [3] (m, world) as joints and table allow, pointing down.

@@ -117,7 +117,7 @@ class MjxGoalEnv(GoalEnv):
         # Sequentially, in a loop: the renderer is compiled once, with the same trace as in `observe`.
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), data, goal_data)
         frame, goal = jax.lax.map(lambda data: self._observe(data, None, domain), both)
-        return state.replace(obs={"observation": frame, "achieved_goal": frame, "desired_goal": goal})
+        return state.replace(obs={"observation": frame, "achieved_goal": self.as_goal(frame), "desired_goal": goal})
 
     def advance(self, state: State, action: jax.Array) -> State:
         self.check_action(action)

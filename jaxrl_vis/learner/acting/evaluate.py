@@ -39,17 +39,14 @@ def summarize(
     """Summarize the episodes of an evaluation.
 
     Args:
-        outcome: ``success`` and ``goal_distance`` of all N episodes at their last steps, [S, N].
+        outcome: The task's metrics (`GoalEnv.metric_names`) of all N episodes at their last steps, [S, N].
         observations: [S, K, T+2, ...] of the recorded episodes, the goals' at the end.
         success: [S, at least K] of the recorded episodes and possibly more.
         frame_stack: Images that an observation stacks.
         xp: ``jax.numpy`` or ``numpy``, whose arrays these are.
     """
-    metrics = {
-        "eval/success": xp.mean(outcome["success"], axis=1),
-        "eval/goal_distance": xp.mean(outcome["goal_distance"], axis=1),
-        "eval/goal_distance_median": xp.median(outcome["goal_distance"], axis=1),
-    }
+    metrics = {f"eval/{name}": xp.mean(values, axis=1) for name, values in outcome.items()}
+    metrics["eval/goal_distance_median"] = xp.median(outcome["goal_distance"], axis=1)
     if frame_stack > 1:  # for people, the newest of stacked images, which come first
         observations = observations[:, :, :, : observations.shape[3] // frame_stack]
     frames, goals = observations[:, :, :-1], observations[:, :, -1]

@@ -103,7 +103,7 @@ class Rollout(NamedTuple):
 
     Attributes:
         episodes: The kept episodes, [S, K, ...].
-        outcome: ``success`` and ``goal_distance`` of all episodes at their last step, [S, E].
+        outcome: the task's metrics (`GoalEnv.metric_names`) of all episodes at their last step, [S, E].
         record: Result of ``record`` for the kept episodes' states after 0, 1, ... T steps, [S, K, T+1, ...]; or None.
     """
 
@@ -184,7 +184,7 @@ def play(
     carry = (state.replace(obs=None), first_observation)
     step_keys = jax.vmap(lambda key: jax.random.split(key, env.horizon), out_axes=1)(policy_keys)
     (state, _), ((observations, states, actions), records) = jax.lax.scan(step, carry, step_keys)
-    outcome = {name: by_seed(state.metrics[name]) for name in ("success", "goal_distance")}
+    outcome = {name: by_seed(state.metrics[name]) for name in env.metric_names}
 
     episodes = Episodes(
         observations=_episode_major(kept(first_observation)[None], observations, kept(goal)[None]),

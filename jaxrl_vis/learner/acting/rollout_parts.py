@@ -93,4 +93,4 @@ def played_spec(env: GoalEnv, size: int, seeds: int) -> Played:
         states=spec((*slots, env.goal_state_size)),
         actions=spec((seeds, size, env.horizon, env.action_size)),
     )
-    return episodes, {name: spec((seeds, size)) for name in ("success", "goal_distance")}
+    return episodes, {name: spec((seeds, size)) for name in env.metric_names}

@@ -149,6 +149,8 @@ class Sampler:
             # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.
             reached = jax.vmap(self.as_goal)(batch.observation_tp1)
             batch = batch.replace(reached=reached)
+            if batch.goal.ndim == 2:  # of states; the replay repeats a goal's newest image itself
+                batch = batch.replace(observations=batch.observations.at[1].set(jax.vmap(self.as_goal)(batch.goal)))
         if self.config.study.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))

@@ -67,8 +67,6 @@ class ThreadedRollout:
         """Evaluate by ``program``, as `TrainStep.evaluate` does, with the key of each seed, [S]; returns NumPy's arrays."""
         num_kept = num_recorded(count)
         played = jax.device_get(self.play(program, train, keys, count, NO_EXPLORATION, num_kept=num_kept))
-        outcome = {
-            name: join_parts([part[name] for _, part in played], count, np, axis=1) for name in ("success", "goal_distance")
-        }
+        outcome = {name: join_parts([part[name] for _, part in played], count, np, axis=1) for name in sorted(played[0][1])}
         recorded = [episodes.observations for episodes, _ in played if episodes is not None]
         return summarize(outcome, join_parts(recorded, num_kept, np, axis=1), outcome["success"], frame_stack, np)

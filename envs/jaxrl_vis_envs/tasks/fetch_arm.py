@@ -1,0 +1,58 @@
+"""Fetch arm of Gymnasium-Robotics: its start, and the displacements that pull its gripper, which always points down."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from jaxrl_vis_envs.physics import mjx_model
+from jaxrl_vis_envs.physics.mjx_model import mjx
+from jaxrl_vis_envs.pixels import Observer
+from jaxrl_vis_envs.tasks.pulled_arm import PulledArm, PulledArmConfig, pull
+
+# Quaternion of the gripper pointing down. Adding it to the link's unit quaternion, as the original does, turns the target about
+# 60 % of the rotation back to this orientation in each control step.
+_DOWN = (1.0, 0.0, 1.0, 0.0)
+_SETTLING_SUBSTEPS = 200
+
+
+class FetchArm(PulledArm):
+    """Arm with closed fingers. Its model has the parts of fetch_reach.xml."""
+
+    action_size = 4
+    action_meaning = (
+        "displacement of the gripper along the world's x, y and z from where it is, in multiples of action_scale (m); the last "
+        "component is ignored"
+    )
+
+    def __init__(
+        self, config: PulledArmConfig, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None
+    ) -> None:
+        """Compute the start.
+
+        Args:
+            config: Settings of the task.
+            mj_model: Model with the arm.
+            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+        """
+        self._fingers = np.array([mj_model.joint(name).qposadr[0] for name in ("right_finger", "left_finger")])
+        super().__init__(config, mj_model, "gripper", observer)
+
+    def _pull_grip(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData, position: np.ndarray) -> None:
+        """Pull the gripper's link to ``position`` [3] (m, world) for 0.4 s, pointing down."""
+        pull(mj_model, mj_data, position, np.array(_DOWN) / np.linalg.norm(_DOWN), _SETTLING_SUBSTEPS)
+        mujoco.mj_forward(mj_model, mj_data)
+
+    def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
+        # The target is relative to the gripper, not to the previous target, so tracking errors do not accumulate.
+        position = data.xpos[self._hand] + self.config.action_scale * action[:3]
+        quaternion = data.xquat[self._hand] + jnp.asarray(_DOWN, jnp.float32)
+        data = data.replace(mocap_pos=position[None], mocap_quat=quaternion[None])
+        data = mjx_model.take_steps(self._model, data, self.config.substeps)
+        return mjx_model.kinematics(self._model, self._with_closed_fingers(data))
+
+    def _with_closed_fingers(self, data: mjx.Data) -> mjx.Data:
+        """Reset the finger positions but not their velocities, as the original does after each control step."""
+        return data.replace(qpos=data.qpos.at[self._fingers].set(0.0))
