@@ -70,6 +70,7 @@ def _make_env(image_size: int) -> types.SimpleNamespace:
         observation_spec=jax.ShapeDtypeStruct((1, image_size, image_size), jnp.uint8),
         goal_state_size=3,
         action_size=4,
+        metric_names=("success", "goal_distance"),
     )
 
 
