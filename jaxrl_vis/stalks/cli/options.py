@@ -21,6 +21,8 @@ _GRASPING = {"cv2": "opencv-python-headless", "scipy": "scipy", "yaml": "pyyaml"
 _EXTRAS = {"phenotyping": {**_GRASPING, "tifffile": "tifffile", "pandas": "pandas"}, "grasping": _GRASPING}
 _COMMANDS = {"phenotyping": "phenotype", "grasping": "grasp"}
 Purpose = Literal["phenotyping", "grasping"]
+DEFAULT_STEPS = 20_000
+"""Most updates of a training on synthetic images."""
 
 
 def check_extra(extra: Purpose) -> None:
@@ -130,8 +132,8 @@ class TrainingOptions(PlantOptions):
     """The file to write, .safetensors; `run` and `eval` take it as --weights."""
     minutes: float | None = None
     """Most minutes; the weights are written at the end, and every half minute before."""
-    steps: int = 20000
-    """Most updates."""
+    steps: int | None = None
+    """Most updates: 20,000 if not given, and 1,500 where `phenotype train` learns from --data."""
     images: int = 800
     """Number of images to learn from."""
     batch: int = 16

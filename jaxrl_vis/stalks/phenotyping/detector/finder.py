@@ -63,8 +63,11 @@ def higher_up(stalk: np.ndarray) -> np.ndarray:
 
 
 def resize_factor(width: int, settings: Settings, density: float | None) -> float:
-    """Factor by which `resize` resizes an image ``width`` pixels wide: only where its density is known it is enlarged."""
-    return min(settings.resizing(width, density), _MAX_ENLARGED if density and settings.density else 1.0)
+    """Factor by which `resize` resizes an image ``width`` pixels wide.
+
+    It is enlarged only where its density is known, or where the networks learned from images that were.
+    """
+    return min(settings.resizing(width, density), _MAX_ENLARGED if density or not settings.density else 1.0)
 
 
 def resize(image: np.ndarray, settings: Settings, density: float | None) -> tuple[np.ndarray, tuple[float, float]]:
@@ -109,7 +112,7 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
-def _segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
+def segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
     """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle.
 
     Snips of another resolution are resized to the ``full`` size: the network knows stalks that are as many pixels wide there.
@@ -203,7 +206,7 @@ class Finder:
             part = stalks[start : start + self._batch]
             filled = np.pad(part, ((0, self._batch - len(part)), (0, 0)), mode="edge")
             snips = cut(on_device, filled, shape)
-            masks.append(_segment(self._params["segmenter"], snips, settings, self.dtype, full))
+            masks.append(segment(self._params["segmenter"], snips, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -241,27 +242,37 @@ def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | 
     return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
 
 
+_MOST_ENLARGED = 3.0
+_WIDEST_SNIP = 512  # pixels
+_WIDEST = 2048  # pixels of an image that was resized so that its boxes have the size that networks know
+
+
 def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
     """Settings whose anchors are as large as the boxes of a folder's annotations.
 
-    What was learned from images of unknown cameras is looked for in images that are reduced as those were.
+    Images of unknown cameras are resized so that boxes are as tall as the band; what was learned from them is looked for in
+    images that are resized likewise. Snips grow and shrink with them, as they show the stalk of a box.
 
     Raises:
         RequestError: The annotations or the calibration of the folder cannot be read.
     """
     data = read_annotations(folder, labels)
     densities = _densities(folder, data["images"])
-    factors = {image["id"]: resize_factor(image["width"], settings, densities[image["id"]]) for image in data["images"]}
-    sizes = np.array(
-        [
-            np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]]
-            for annotation in data["annotations"]
-            if not annotation.get("iscrowd")
-        ]
-    )
+    known = all(densities.values())
+    widths = {image["id"]: image["width"] for image in data["images"]}
+    boxes = [annotation for annotation in data["annotations"] if not annotation.get("iscrowd")]
+    if not known:
+        tall = float(np.median([annotation["bbox"][3] / widths[annotation["image_id"]] for annotation in boxes]))
+        width = round(min(settings.band_lines / tall, _WIDEST, _MOST_ENLARGED * max(widths.values())))
+        ratio = settings.full_width / settings.width
+        settings = dataclasses.replace(settings, density=0.0, width=max(width, 32), full_width=max(round(ratio * width), 32))
+    factors = {number: resize_factor(width, settings, densities[number]) for number, width in widths.items()}
+    sizes = np.array([np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]] for annotation in boxes])
+    # A snip is at least twice as wide as the boxes: trunks are thicker than stalks.
+    columns = 8 * math.ceil(2.0 * settings.full_width / settings.width * float(np.median(sizes[:, 0])) / 8)
     return dataclasses.replace(
         settings,
-        density=settings.density if all(densities.values()) else 0.0,
+        snip_columns=min(max(settings.snip_columns, columns), _WIDEST_SNIP),
         band_lines=round(float(np.median(sizes[:, 1])), 1),
         anchor_widths=tuple(round(float(width), 1) for width in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95))),
     )
