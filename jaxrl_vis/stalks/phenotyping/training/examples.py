@@ -35,6 +35,8 @@ MAX_STALKS = 56
 """Stalks of an image that networks learn from."""
 _BARELY = 0.02  # what is seen less is not there
 _THIN = 4
+_AT_STALKS = 0.8  # of images that are cut: the share that is cut around a stalk
+_SCALES = (-0.5, 0.6)  # logarithms of the factors by which the scale of images by day varies
 _HIGHER = 0.3  # share of the stalks of which the networks also learn the piece around the upper height
 
 
@@ -67,8 +69,12 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         frames: Number of images of it, spread over it.
     """
     sequence = Sequence.of(draw(family, seed))
-    density = sequence.drive.true.focal / family.rig.distance
+    settled = sequence.plot.family
+    density = sequence.drive.true.focal / settled.rig.distance
     rng = np.random.default_rng([seed, 17])
+    by_day = settled.scene.share > 0
+    if by_day:  # nobody knows the scale of other people's images exactly
+        density *= float(np.exp(rng.uniform(*_SCALES)))
     length = len(sequence)
     chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
     examples = []
@@ -79,8 +85,38 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         masks_of = functools.partial(_instance_masks, instance, indices)
-        examples.append(_example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER))
+        example = _example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER)
+        examples.append(_cut_out(example, (settings.lines, settings.width), rng) if by_day else example)
     return examples
+
+
+def _cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:
+    """Return an example with a part of its image of at most so many lines and columns: wide lenses show much."""
+    size = example.image.shape[:2]
+    lines, columns = (min(length, limit) for length, limit in zip(size, most))
+    low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])
+    there = np.flatnonzero(example.kinds == STALK)
+    if len(there) and rng.random() < _AT_STALKS:
+        box = example.stalks[rng.choice(there)]
+        middle = np.array([box[1] + box[3], box[0] + box[2]]) / 2
+        low, high = np.clip(middle - 0.9 * np.array([lines, columns]), 0, high), np.clip(middle - [0.1 * lines, 0.1 * columns], 0, high)
+    top, left = (int(rng.integers(int(first), int(last) + 1)) for first, last in zip(low, high))
+    stalks = example.stalks - np.array([left, top, left, top, left, left], np.float32)
+    inside = np.array([[lines, columns]]) > np.maximum(stalks[:, [1, 0]], 0.0)
+    shown = (np.minimum(stalks[:, [3, 2]], [lines, columns]) - np.maximum(stalks[:, [1, 0]], 0.0) > [16.0, 3.0]) & inside
+    there = shown.all(axis=1) & (example.kinds != NOTHING)
+    kinds = np.where(there, example.kinds, NOTHING)
+    image = example.image[top : top + lines, left : left + columns]
+    return dataclasses.replace(example, image=np.ascontiguousarray(image), stalks=_clipped(stalks, lines, columns), kinds=kinds)
+
+
+def _clipped(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
+    """Return stalks [T, 6] with boxes cut off where an image ends, and the axis where the box does."""
+    left, top, right, bottom, above, below = stalks.T
+    slope = (below - above) / np.maximum(bottom - top, 1e-3)
+    first, last = np.clip(top, 0, lines), np.clip(bottom, 0, lines)
+    axis = above + slope * (first - top), below + slope * (last - bottom)
+    return np.stack([np.clip(left, 0, columns), first, np.clip(right, 0, columns), last, *axis], axis=1).astype(np.float32)
 
 
 def _instance_masks(
