@@ -86,8 +86,8 @@ def _building(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
     columns = np.arange(part.shape[1])
     ribs = 1.0 + rng.uniform(0.0, 0.5) * np.sin(2 * np.pi * columns / rng.uniform(3, 16))
     picture = picture.copy()
-    picture[top : _HORIZON + 6, left : left + wide] = colour * ribs[None, :, None] * (
-        0.9 + 0.2 * smooth_noise(rng, (20, 20), part.shape[:2])[..., None]
+    picture[top : _HORIZON + 6, left : left + wide] = (
+        colour * ribs[None, :, None] * (0.9 + 0.2 * smooth_noise(rng, (20, 20), part.shape[:2])[..., None])
     )
     return picture
 
@@ -149,7 +149,9 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
         whole = np.asarray(opened.convert("RGB"))
     tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in whole.shape[:2])
     line, column = rng.integers(0, whole.shape[0] - tall + 1), rng.integers(0, whole.shape[1] - wide + 1)
-    part = Image.fromarray(whole[line : line + tall, column : column + wide]).resize(SHAPE[::-1], Image.Resampling.BILINEAR)
+    part = Image.fromarray(whole[line : line + tall, column : column + wide]).resize(
+        (SHAPE[1], SHAPE[0]), Image.Resampling.BILINEAR
+    )
     values = (np.asarray(part) / 255.0) ** 2.2
     return values[:, ::-1] if rng.random() < 0.5 else values
 

@@ -23,7 +23,9 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
     gains = np.exp(scene.white_balance * rng.normal(size=3) * [1.0, 0.2, 1.0])
     contrast = np.exp(0.12 * rng.normal())
     table = np.clip((np.arange(256) / 255.0)[:, None] ** contrast * gains ** (1 / 2.2), 0.0, 1.0)
-    values = np.stack([np.round(255.0 * table[:, channel]).astype(np.uint8)[image[..., channel]] for channel in range(3)], axis=2)
+    values = np.stack(
+        [np.round(255.0 * table[:, channel]).astype(np.uint8)[image[..., channel]] for channel in range(3)], axis=2
+    )
     values = _moved(values, scene.motion[0] * width)
     share = scene.resolution[0]
     small = Image.fromarray(values).resize((max(round(share * width), 8), max(round(share * height), 8)), Image.Resampling.BOX)

@@ -42,8 +42,8 @@ class Day(NamedTuple):
     Attributes:
         sun: [3] unit vector towards the sun, in the world.
         sunlight, skylight: [3] light on a white surface, red, green and blue.
-        shadow: [4] share of the sunlight that shadows take away, share of the ground that they cover, and their size and that of
-            the gaps in them, m.
+        shadow: [4] share of the sunlight that shadows take away, share of the ground that they cover, and their size and that
+            of the gaps in them, m.
         backdrop: [h, w, 3] radiance beyond everything, see `backdrop`.
     """
 
@@ -356,7 +356,7 @@ def _daylight(
     gloss: jax.Array,
 ) -> list[jax.Array]:
     """Compute radiance by sun and sky at points of the camera's frame, m: red, green and blue."""
-    sun = tuple(sum(shot.rotation[i, k] * day.sun[k] for k in range(3)) for i in range(3))
+    sun = tuple(shot.rotation[i] @ day.sun for i in range(3))
     facing = _dot(at.normal, sun)
     # Leaves let light through.
     lit = jnp.maximum(facing, jnp.where(is_leaf, -0.45, 0.0) * facing)

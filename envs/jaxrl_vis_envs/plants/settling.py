@@ -42,7 +42,9 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         size = rng.uniform(0.7, 1.2)
         stalks = dataclasses.replace(stalks, **_MAIZE_STALKS | {"diameter_mean": 0.022 * size})
         leaves = dataclasses.replace(leaves, **_MAIZE_LEAVES, density=leaves.density * rng.uniform(0.5, 1.3))
-        layout = dataclasses.replace(layout, stalks_mean=layout.stalks_mean * rng.uniform(0.3, 0.6), tillers=0.0, offset_sd=0.015)
+        layout = dataclasses.replace(
+            layout, stalks_mean=layout.stalks_mean * rng.uniform(0.3, 0.6), tillers=0.0, offset_sd=0.015
+        )
     leaves, textures = _ripeness(leaves, textures, rng)
     if scene.potted:
         layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=rng.integers(1, 3), stalks_sd=0.0, rows_behind=0)
@@ -62,7 +64,9 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
     return _family(family, scene, layout, stalks, leaves, textures, rig, imaging)
 
 
-def _family(family: Family, scene: Scene, layout: Layout, stalks: Stalks, leaves: Leaves, textures: Textures, rig: Rig, imaging):
+def _family(
+    family: Family, scene: Scene, layout: Layout, stalks: Stalks, leaves: Leaves, textures: Textures, rig: Rig, imaging
+):
     return dataclasses.replace(
         family, scene=scene, layout=layout, stalks=stalks, leaves=leaves, textures=textures, rig=rig, imaging=imaging
     )

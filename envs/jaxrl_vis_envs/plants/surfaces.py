@@ -193,7 +193,24 @@ def _ground_by_day(rng: np.random.Generator, grass: bool, soil: list[float]) -> 
         return [*colour, *over, 1 / 0.008, 0.6, 1 / 0.15, 0.4, 0.3, 1 / 0.02, 0.0, 10.0, 0.0, 0.0, place, 0.5]
     if rng.random() < 0.3:
         grey = rng.uniform(0.15, 0.6)
-        return [grey, grey, grey, *([0.9 * grey] * 3), 1 / 0.003, 0.1, 1 / 0.3, 0.15, 0.0, 1 / 0.01, 0.0, 10.0, 0.0, 0.05, place, 0.5]
+        return [
+            grey,
+            grey,
+            grey,
+            *([0.9 * grey] * 3),
+            1 / 0.003,
+            0.1,
+            1 / 0.3,
+            0.15,
+            0.0,
+            1 / 0.01,
+            0.0,
+            10.0,
+            0.0,
+            0.05,
+            place,
+            0.5,
+        ]
     brightness = rng.uniform(0.6, 2.0)
     return [brightness * channel for channel in soil[:6]] + soil[6:]
 

@@ -99,8 +99,8 @@ def _split(options: Train, names: list[str], examples: list[Example], say: Any) 
         )
     else:
         say(
-            f"{len(examples)} images of {parts.photographs} photographs: {len(parts.train)} to learn from, {len(parts.stop)} to "
-            f"decide when to stop, {len(parts.test)} for the report"
+            f"{len(examples)} images of {parts.photographs} photographs: {len(parts.train)} to learn from, {len(parts.stop)} "
+            f"to decide when to stop, {len(parts.test)} for the report"
         )
     return parts
 

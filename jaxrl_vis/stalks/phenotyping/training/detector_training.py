@@ -139,7 +139,8 @@ def update_networks(
         total, parts = detector_loss(params["detector"], images, stalks, kinds, settings, dtype, near)
         if strips is None:
             return total, parts
-        of_masks = segmenter_loss(params["segmenter"], *vary_snips(*strips, variation), settings, dtype)
+        snips, masks = vary_snips(strips[0], strips[1], variation)
+        of_masks = segmenter_loss(params["segmenter"], snips, masks, settings, dtype)
         return total + of_masks, {**parts, "masks": of_masks}
 
     gradients, parts = jax.grad(loss, has_aux=True)(params)

@@ -99,7 +99,10 @@ def _cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) 
     if len(there) and rng.random() < _AT_STALKS:
         box = example.stalks[rng.choice(there)]
         middle = np.array([box[1] + box[3], box[0] + box[2]]) / 2
-        low, high = np.clip(middle - 0.9 * np.array([lines, columns]), 0, high), np.clip(middle - [0.1 * lines, 0.1 * columns], 0, high)
+        low, high = (
+            np.clip(middle - 0.9 * np.array([lines, columns]), 0, high),
+            np.clip(middle - [0.1 * lines, 0.1 * columns], 0, high),
+        )
     top, left = (int(rng.integers(int(first), int(last) + 1)) for first, last in zip(low, high))
     stalks = example.stalks - np.array([left, top, left, top, left, left], np.float32)
     inside = np.array([[lines, columns]]) > np.maximum(stalks[:, [1, 0]], 0.0)

@@ -7,11 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.boxes import overlap
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect
 from jaxrl_vis.stalks.phenotyping.detector.finder import segment
 from jaxrl_vis.stalks.phenotyping.detector.losses import STALK, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, overlaps_with
 from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
@@ -77,21 +76,31 @@ def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], se
         image = image_batch([example], shape)[0][0]
         there = jax.device_get(detect(params, image, settings, dtype))
         stalks, scores = there.stalks[there.valid], there.scores[there.valid]
-        finds.append(Finds(stalks, scores, *_match(stalks, scores, example), int((example.kinds == STALK).sum())))
+        matched = match_finds(stalks, scores, example.stalks, example.kinds)
+        finds.append(Finds(stalks, scores, *matched, int((example.kinds == STALK).sum())))
     return finds
 
 
-def _match(stalks: np.ndarray, scores: np.ndarray, example: Example) -> tuple[np.ndarray, np.ndarray]:
-    """Return which finds are stalks, each once, the best first; and which lie in unclear regions."""
-    truth, unclear = (example.stalks[example.kinds == kind] for kind in (STALK, UNCLEAR))
-    overlaps = np.asarray(overlap(stalks[:, :4], truth[:, :4])) if len(truth) else np.zeros((len(stalks), 0))
-    right, free = np.zeros(len(stalks), bool), np.ones(len(truth), bool)
+def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Match finds with true stalks, the best first, a stalk once, at an overlap of boxes of 0.5.
+
+    Args:
+        stalks: [K, 6] finds.
+        scores: [K].
+        truth: [T, 6] stalks of the image.
+        kinds: [T] int32: `losses.NOTHING`, ``UNCLEAR`` or ``STALK``.
+
+    Returns:
+        Which finds are stalks [K] bool, and which lie on unclear ones and count neither way [K] bool.
+    """
+    clear, unclear = truth[kinds == STALK], truth[kinds == UNCLEAR]
+    right, free = np.zeros(len(stalks), bool), np.ones(len(clear), bool)
     for place in np.argsort(-scores, kind="stable"):
-        fitting = np.where(free, overlaps[place], 0.0)
+        fitting = np.where(free, overlaps_with(stalks[place, :4], clear[:, :4]), 0.0)
         if fitting.size and fitting.max() >= IOU:
             right[place], free[int(fitting.argmax())] = True, False
-    beside = np.asarray(overlap(stalks[:, :4], unclear[:, :4])) >= IOU if len(unclear) else np.zeros((len(stalks), 0), bool)
-    return right, beside.any(axis=1) & ~right
+    beside = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
+    return right, beside & ~right
 
 
 def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, dtype: Any) -> float:
