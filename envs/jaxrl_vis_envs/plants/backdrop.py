@@ -149,9 +149,8 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
         whole = np.asarray(opened.convert("RGB"))
     tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in whole.shape[:2])
     line, column = rng.integers(0, whole.shape[0] - tall + 1), rng.integers(0, whole.shape[1] - wide + 1)
-    part = Image.fromarray(whole[line : line + tall, column : column + wide]).resize(
-        (SHAPE[1], SHAPE[0]), Image.Resampling.BILINEAR
-    )
+    part = Image.fromarray(whole[line : line + tall, column : column + wide])
+    part = part.resize((SHAPE[1], SHAPE[0]), Image.Resampling.BILINEAR)
     values = (np.asarray(part) / 255.0) ** 2.2
     return values[:, ::-1] if rng.random() < 0.5 else values
 

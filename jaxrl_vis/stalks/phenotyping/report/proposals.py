@@ -12,7 +12,7 @@ from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.io.annotations import coco
 
-_TOLERANCE = 0.5  # pixels by which an outline of few corners differs from the mask
+_TOLERANCE = 0.8  # pixels by which an outline of few corners differs from the mask
 
 
 def outline(detection: Detection) -> list[float]:

@@ -126,7 +126,7 @@ def tune(examples: Sequence[Example], parts: Split, settings: Settings, tuning: 
     while step < tuning.steps:
         elapsed = time.monotonic() - started
         progress = max(step / tuning.steps, elapsed / (60.0 * tuning.minutes) if tuning.minutes else 0.0)
-        if progress >= 1.0:
+        if step and progress >= 1.0:
             why = f"{tuning.minutes:g} minutes are over"
             break
         rate = tuning.rate * min((step + 1) / _WARM_UP, 1.0) * 0.5 * (1.0 + np.cos(np.pi * progress))
