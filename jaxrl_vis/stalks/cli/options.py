@@ -161,6 +161,25 @@ class TrainingOptions(PlantOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class DetectorTraining(TrainingOptions):
+    """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
+
+    data: Path | None = None
+    """A folder of annotated images, in place of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal VOC,
+    LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in folders below."""
+    label: tuple[str, ...] = ()
+    """Names of what counts as a stalk in --data, as `stem`; what is called otherwise is background. If not given, what is
+    called a stalk, or everything where nothing has a name."""
+    start: str | None = None
+    """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`. If not given,
+    `random`, and for --data `shipped`, as a few images are too few to learn everything from."""
+    batch: int = 8
+    """Images per update."""
+    snips: int = 32
+    """Strips at full resolution per update, for the masks."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class EvaluationOptions(PlantOptions):
     """Options of a command that scores results against the truth of synthetic plots or runs."""
 

@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import DEFAULT_STEPS, TrainingOptions, check_extra
+from jaxrl_vis.stalks.cli.options import DEFAULT_STEPS, DetectorTraining, check_extra
 from jaxrl_vis.stalks.cli.tuning import train_on_images
 
 if TYPE_CHECKING:
@@ -23,26 +23,7 @@ _FIRST_SEED = 100_000
 """First seed of the plots that networks learn from: evaluations use the seeds below."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Train(TrainingOptions):
-    """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
-
-    data: Path | None = None
-    """A folder of annotated images, in place of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal VOC,
-    LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in folders below."""
-    label: tuple[str, ...] = ()
-    """Names of what counts as a stalk in --data, as `stem`; what is called otherwise is background. If not given, what is
-    called a stalk, or everything where nothing has a name."""
-    start: str | None = None
-    """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`. If not given,
-    `random`, and for --data `shipped`, as a few images are too few to learn everything from."""
-    batch: int = 8
-    """Images per update."""
-    snips: int = 32
-    """Strips at full resolution per update, for the masks."""
-
-
-def train(options: Train) -> int:
+def train(options: DetectorTraining) -> int:
     """Train the networks and write their weights."""
     check_counts(snips=options.snips)
     options.check()
@@ -65,7 +46,7 @@ def train(options: Train) -> int:
     return _train(options)
 
 
-def _train(options: Train) -> int:
+def _train(options: DetectorTraining) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
     from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
@@ -105,7 +86,7 @@ def _train(options: Train) -> int:
     return 0
 
 
-def _start(options: Train) -> tuple[Any, "Settings", str]:
+def _start(options: DetectorTraining) -> tuple[Any, "Settings", str]:
     """Return parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights

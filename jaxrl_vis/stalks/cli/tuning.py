@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import DetectorTraining
 
 if TYPE_CHECKING:
-    from jaxrl_vis.stalks.cli.phenotype_train import Train
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.training.examples import Example
     from jaxrl_vis.stalks.phenotyping.training.photographs import Split
@@ -23,7 +23,7 @@ _STEPS = 1500
 _RATE, _RATE_FROM_RANDOM = 3e-4, 1e-3
 
 
-def train_on_images(options: Train, folder: Path) -> int:
+def train_on_images(options: DetectorTraining, folder: Path) -> int:
     """Train on a folder of annotated images; write the weights, and a report on images that were held out beside them."""
     began = time.monotonic()
 
@@ -74,7 +74,7 @@ def train_on_images(options: Train, folder: Path) -> int:
     return 0
 
 
-def _read_examples(options: Train, folder: Path, settings: Settings, count: int, say: Any) -> list[Example]:
+def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, count: int, say: Any) -> list[Example]:
     """Read all images with their stalks and snips, and say how far it is every few seconds."""
     from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples
 
@@ -88,7 +88,7 @@ def _read_examples(options: Train, folder: Path, settings: Settings, count: int,
     return examples
 
 
-def _split(options: Train, names: list[str], examples: list[Example], say: Any) -> Split:
+def _split(options: DetectorTraining, names: list[str], examples: list[Example], say: Any) -> Split:
     """Split the images by photograph, and say how many are where."""
     from jaxrl_vis.stalks.phenotyping.training.photographs import FEWEST, photographs_of, split
 
@@ -148,7 +148,7 @@ def _report(
     say(f"{page}: the held-out images, before and after")
 
 
-def _start(options: Train, folder: Path, say: Any) -> tuple[Any, Settings, str]:
+def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Settings, str]:
     """Return parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights

@@ -86,12 +86,18 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         masks_of = functools.partial(_instance_masks, instance, indices)
         example = _example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER)
-        examples.append(_cut_out(example, (settings.lines, settings.width), rng) if by_day else example)
+        examples.append(cut_out(example, (settings.lines, settings.width), rng) if by_day else example)
     return examples
 
 
-def _cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:
-    """Return an example with a part of its image of at most so many lines and columns: wide lenses show much."""
+def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:
+    """Return an example with a part of its image of at most so many lines and columns, mostly around a stalk.
+
+    Args:
+        example: The example; its snips stay as they are.
+        most: Most lines and columns.
+        rng: For the place.
+    """
     size = example.image.shape[:2]
     lines, columns = (min(length, limit) for length, limit in zip(size, most))
     low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])

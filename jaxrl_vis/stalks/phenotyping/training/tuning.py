@@ -26,13 +26,14 @@ from jaxrl_vis.stalks.phenotyping.training.detector_training import (
     initial_networks,
     update_networks,
 )
-from jaxrl_vis.stalks.phenotyping.training.examples import Example
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, find_in, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import Split
 
 FROZEN = ("stem", "fine")
 """Layers that stay as they are where there are weights to start from."""
 _WARM_UP = 50  # updates until the rate is highest
+_STRIP, _BESIDE = 256, 3.0  # columns of what is learned from at once: pixels, and widths of the widest box
 _HEARTBEAT = 10.0  # s between signs of life of what takes long
 
 Say = Callable[[str], None]
@@ -187,13 +188,19 @@ class _Batches:
     """Batches of images and snips, drawn at random."""
 
     def __init__(self, examples: list[Example], shape: tuple[int, int], tuning: Tuning) -> None:
-        self._examples, self._shape, self._tuning = examples, shape, tuning
+        self._examples, self._tuning = examples, tuning
+        # All lines, as the height of a find is a matter of what is above and below it.
+        widest = max(float((stalk[2] - stalk[0]).max()) for stalk in (example.stalks.T for example in examples))
+        self._shape = shape[0], min(shape[1], padded_shape((1, max(_STRIP, round(_BESIDE * widest))))[1])
         self._rng = np.random.default_rng(tuning.seed)
         self._snips, self._masks = _alike(examples) if tuning.snips else (np.zeros(0), np.zeros(0))
 
     def draw(self) -> Any:
         """Draw a batch, as `update_networks` takes it."""
-        chosen = [self._examples[place] for place in self._rng.integers(len(self._examples), size=self._tuning.batch)]
+        chosen = [
+            cut_out(self._examples[place], self._shape, self._rng)
+            for place in self._rng.integers(len(self._examples), size=self._tuning.batch)
+        ]
         strips = None
         if len(self._snips):
             places = self._rng.integers(len(self._snips), size=self._tuning.snips)
