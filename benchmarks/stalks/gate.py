@@ -38,7 +38,7 @@ WIDTH, FRAMES = 844, 2
 RIGHT = 0.8
 """F1 of an image's finds from which on it is read rightly."""
 MOST_FLAGGED = 0.04
-AXES = 12
+AXES = 8
 Photograph = tuple[np.ndarray, int, Callable[[np.ndarray], int]]
 
 
@@ -92,8 +92,25 @@ def f1_of(hits: int, finds: int, stalks: int) -> float:
     return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
 
 
-def seen_in(path: Path, finder: Finder) -> Iterator[Seen]:
-    """Look at the images of a file of `draw`."""
+def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
+    """Look at the images of a file of `draw`, or read what networks of this name saw in them before."""
+    kept = path.with_suffix(f".{name.split()[-1]}.npz")
+    if not kept.exists():
+        arrays = {}
+        for place, seen in enumerate(_seen_now(path, finder)):
+            values = {"pooled": seen.pooled, "scores": seen.scores, "f1": seen.f1, "plain": seen.plain}
+            arrays |= {f"{key}_{place}": value for key, value in values.items()}
+        np.savez(kept, **arrays)
+    family = path.stem.split("_", 1)[1].rpartition("_")[0]
+    with np.load(kept) as data:
+        columns = [[data[f"{key}_{place}"] for place in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
+    return [
+        Seen(family, pooled, scores, float(f1), (float(plain[0]), float(plain[1])))
+        for pooled, scores, f1, plain in zip(*columns)
+    ]
+
+
+def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
     with np.load(path) as data:
         for place in range(FRAMES):
             image, truth, kinds = (data[f"{name}_{place}"] for name in ("image", "stalks", "kinds"))
@@ -101,7 +118,7 @@ def seen_in(path: Path, finder: Finder) -> Iterator[Seen]:
             right, ignored = match_finds(stalks, scores, truth, kinds)
             counted = (scores >= LEAST_SCORE) & ~ignored
             f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
-            yield Seen(path.stem.split("_", 1)[1].rpartition("_")[0], pooled, scores, f1, plain_measures(image))
+            yield Seen("", pooled, scores, f1, plain_measures(image))
 
 
 def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
@@ -177,11 +194,11 @@ def main() -> None:
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
         if path.exists():
-            seen[part] += seen_in(path, finder)
+            seen[part] += seen_in(path, finder, detector_name(options.weights))
     fitted, tried = seen["fit"], seen["test"]
     wrong = np.array([image.f1 < RIGHT for image in fitted])
-    pooled = np.array([image.pooled for image in fitted])
-    gate = fit_gate(pooled, [image.scores for image in fitted], wrong, AXES, MOST_FLAGGED)
+    pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES
+    gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MOST_FLAGGED)
     about = {"images": len(fitted), "families": list(PLOTS), "origin": "synthetic images alone"}
     write_gate(options.weights, gate, about)
     if options.photographs:

@@ -23,7 +23,8 @@ def images() -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
 
 @pytest.fixture(scope="module")
 def gate(images):
-    return fit_gate(*images, axes=3, most_flagged=0.05)
+    pooled, scores, wrong = images
+    return fit_gate(pooled, scores, wrong, np.arange(260), axes=3, most_flagged=0.05)
 
 
 def test_a_gate_flags_what_lies_elsewhere_and_what_is_unsure(images, gate):
@@ -40,8 +41,8 @@ def test_a_gate_flags_what_lies_elsewhere_and_what_is_unsure(images, gate):
 
 def test_a_gate_needs_images_of_both_kinds(images):
     pooled, scores, wrong = images
-    with pytest.raises(ValueError, match="needs 6 images that are read rightly, and one that is not"):
-        fit_gate(pooled[:200], scores[:200], wrong[:200], axes=3, most_flagged=0.05)
+    with pytest.raises(ValueError, match="needs 9 images that are read rightly, and one that is not"):
+        fit_gate(pooled[:200], scores[:200], wrong[:200], np.arange(200), axes=3, most_flagged=0.05)
 
 
 def test_a_gate_is_for_its_weights_alone(gate, images, tmp_path):

@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Seven photographs with a bright stalk each, one of them twice, with outlines."""
     folder = tmp_path_factory.mktemp("labelled")
     rng = np.random.default_rng(0)
-    images, annotations = [], []
+    images, annotations, images_drawn = [], [], []
     for number in range(8):
         noise = rng.integers(0, 120, (6, 6, 3)).astype(np.uint8)
         image = cv2.resize(noise, IMAGE[::-1], interpolation=cv2.INTER_LINEAR)
@@ -38,7 +38,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         image[:, left : left + 8] = 220
         name = f"{number}.png"
         if number == 7:  # a copy of the first, as labelling programs export them
-            image, left, name = cv2.imread(str(folder / "0.png")), 6, "0.rf.00ff00ff00ff.png"
+            image, left, name = images_drawn[0], 6, "0.rf.00ff00ff00ff.png"
+        images_drawn.append(image)
         cv2.imwrite(str(folder / name), image)
         images.append({"id": number, "file_name": name, "width": IMAGE[1], "height": IMAGE[0]})
         outline = [left, 15, left + 8, 15, left + 8, 45, left, 45]

@@ -19,6 +19,7 @@ from jaxrl_vis.stalks.digests import file_digest
 MEASURES = 3
 """Numbers of an image that decide."""
 _COMMAND = "python -m benchmarks.stalks.gate"
+_PARTS = 5
 _UNSURE = 0.1  # scores below are of what is no stalk
 
 
@@ -112,38 +113,53 @@ def read_gate(weights: Path) -> Gate | None:
     arrays, digest, _ = read_parameters(path, _COMMAND, declare)
     if digest != file_digest(weights):
         return None
-    mean, scale, axes, weights = (np.asarray(arrays[name]) for name in ("mean", "scale", "axes", "weights"))
-    return Gate(mean, scale, axes, float(arrays["beside"]), weights, float(arrays["threshold"]))
+    mean, scale, axes, linear = (np.asarray(arrays[name]) for name in ("mean", "scale", "axes", "weights"))
+    return Gate(mean, scale, axes, float(arrays["beside"]), linear, float(arrays["threshold"]))
 
 
-def fit_gate(pooled: np.ndarray, scores: list[np.ndarray], wrong: np.ndarray, axes: int, most_flagged: float) -> Gate:
+def fit_gate(
+    pooled: np.ndarray, scores: list[np.ndarray], wrong: np.ndarray, plots: np.ndarray, axes: int, most_flagged: float
+) -> Gate:
     """Fit a gate.
+
+    Images lie nearer to statistics that they are part of. So weights and threshold come from measures by the statistics of
+    other plots: of five parts, each is measured by the four others.
 
     Args:
         pooled: [N, D] of synthetic images.
         scores: Scores of each.
         wrong: [N] bool, True for those that were read wrongly.
+        plots: [N] int, the plot of each.
         axes: Number of principal axes.
         most_flagged: Greatest share of the images that were read rightly and are told to be unlike what the networks know.
 
     Raises:
         ValueError: There are too few images of a kind.
     """
-    right = pooled[~wrong]
-    if len(right) < 2 * axes or not wrong.any():
-        raise ValueError(f"a gate needs {2 * axes} images that are read rightly, and one that is not")
-    mean, scale = right.mean(axis=0), right.std(axis=0) + 1e-4
+    if (~wrong).sum() < 3 * axes or not wrong.any():
+        raise ValueError(f"a gate needs {3 * axes} images that are read rightly, and one that is not")
+    parts = np.unique(plots, return_inverse=True)[1] % _PARTS
+    measures = np.zeros((len(wrong), MEASURES))
+    for part in range(_PARTS):
+        here = np.flatnonzero(parts == part)
+        of_others = _statistics(pooled[~wrong & (parts != part)], axes)
+        measures[here] = [of_others.measures(pooled[place], scores[place]) for place in here]
+    weights = logistic(measures, wrong)
+    doubts = 1.0 / (1.0 + np.exp(-np.clip(weights[0] + measures @ weights[1:], -30.0, 30.0)))
+    threshold = float(np.quantile(doubts[~wrong], 1.0 - most_flagged))
+    return dataclasses.replace(_statistics(pooled[~wrong], axes), weights=weights, threshold=threshold)
+
+
+def _statistics(right: np.ndarray, axes: int) -> Gate:
+    """Return a gate with the statistics of pooled features [N, D], and no weights yet."""
+    mean, scale = right.mean(axis=0), right.std(axis=0)
+    scale = scale + 0.1 * scale.mean() + 1e-6  # what hardly varies among a few images may vary more among others
     offset = (right - mean) / scale
     _, lengths, directions = np.linalg.svd(offset, full_matrices=False)
     spread = lengths[:axes] / np.sqrt(len(right))
     principal = (directions[:axes] / spread[:, None]).T
     left = offset - (offset @ directions[:axes].T) @ directions[:axes]
-    gate = Gate(mean, scale, principal, float(np.sqrt(np.mean(left**2))), np.zeros(1 + MEASURES), 0.5)
-    measures = np.array([gate.measures(*each) for each in zip(pooled, scores)])
-    weights = logistic(measures, wrong)
-    gate = dataclasses.replace(gate, weights=weights)
-    doubts = np.array([gate.doubt(*each) for each in zip(pooled, scores)])
-    return dataclasses.replace(gate, threshold=float(np.quantile(doubts[~wrong], 1.0 - most_flagged)))
+    return Gate(mean, scale, principal, float(np.sqrt(np.mean(left**2))), np.zeros(1 + MEASURES), 0.5)
 
 
 def logistic(measures: np.ndarray, wrong: np.ndarray) -> np.ndarray:
