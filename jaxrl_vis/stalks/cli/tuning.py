@@ -58,14 +58,13 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
         rate=options.rate or (_RATE_FROM_RANDOM if start is None else _RATE),
         seed=options.seed,
     )
-    tuned = tune(examples, parts, settings, tuning, start, say)
-    about = {
-        "version": __version__,
-        "origin": f"annotated images{origin}",
-        "steps": tuned.steps,
-        "seed": options.seed,
-    }
-    write_weights(options.out, tuned.params, settings, about)
+
+    def keep(params: Any, step: int) -> None:
+        about = {"version": __version__, "origin": f"annotated images{origin}", "steps": step, "seed": options.seed}
+        write_weights(options.out, params, settings, about)
+
+    tuned = tune(examples, parts, settings, tuning, start, say, keep)
+    keep(tuned.params, tuned.steps)
     say(f"the end: {tuned.why}; weights are those of update {tuned.steps}")
     if parts.test:
         _report(page, examples, parts, tuned, settings, start, masks, say)

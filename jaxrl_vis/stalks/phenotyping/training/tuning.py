@@ -88,7 +88,15 @@ class Tuned:
     update_s: float
 
 
-def tune(examples: Sequence[Example], parts: Split, settings: Settings, tuning: Tuning, start: Any, say: Say) -> Tuned:
+def tune(
+    examples: Sequence[Example],
+    parts: Split,
+    settings: Settings,
+    tuning: Tuning,
+    start: Any,
+    say: Say,
+    keep: Callable[[Any, int], None] = lambda params, step: None,
+) -> Tuned:
     """Train networks on annotated images.
 
     Args:
@@ -98,6 +106,7 @@ def tune(examples: Sequence[Example], parts: Split, settings: Settings, tuning: 
         tuning: Schedule.
         start: Parameters to go on from; None for random ones.
         say: See `Say`.
+        keep: Called with the best parameters so far and their update, so that a training that is stopped leaves them.
 
     Raises:
         NonFiniteError: A loss is not finite any more.
@@ -141,6 +150,8 @@ def tune(examples: Sequence[Example], parts: Split, settings: Settings, tuning: 
                 raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
             line = "  ".join(f"{name} {value:.3f}" for name, value in values.items())
             looked = watch.look(state[1], step) if step % tuning.look == 0 else ""
+            if step % tuning.look == 0 and (watch.step == step or not stop):
+                keep(state[1], step)
             say(f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {line}{looked}")
             last = time.monotonic()
         if watch.over:
