@@ -129,6 +129,12 @@ def run(
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
+    if request.tried is not None:
+        about.append(
+            "Counting and measuring was tried on synthetic rows of sorghum in the light of a flash alone, seen from aside with "
+            f"{request.tried.density:.0f} pixels or more per metre of the row and {request.tried.view:.2f} m of it from top to "
+            "bottom; on no real row."
+        )
     with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
         return _run(plots, find, request, driven, page, done, say, run_all)
 
