@@ -17,7 +17,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.training.detector_training import beginning, image_batch, update_networks
-from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, cut_out, resized_snips, settings_for
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, match_finds, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import photographs_of, split
 from jaxrl_vis.stalks.phenotyping.training.tuning import FROZEN, Tuning, tune
@@ -164,3 +164,22 @@ def test_images_are_resized_so_that_boxes_are_as_tall_as_the_band(folder):
     assert settings.width == 2 * IMAGE[1] and settings.band_lines == 60.0 and settings.full_width == 2 * IMAGE[1]
     example = next(iter(annotated_examples(folder, settings)))
     assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 90.0
+
+
+def test_cut_examples_keep_the_stalks_that_show():
+    image = np.arange(100 * 200 * 3, dtype=np.uint32).reshape(100, 200, 3).astype(np.uint8)
+    stalks = np.array([[20, 30, 30, 80, 22, 28], [180, 10, 190, 90, 185, 185], [0] * 6], np.float32)
+    example = Example(
+        image, stalks, np.array([STALK, STALK, NOTHING]), np.zeros((2, 40, 16, 3), np.uint8), np.ones((2, 40, 16), bool)
+    )
+    for seed in range(20):
+        cut = cut_out(example, (100, 60), np.random.default_rng(seed))
+        assert cut.image.shape == (100, 60, 3)
+        left = int(np.flatnonzero((image[0, :, 0] == cut.image[0, 0, 0]) & (image[0, :, 1] == cut.image[0, 0, 1]))[0])
+        shown = [box[0] < left + 57 and box[2] > left + 3 for box in stalks[:2]]
+        assert (cut.kinds[:2] == STALK).tolist() == shown
+        for box, kind, whole in zip(cut.stalks, cut.kinds, stalks):
+            if kind == STALK and left <= whole[0] and whole[2] <= left + 60:
+                np.testing.assert_allclose(box, whole - [left, 0, left, 0, left, left])
+    resized = resized_snips(example, (80, 24))
+    assert resized.snips.shape == (2, 80, 24, 3) and resized.masks.shape == (2, 80, 24) and resized.masks.all()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,8 +87,22 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         masks_of = functools.partial(_instance_masks, instance, indices)
         example = _example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER)
-        examples.append(cut_out(example, (settings.lines, settings.width), rng) if by_day else example)
+        if by_day:
+            # Lenses and scales differ from plot to plot, and each shape of snips would be a program of its own.
+            shape = snip_shape((settings.snip_lines, settings.snip_columns), family.rig.width / settings.full_width)
+            example = resized_snips(cut_out(example, (settings.lines, settings.width), rng), shape)
+        examples.append(example)
     return examples
+
+
+def resized_snips(example: Example, shape: tuple[int, int]) -> Example:
+    """Return an example whose snips, and their masks, have so many lines and columns."""
+    if not len(example.snips) or example.snips.shape[1:3] == shape:
+        return example
+    size = (shape[1], shape[0])
+    snips = np.stack([cv2.resize(snip, size, interpolation=cv2.INTER_LINEAR) for snip in example.snips])
+    masks = [cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in example.masks]
+    return dataclasses.replace(example, snips=snips, masks=np.stack(masks))
 
 
 def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:

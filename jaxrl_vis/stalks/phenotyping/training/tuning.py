@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.training.detector_training import (
     initial_networks,
     update_networks,
 )
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resized_snips
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, find_in, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import Split
 
@@ -221,14 +220,12 @@ class _Batches:
 
 def _alike(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
     """Return snips [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to the size in the middle of theirs."""
-    pairs = [pair for example in examples for pair in zip(example.snips, example.masks)]
-    if not pairs:
+    shapes = sorted(example.snips.shape[1:3] for example in examples for _ in example.snips)
+    if not shapes:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)
-    shapes = sorted(snip.shape[:2] for snip, _ in pairs)
     lines, columns = shapes[len(shapes) // 2]
-    snips = [cv2.resize(snip, (columns, lines), interpolation=cv2.INTER_LINEAR) for snip, _ in pairs]
-    masks = [cv2.resize(mask.astype(np.uint8), (columns, lines), interpolation=cv2.INTER_NEAREST) > 0 for _, mask in pairs]
-    return np.stack(snips), np.stack(masks)
+    alike = [resized_snips(example, (lines, columns)) for example in examples if len(example.snips)]
+    return np.concatenate([each.snips for each in alike]), np.concatenate([each.masks for each in alike])
 
 
 def _largest(examples: Sequence[Example]) -> tuple[int, int]:
