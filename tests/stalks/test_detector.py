@@ -392,10 +392,10 @@ def test_annotations_of_ones_own(tmp_path):
         ],
     }
     (tmp_path / "annotations.json").write_text(json.dumps(data))
-    settings = settings_for(tmp_path, TINY)
+    settings = settings_for(tmp_path, dataclasses.replace(TINY, band_lines=40.0))  # as tall as the boxes: nothing is resized
     assert settings.band_lines == 40.0 and 8.0 <= settings.anchor_widths[0] < settings.anchor_widths[-1] <= 16.0
     (example,) = annotated_examples(tmp_path, settings)
-    assert (example.kinds == STALK).sum() == 2 and example.snips.shape == (2, 32, 16, 3)
+    assert (example.kinds == STALK).sum() == 2 and example.snips.shape == (2, 32, 24, 3)  # twice as wide as the boxes
     np.testing.assert_allclose(example.stalks[0], [10, 10, 26, 50, 23, 13], atol=1.5)
     np.testing.assert_allclose(example.stalks[1], [40, 10, 48, 50, 44, 44], atol=0.01)
     (tmp_path / "row.png").unlink()

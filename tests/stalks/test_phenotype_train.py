@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import initial
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, outlined_mask
@@ -68,8 +69,10 @@ def test_training_goes_on_from_weights_and_boxes_leave_masks_alone(folder, weigh
     assert train(tmp_path / "more.safetensors", folder, "--start", str(weights), "--steps", "3", "--rate", "1") == 0
     said = capsys.readouterr().out
     assert f"from {weights}" in said and "masks stay as they are" in said and "stalks: stalk (3)" in said
+    assert "3 photographs, fewer than 5: none is held out" in said and not (tmp_path / "more.html").exists()
     _, settings, about = read_weights(tmp_path / "more.safetensors")
-    assert settings == dataclasses.replace(TINY, density=0.0)  # all the candidates of a new training
+    # All the candidates of a new training; images are not resized, as boxes are as tall as the band.
+    assert settings == dataclasses.replace(TINY, density=0.0)
     assert about["origin"] == f"annotated images, from {weights}"
     changes = differences(tmp_path / "more.safetensors", weights)
     assert changes["detector"] > 1e-3 and changes["segmenter"] == 0.0
@@ -98,8 +101,12 @@ def test_outlines_teach_masks(folder, weights, tmp_path):
 
 
 def test_boxes_of_another_size_start_from_random_weights_or_are_refused(folder, tmp_path, capsys):
-    # So small an image is not reduced: 30 lines, where the weights that ship know 135.
-    assert train(tmp_path / "out.safetensors", folder, "--start", "shipped", "--steps", "1") == 2
+    # A calibration says how large the stalks are: 30 lines, where the weights that ship know 135.
+    calibrated = tmp_path / "calibrated"
+    shutil.copytree(folder, calibrated)
+    density = read_weights(SHIPPED)[1].density
+    write_calibration(calibrated / "calibration.yaml", Calibration(IMAGE[1], IMAGE[0], 0.8 * density, (31.5, 29.5), 0.1))
+    assert train(tmp_path / "out.safetensors", calibrated, "--start", "shipped", "--steps", "1") == 2
     refusal = capsys.readouterr().err
     assert "30 pixels tall" in refusal and "135" in refusal and "--start random" in refusal
     assert not (tmp_path / "out.safetensors").exists()
@@ -216,7 +223,8 @@ def test_a_box_that_is_not_there_is_the_one_around_the_mask(tmp_path, segmentati
     for annotation in ({}, {"bbox": None}):
         (found,) = read_annotations(coco_folder(tmp_path, {"segmentation": segmentation, **annotation}))["annotations"]
         assert found["bbox"] == BOX
-    assert settings_for(tmp_path, TINY).band_lines == 40.0
+    settings = settings_for(tmp_path, TINY)
+    assert settings.band_lines == 30.0 and settings.width == 48  # the image is reduced so that the box is as tall
 
 
 def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):

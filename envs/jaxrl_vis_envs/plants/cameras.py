@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxrl_vis_envs.plants.family import Family, Rig
 from jaxrl_vis_envs.plants.field import generator
+from jaxrl_vis_envs.plants.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +115,9 @@ def drive(family: Family, seed: int) -> Drive:
     pitch = math.radians(rig.pitch) + math.radians(rig.pitch_sd) * (rng.normal() + 0.2 * rng.normal(size=rig.frames))
     positions = np.stack([along - baseline / 2.0, -distance, height], axis=1)
     poses = tuple(Pose(position, looking_along_y(angle)) for position, angle in zip(positions, pitch))
+    if family.scene.share > 0:
+        signs = generator(family, seed, "turn").choice([-1.0, 1.0], 2)
+        poses = tuple(_turned(pose, family.scene, signs, family.rig.distance) for pose in poses)
 
     scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*rig.odometry_noise)
     reported = (along - along[0]) * scale + 0.0005 * rng.normal(size=rig.frames) * (np.arange(rig.frames) > 0)
@@ -123,6 +127,15 @@ def drive(family: Family, seed: int) -> Drive:
         0.5 * rig.rectification_error * pixels * rng.normal() / rig.width,
     )
     return Drive(true, stated, poses, (along - begin) / rig.speed, reported, offset, slope)
+
+
+def _turned(pose: Pose, scene: Scene, signs: np.ndarray, distance: float) -> Pose:
+    """Turn a camera about the vertical through the point of the row that it looks at, and roll it about its view."""
+    yaw, roll = (math.radians(sign * angle) for sign, angle in zip(signs, (scene.yaw[0], scene.roll[0])))
+    about = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    pivot = pose.position + np.array([0.0, distance, 0.0])
+    rolled = np.array([[math.cos(roll), -math.sin(roll), 0.0], [math.sin(roll), math.cos(roll), 0.0], [0.0, 0.0, 1.0]])
+    return Pose(pivot + about @ (pose.position - pivot), rolled @ pose.rotation @ about.T)
 
 
 def looking_along_y(pitch: float) -> np.ndarray:

@@ -20,17 +20,38 @@ import numpy as np
 
 from jaxrl_vis_envs.compiling.compilation import compiler_options
 from jaxrl_vis_envs.cores import num_cores
+from jaxrl_vis_envs.plants.backdrop import REACH
 from jaxrl_vis_envs.plants.surfaces import GROUND, NOTHING
 from jaxrl_vis_envs.plants.tables import CONE_HIT, FAR, NEAR, TRIANGLE_HIT, View, tile_size
 from jaxrl_vis_envs.plants.texture import noise, ramp
 
-_GROUND_FAR = 3.5  # m: beyond, the ground is black
+_GROUND_FAR = 3.5  # m: beyond, the ground is black at night
+_HORIZON = 200.0  # m: by day
+_CANOPY = 1.6  # m: height of the leaves that cast shadows by day
 # The rays of a pixel have distinct columns and lines, so that edges of any direction are antialiased.
 _RAYS = {1: ((0.0, 0.0),), 4: ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))}
 _TILES_PER_BATCH = 256  # on an accelerator
 # Number of surfaces tested per loop iteration on an accelerator, where reading and writing the hits so far in each iteration
 # takes longer than testing a surface.
 _SURFACES_PER_STEP = 8
+
+
+class Day(NamedTuple):
+    """Daylight, all float32.
+
+    Attributes:
+        sun: [3] unit vector towards the sun, in the world.
+        sunlight, skylight: [3] light on a white surface, red, green and blue.
+        shadow: [4] share of the sunlight that shadows take away, share of the ground that they cover, and their size and that
+            of the gaps in them, m.
+        backdrop: [h, w, 3] radiance beyond everything, see `backdrop`.
+    """
+
+    sun: jax.Array
+    sunlight: jax.Array
+    skylight: jax.Array
+    shadow: jax.Array
+    backdrop: jax.Array
 
 
 class Shot(NamedTuple):
@@ -45,6 +66,7 @@ class Shot(NamedTuple):
         flash: [3] position of the flash in the camera's frame, m.
         light: [3] intensity of the flash (1: a white surface at ``reference`` facing it has radiance 1), intensity of ambient
             light, and the distance ``reference`` in m.
+        day: Daylight; None at night, where the program is one without it.
     """
 
     focal: jax.Array
@@ -54,6 +76,7 @@ class Shot(NamedTuple):
     position: jax.Array
     flash: jax.Array
     light: jax.Array
+    day: Day | None = None
 
 
 class _Tables(NamedTuple):
@@ -184,6 +207,9 @@ def _nearest(
     falling = x * up[0] + y * up[1] + up[2]
     ground = jnp.where(falling < -1e-6, -shot.position[2] / jnp.minimum(falling, -1e-6), FAR)
     is_visible = ground < _GROUND_FAR
+    if shot.day is not None:  # the ground goes on to the horizon
+        is_visible = falling < -1e-3
+        ground = jnp.minimum(ground, _HORIZON)
     start = _Hit(jnp.where(is_visible, ground, FAR), jnp.zeros(x.shape, jnp.int32), is_visible.astype(jnp.int32))
     square = x * x + y * y + 1.0
 
@@ -312,7 +338,59 @@ def _colour(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: _Hit) 
     strength, ambient, reference = shot.light
     flash = strength * (reference * reference) / jnp.maximum(square, 0.02)
     lit = flash * (rough + (1.0 - rough) * facing) + ambient
-    return [jnp.where(kind > 0, channel * lit + shine * flash * facing, 0.0) for channel in albedo]
+    at_night = [jnp.where(kind > 0, channel * lit + shine * flash * facing, 0.0) for channel in albedo]
+    if shot.day is None:
+        return at_night
+    by_day = _daylight(shot, shot.day, point, at, is_leaf, albedo, gloss)
+    beyond = _backdrop(shot, shot.day, x, y)
+    return [jnp.where(kind > 0, night + day, far) for night, day, far in zip(at_night, by_day, beyond)]
+
+
+def _daylight(
+    shot: Shot,
+    day: Day,
+    point: tuple[jax.Array, ...],
+    at: _Point,
+    is_leaf: jax.Array,
+    albedo: list[jax.Array],
+    gloss: jax.Array,
+) -> list[jax.Array]:
+    """Compute radiance by sun and sky at points of the camera's frame, m: red, green and blue."""
+    sun = tuple(shot.rotation[i] @ day.sun for i in range(3))
+    facing = _dot(at.normal, sun)
+    # Leaves let light through.
+    lit = jnp.maximum(facing, jnp.where(is_leaf, -0.45, 0.0) * facing)
+    place = [sum(point[i] * shot.rotation[i, k] for i in range(3)) + shot.position[k] for k in range(3)]
+    # Leaves at one height cast the shadows: where the ray to the sun passes it.
+    rise = jnp.maximum(_CANOPY - place[2], 0.0) / jnp.maximum(day.sun[2], 0.1)
+    u, v = (place[k] + rise * day.sun[k] for k in range(2))
+    depth, cover, size, gap = day.shadow
+    pattern = 0.65 * noise(u / size, v / size, 6) + 0.35 * noise(u / gap, v / gap, 7)
+    sunny = 1.0 - depth * ramp(1.0 - cover - 0.03, 1.0 - cover + 0.03, pattern)
+    upward = sum(at.normal[i] * shot.rotation[i, 2] for i in range(3))
+    open_sky = 0.55 + 0.45 * upward
+    to_camera = _unit(tuple(-part for part in point))
+    halfway = _unit(tuple(a + b for a, b in zip(sun, to_camera)))
+    shine = gloss * jnp.maximum(_dot(at.normal, halfway), 0.0) ** 24
+    return [
+        sunlight * sunny * (channel * lit + shine) + skylight * channel * open_sky
+        for channel, sunlight, skylight in zip(albedo, day.sunlight, day.skylight)
+    ]
+
+
+def _backdrop(shot: Shot, day: Day, x: jax.Array, y: jax.Array) -> list[jax.Array]:
+    """Look up the backdrop in the direction of rays (x, y, 1): red, green and blue."""
+    along, ahead, above = (x * shot.rotation[0, k] + y * shot.rotation[1, k] + shot.rotation[2, k] for k in range(3))
+    lines, columns = day.backdrop.shape[:2]
+    column = (0.5 + 0.5 * jnp.arctan2(along, ahead) / REACH[1]) * columns - 0.5
+    line = (0.5 - 0.5 * above / jnp.hypot(along, ahead) / REACH[0]) * lines - 0.5
+    column, line = jnp.clip(column, 0.0, columns - 1.001), jnp.clip(line, 0.0, lines - 1.001)
+    left, top = column.astype(jnp.int32), line.astype(jnp.int32)
+    u, v = (column - left)[..., None], (line - top)[..., None]
+    upper = day.backdrop[top, left] * (1 - u) + day.backdrop[top, left + 1] * u
+    lower = day.backdrop[top + 1, left] * (1 - u) + day.backdrop[top + 1, left + 1] * u
+    colour = upper * (1 - v) + lower * v
+    return [colour[..., channel] for channel in range(3)]
 
 
 def _albedo(

@@ -10,7 +10,9 @@ import math
 import numbers
 from typing import Any
 
-Range = tuple[float, float]
+from jaxrl_vis_envs.plants.scene import BOUNDS as SCENE_BOUNDS
+from jaxrl_vis_envs.plants.scene import Range, Scene
+
 INCH = 0.0254
 
 
@@ -289,6 +291,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "imaging.vignetting": (0, 1),
     "imaging.blur": (0, 3.0),
     "imaging.full_well": (10.0, 1e7),
+    **SCENE_BOUNDS,
 }
 
 
@@ -316,6 +319,8 @@ class Family:
     """Camera pair."""
     imaging: Imaging = Imaging()
     """Light and sensor."""
+    scene: Scene = Scene()
+    """Plots by day, and what surrounds them."""
 
     def __post_init__(self) -> None:
         _check_value("stream", 1, self.stream)

@@ -11,6 +11,7 @@ import numbers
 import numpy as np
 
 from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Range, Stalks
+from jaxrl_vis_envs.plants.settling import settle
 
 KNOT_SPACING = 0.04
 """Maximum distance of knots along a stalk of the near row, m."""
@@ -96,7 +97,7 @@ class Plot:
     """Contents of a plot, and of the rows behind it.
 
     Attributes:
-        family: Family it was sampled from.
+        family: Family it was sampled from; of one with plots by day and by night, what was drawn for this plot.
         seed: Seed of the sample.
         stalks: Stalks, those of the near row first, sorted by position.
         leaves: All leaves and the litter.
@@ -134,6 +135,7 @@ def draw(family: Family, seed: int) -> Plot:
     Raises:
         ValueError: The seed is not an integer of at least 0.
     """
+    family = settle(family, generator(family, seed, "scene"))
     stalks: list[Stalk] = []
     layout = family.layout
     for row in range(1 + layout.rows_behind):

@@ -1,6 +1,7 @@
 """Stereo pairs of a plot, with ground truth."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import jax
@@ -8,12 +9,33 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis_envs.plants import drawing, imaging, tables
+from jaxrl_vis_envs.plants.backdrop import draw_backdrop
 from jaxrl_vis_envs.plants.cameras import Drive, Pose, drive
+from jaxrl_vis_envs.plants.degrading import degrade
+from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Plot, generator
-from jaxrl_vis_envs.plants.surfaces import Surfaces, build
+from jaxrl_vis_envs.plants.surfaces import NOTHING, Surfaces, build
 
 _FLASH = np.array([0.05, -0.10, -0.02])
 """Position of the flash in the left camera's frame, m: above the middle of the pair."""
+
+
+@functools.lru_cache(maxsize=2)
+def daylight(family: Family, seed: int) -> drawing.Day | None:
+    """Draw the daylight and the backdrop of a plot, whose family is settled; None at night."""
+    scene = family.scene
+    if scene.share <= 0:
+        return None
+    rng = generator(family, seed, "daylight")
+    height, azimuth = np.radians(scene.elevation[0]), rng.uniform(-np.pi, np.pi)
+    sun = np.array([np.cos(height) * np.sin(azimuth), np.cos(height) * np.cos(azimuth), np.sin(height)])
+    strength = 0.0 if scene.indoors else scene.sun[0]
+    warm = np.array([1.0, rng.uniform(0.85, 1.0), rng.uniform(0.65, 0.95)])
+    blue = np.array([rng.uniform(0.75, 1.0), rng.uniform(0.85, 1.0), 1.0])
+    shadow = (scene.shadow[0], rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
+    backdrop = draw_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
+    values = (sun, strength * warm, scene.sky[0] * blue, np.array(shadow), backdrop)
+    return drawing.Day(*(jnp.asarray(value, jnp.float32) for value in values))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,10 +124,13 @@ class Sequence:
             _FLASH - offset,
             (flash, settings.ambient, family.rig.distance),
         )
-        shot = drawing.Shot(*(jnp.asarray(value, jnp.float32) for value in values))
+        shot = drawing.Shot(*(jnp.asarray(value, jnp.float32) for value in values), day=daylight(family, self.plot.seed))
         radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, settings.samples)
+        gain = 2.0 * gains[frame, side]
+        if shot.day is not None:
+            gain *= 0.5 * family.scene.brightness[0] / max(float(radiance.mean()), 1e-4)
         exposure = imaging.Exposure(
-            gain=2.0 * gains[frame, side],
+            gain=gain,
             blur=blur[side] * true.width / 3376,
             vignetting=settings.vignetting,
             full_well=settings.full_well,
@@ -113,4 +138,8 @@ class Sequence:
             noise=settings.noise,
             seed=int(generator(family, self.plot.seed, f"noise {frame} {side}").integers(1 << 32)),
         )
-        return imaging.expose(radiance, exposure), instance, depth
+        image = imaging.expose(radiance, exposure)
+        if shot.day is None:
+            return image, instance, depth
+        values, shown = degrade(np.asarray(image), family.scene, generator(family, self.plot.seed, f"degrade {frame}"))
+        return jnp.asarray(values), jnp.where(jnp.asarray(shown), instance, NOTHING), depth

@@ -5,6 +5,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxrl_vis_envs.plants.clutter import objects
 from jaxrl_vis_envs.plants.family import Range, Textures
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
 
@@ -12,6 +13,8 @@ GROUND = -2
 """Label of the ground in an instance image, in which 0, 1, ... are the stalks of a plot."""
 NOTHING = -1
 """Label where nothing is within the rendered depth."""
+OBJECT = -(1 << 20)
+"""Label of things that are no plant, as a pole."""
 LITTER = -3
 """Label of litter; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
@@ -67,6 +70,9 @@ def build(plot: Plot) -> Surfaces:
     rng = generator(plot.family, plot.seed, "textures")
     textures = plot.family.textures
     materials = [_ground(rng, textures)]
+    by_day = plot.family.scene.share > 0
+    if by_day:
+        materials = [_ground_by_day(rng, plot.family.scene.grass > 0, materials[0])]
     cones = []
     for index, stalk in enumerate(plot.stalks):
         cones.append(_cones(index, stalk, len(materials)))
@@ -77,6 +83,14 @@ def build(plot: Plot) -> Surfaces:
         hue = textures.dry_hue if leaf.dry else textures.leaf_hue
         saturation, value = ((0.35, 0.6), (0.14, 0.34)) if leaf.dry else ((0.5, 0.75), (0.09, 0.19))
         materials.append(_material(rng, textures, hue, textures.dry_hue, saturation, value))
+    if by_day:
+        round_things, flat_things = objects(plot)
+        for tube, paint in round_things:
+            cones.append(_cones(OBJECT, tube, len(materials)))
+            materials.append(paint)
+        for ribbon, paint in flat_things:
+            strips.append(_triangles(ribbon, len(materials)))
+            materials.append(paint)
     return Surfaces(**_joined(cones, _NO_CONES), **_joined(strips, _NO_TRIANGLES), materials=np.array(materials, np.float32))
 
 
@@ -168,6 +182,37 @@ def _material(
         rng.uniform(0.0, 50.0),
         rng.uniform(0.2, 1.0),
     ]
+
+
+def _ground_by_day(rng: np.random.Generator, grass: bool, soil: list[float]) -> list[float]:
+    """Return the material of grass, or of soil or concrete of any brightness."""
+    place = soil[-2]
+    if grass:
+        colour = colorsys.hsv_to_rgb(rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3))
+        over = colorsys.hsv_to_rgb(rng.uniform(0.1, 0.25), rng.uniform(0.3, 0.7), rng.uniform(0.1, 0.4))
+        return [*colour, *over, 1 / 0.008, 0.6, 1 / 0.15, 0.4, 0.3, 1 / 0.02, 0.0, 10.0, 0.0, 0.0, place, 0.5]
+    if rng.random() < 0.3:
+        grey = rng.uniform(0.15, 0.6)
+        return [
+            grey,
+            grey,
+            grey,
+            *([0.9 * grey] * 3),
+            1 / 0.003,
+            0.1,
+            1 / 0.3,
+            0.15,
+            0.0,
+            1 / 0.01,
+            0.0,
+            10.0,
+            0.0,
+            0.05,
+            place,
+            0.5,
+        ]
+    brightness = rng.uniform(0.6, 2.0)
+    return [brightness * channel for channel in soil[:6]] + soil[6:]
 
 
 def _ground(rng: np.random.Generator, textures: Textures) -> list[float]:

@@ -117,6 +117,8 @@ def _padded(table: np.ndarray, minimum: int) -> np.ndarray:
 
 def _may_be_in_sight(points: np.ndarray, pose: Pose, camera: Calibration) -> np.ndarray:
     """Return a mask of points [N, 3] in the world that may belong to something in sight: a cheap, conservative test."""
+    if pose.rotation[0, 0] != 1.0:  # turned or rolled
+        return np.ones(len(points), bool)
     depth_bound = points[:, 1] - pose.position[1] + 0.3
     wide, high = (1.15 * size / camera.focal / 2 + 0.05 for size in (camera.width, camera.height))
     sideways, above = np.abs(points[:, 0] - pose.position[0]), np.abs(points[:, 2] - pose.position[2])

@@ -14,14 +14,17 @@ from jaxrl_vis.stalks.cli import (
     grasp_train,
     phenotype_eval,
     phenotype_figure,
+    phenotype_label,
     phenotype_run,
     phenotype_synth,
     phenotype_train,
 )
+from jaxrl_vis.stalks.cli.options import DetectorTraining
 
 COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "phenotype synth": (phenotype_synth.Synth, phenotype_synth.synth),
-    "phenotype train": (phenotype_train.Train, phenotype_train.train),
+    "phenotype train": (DetectorTraining, phenotype_train.train),
+    "phenotype label": (phenotype_label.Label, phenotype_label.label),
     "phenotype run": (phenotype_run.Run, phenotype_run.run),
     "phenotype eval": (phenotype_eval.Eval, phenotype_eval.evaluate),
     "phenotype figure": (phenotype_figure.Figure, phenotype_figure.draw),

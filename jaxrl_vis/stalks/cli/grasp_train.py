@@ -12,7 +12,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import TrainingOptions, check_extra
+from jaxrl_vis.stalks.cli.options import DEFAULT_STEPS, TrainingOptions, check_extra
 
 _FIRST_SEED = 100_000
 """First seed of the rows that networks learn from: evaluations use the seeds below."""
@@ -60,7 +60,7 @@ def _train(options: Train, family) -> int:
     ]
     settings = Settings(options.loss)
     plan = Plan(
-        steps=options.steps,
+        steps=options.steps or DEFAULT_STEPS,
         minutes=options.minutes,
         images=options.images,
         first=min(16, options.images),

@@ -21,6 +21,8 @@ _GRASPING = {"cv2": "opencv-python-headless", "scipy": "scipy", "yaml": "pyyaml"
 _EXTRAS = {"phenotyping": {**_GRASPING, "tifffile": "tifffile", "pandas": "pandas"}, "grasping": _GRASPING}
 _COMMANDS = {"phenotyping": "phenotype", "grasping": "grasp"}
 Purpose = Literal["phenotyping", "grasping"]
+DEFAULT_STEPS = 20_000
+"""Most updates of a training on synthetic images."""
 
 
 def check_extra(extra: Purpose) -> None:
@@ -130,8 +132,8 @@ class TrainingOptions(PlantOptions):
     """The file to write, .safetensors; `run` and `eval` take it as --weights."""
     minutes: float | None = None
     """Most minutes; the weights are written at the end, and every half minute before."""
-    steps: int = 20000
-    """Most updates."""
+    steps: int | None = None
+    """Most updates: 20,000 if not given, and 1,500 where `phenotype train` learns from --data."""
     images: int = 800
     """Number of images to learn from."""
     batch: int = 16
@@ -156,6 +158,25 @@ class TrainingOptions(PlantOptions):
             raise RequestError(f"--rate must be more than 0, not {self.rate:g}")
         if self.out.suffix != ".safetensors":
             raise RequestError(f"the weights go into a file that ends in .safetensors, not {self.out}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DetectorTraining(TrainingOptions):
+    """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
+
+    data: Path | None = None
+    """A folder of annotated images, in place of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal VOC,
+    LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in folders below."""
+    label: tuple[str, ...] = ()
+    """Names of what counts as a stalk in --data, as `stem`; what is called otherwise is background. If not given, what is
+    called a stalk, or everything where nothing has a name."""
+    start: str | None = None
+    """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`. If not given,
+    `random`, and for --data `shipped`, as a few images are too few to learn everything from."""
+    batch: int = 8
+    """Images per update."""
+    snips: int = 32
+    """Strips at full resolution per update, for the masks."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

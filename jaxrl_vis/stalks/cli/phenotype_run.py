@@ -81,8 +81,9 @@ def run(options: Run) -> int:
     enable_compilation_cache()
     from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
-    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS
+    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS, UNFAMILIAR
 
+    gate = None
     if options.masks == "truth":
         from jaxrl_vis.stalks.phenotyping.evaluation.truth_on_disk import find_truth
 
@@ -91,12 +92,19 @@ def run(options: Run) -> int:
         from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, find_stalks, load_finder, resolve_weights
 
         weights = resolve_weights(options.weights)
-        load_finder(weights, options.least_score)  # reports what is wrong with the weights
+        gate = load_finder(weights, options.least_score).gate  # reports what is wrong with the weights
         name = f"{detector_name(weights)}, least score {options.least_score:g}"
+        if gate is None:
+            print(
+                "these weights have no gate: nothing tells whether your images are like those that they know", file=sys.stderr
+            )
         find = functools.partial(find_stalks, weights, options.least_score)
 
     tried = TRIED if options.masks == "network" else None
-    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried)
+    most_doubt = None if gate is None else gate.threshold
+    request = Request(
+        options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried, most_doubt
+    )
     for plot in plots:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
@@ -121,6 +129,12 @@ def run(options: Run) -> int:
         if NO_GROUND in row["flag"]:
             print(
                 f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
+            )
+        if UNFAMILIAR in row["flag"]:
+            print(
+                f"{row['plot']}: its images are unlike those that the networks read rightly: look at its overlays before you "
+                "trust a number",
+                file=sys.stderr,
             )
         if FEW_FRAMES in row["flag"]:
             print(f"{row['plot']}: most widths were measured in fewer than three pairs: take more of them", file=sys.stderr)

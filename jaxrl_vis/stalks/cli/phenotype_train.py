@@ -13,7 +13,8 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import TrainingOptions, check_extra
+from jaxrl_vis.stalks.cli.options import DEFAULT_STEPS, DetectorTraining, check_extra
+from jaxrl_vis.stalks.cli.tuning import train_on_images
 
 if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
@@ -22,27 +23,7 @@ _FIRST_SEED = 100_000
 """First seed of the plots that networks learn from: evaluations use the seeds below."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Train(TrainingOptions):
-    """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
-
-    data: Path | None = None
-    """A folder of annotated images, in place of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal VOC,
-    LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in folders below."""
-    label: tuple[str, ...] = ()
-    """Names of what counts as a stalk in --data, as `stem`; what is called otherwise is background. If not given, what is
-    called a stalk, or everything where nothing has a name."""
-    start: str | None = None
-    """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`; if not given,
-    `shipped` where the boxes of --data are about as tall as those that these weights find, as a few images are too few to learn
-    everything from, and `random` otherwise."""
-    batch: int = 8
-    """Images per update."""
-    snips: int = 32
-    """Strips at full resolution per update, for the masks."""
-
-
-def train(options: Train) -> int:
+def train(options: DetectorTraining) -> int:
     """Train the networks and write their weights."""
     check_counts(snips=options.snips)
     options.check()
@@ -56,6 +37,8 @@ def train(options: Train) -> int:
         raise RequestError("--label goes with --data: synthetic plots say themselves what is a stalk")
     check_extra("phenotyping")
     check_writable(options.out, "OUT")
+    if options.data is not None:
+        return train_on_images(options, options.data)
     if options.workers > 1:
         share_accelerator()
     check_devices()
@@ -63,33 +46,22 @@ def train(options: Train) -> int:
     return _train(options)
 
 
-def _train(options: Train) -> int:
+def _train(options: DetectorTraining) -> int:
     from jaxrl_vis import __version__
     from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
-    from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
     from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
-    from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, any_outlined, synthetic_examples
+    from jaxrl_vis.stalks.phenotyping.training.examples import Example, synthetic_examples
 
-    if options.data is not None:
-        print(f"{options.data}: {read_annotations(options.data, options.label)['summary']}")
     before, settings, origin_before = _start(options)
-    left_alone = {}
-    if options.data is not None and before is not None and not any_outlined(options.data, options.label):
-        # A box is no outline: what the weights know of masks is better.
-        left_alone = {"segmenter": before["segmenter"]}
-        print("masks stay as they are: no annotation has an outline, only boxes")
-    sources: list[Iterator[Example]]
-    if options.data is not None:
-        sources = [annotated_examples(options.data, settings, options.label)]
-        origin = "annotated images"
-    else:
-        family = options.read_family("phenotyping")
-        first = _FIRST_SEED * (1 + options.seed)
-        draw = functools.partial(synthetic_examples, family, settings)
-        sources = [itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))]
-        origin = f"synthetic plots of family {family.name}"
+    family = options.read_family("phenotyping")
+    first = _FIRST_SEED * (1 + options.seed)
+    draw = functools.partial(synthetic_examples, family, settings)
+    sources: list[Iterator[Example]] = [
+        itertools.chain.from_iterable(map_unordered(draw, itertools.count(first), options.workers))
+    ]
+    origin = f"synthetic plots of family {family.name}"
     plan = Plan(
-        steps=options.steps,
+        steps=options.steps or DEFAULT_STEPS,
         minutes=options.minutes,
         images=options.images,
         first=min(24, options.images),
@@ -102,40 +74,27 @@ def _train(options: Train) -> int:
     started = time.monotonic()
 
     def report(step, progress, images, losses, params) -> None:
-        write_weights(options.out, {**params, **left_alone}, settings, {**about, "steps": step})
+        write_weights(options.out, params, settings, {**about, "steps": step})
         parts = "  ".join(f"{name} {value:.3f}" for name, value in losses.items())
         print(
             f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {images} images  {parts}", flush=True
         )
 
     params, steps = train(sources, settings, plan, report, start=before)
-    write_weights(options.out, {**params, **left_alone}, settings, {**about, "steps": steps})
+    write_weights(options.out, params, settings, {**about, "steps": steps})
     print(f"{options.out}: {steps} updates on {origin}{origin_before}, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
 
 
-def _start(options: Train) -> tuple[Any, "Settings", str]:
-    """Parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
+def _start(options: DetectorTraining) -> tuple[Any, "Settings", str]:
+    """Return parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
-    from jaxrl_vis.stalks.phenotyping.training.examples import settings_for
 
-    fitting = None if options.data is None else settings_for(options.data, Settings(), options.label)
-    start = options.start or ("random" if fitting is None else "shipped")
+    start = options.start or "random"
     if start == "random":
-        return None, fitting or Settings(), ""
+        return None, Settings(), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
-    if fitting is not None and not 0.5 <= fitting.band_lines / settings.band_lines <= 2.0:
-        why = (
-            f"boxes of {options.data} are {fitting.band_lines:.0f} pixels tall in images of {settings.width}, and those that "
-            f"the weights `{start}` find {settings.band_lines:.0f}"
-        )
-        if options.start is not None:
-            raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
-        print(f"starting from random weights: {why}")
-        return None, fitting, ""
-    # What was learned goes with its anchors, so those of the annotations are not taken. How many candidates there are is no
-    # part of it: what the head has not seen yet it learns now.
-    density = settings.density if fitting is None else fitting.density
-    settings = dataclasses.replace(settings, density=density, candidates=Settings().candidates)
+    # How many candidates there are is no part of what was learned: what the head has not seen yet it learns now.
+    settings = dataclasses.replace(settings, candidates=Settings().candidates)
     return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"

@@ -24,7 +24,7 @@ import jaxrl_vis
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.worker_pool import UnorderedMap, worker_pool
 from jaxrl_vis.stalks.digests import value_digest
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, Detections
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
@@ -39,6 +39,7 @@ from jaxrl_vis.stalks.phenotyping.report.tables import (
     PARTLY_SEEN,
     PLOT_COLUMNS,
     STALK_COLUMNS,
+    UNFAMILIAR,
     Origin,
     Row,
     plot_rows,
@@ -72,6 +73,7 @@ class Request:
         speed: Speed of the robot, m/s, where only times are known.
         disparity_scale: Divisor of disparities in 16-bit images.
         tried: Range of lenses that the detector was tried on; None if any will do.
+        most_doubt: Doubt of the gate above which an image is unlike those that the networks know; None if there is no gate.
     """
 
     out: Path
@@ -81,6 +83,7 @@ class Request:
     speed: float | None = None
     disparity_scale: float = 256.0
     tried: LensRange | None = None
+    most_doubt: float | None = None
 
 
 def run(
@@ -126,6 +129,12 @@ def run(
         f"jaxrl-vis {jaxrl_vis.__version__}; finds by {request.finder}; widths by the method {request.method}.",
         "Tables: stalks.csv, plots.csv and skipped.csv; all pairs: overlays/.",
     ]
+    if request.tried is not None:
+        about.append(
+            "Counting and measuring was tried on synthetic rows of sorghum in the light of a flash alone, seen from aside with "
+            f"{request.tried.density:.0f} pixels or more per metre of the row and {request.tried.view:.2f} m of it from top to "
+            "bottom; on no real row."
+        )
     with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
         return _run(plots, find, request, driven, page, done, say, run_all)
 
@@ -243,10 +252,12 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
         wrong = pair_fault(view.detections, view.sightings, left, right, calibration, view.ground)
     if wrong is not None:
         return {"skipped": wrong}
+    doubt = view.detections.doubt if isinstance(view.detections, Detections) else None
     return {
         "size": list(left.shape[:2]),
         "lines": list(view.frame.lines),
         "columns": list(view.frame.columns),
+        "doubt": None if doubt is None else round(doubt, 4),
         "camera_height_m": None if view.ground is None else round(view.ground.camera_height, 4),
         "sightings": [dataclasses.asdict(sighting) for sighting in view.sightings],
     }
@@ -280,10 +291,27 @@ def _finish(
         labels = sighting_labels(frames, tracks)
         start = float(path.places[0])
         stalks, row = plot_rows(frames, tracks, path, skipped, origin)
+    strange = _strange(request, [record for _, record in usable])
+    if strange:
+        row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
     width = usable[0][1]["size"][1] if usable else 0
     why = why or (_why_no_count(row["flag"], frames, plot, driven) if row["stalks"] == "" else "")
-    return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why)
+    return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
+
+
+def _strange(request: Request, records: list[dict[str, Any]]) -> str:
+    """Say how many pairs of a plot are unlike what the networks know, where that is more than half; else an empty text."""
+    doubts = [record["doubt"] for record in records if record.get("doubt") is not None]
+    if request.most_doubt is None or not doubts:
+        return ""
+    unlike = sum(doubt > request.most_doubt for doubt in doubts)
+    if unlike <= len(doubts) / 2:
+        return ""
+    return (
+        f"{unlike} of {len(doubts)} pairs are unlike the images that the networks read rightly (the median of their doubts is "
+        f"{np.median(doubts):.2f}, the limit {request.most_doubt:.2f}): look at the overlays before you trust a number"
+    )
 
 
 def _draw_overlays(

@@ -82,14 +82,16 @@ class Found:
         stalks: [..., K, 6] float32, box and columns of the axis at its top and bottom, pixels.
         scores: [..., K] float32, 0 to 1.
         valid: [..., K] bool.
+        pooled: [2 C] float32, mean and standard deviation over the image of the backbone's C features; None where nobody asked.
     """
 
     stalks: jax.Array
     scores: jax.Array
     valid: jax.Array
+    pooled: jax.Array | None = None
 
 
-jax.tree_util.register_dataclass(Found, ["stalks", "scores", "valid"], [])
+jax.tree_util.register_dataclass(Found, ["stalks", "scores", "valid", "pooled"], [])
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
@@ -192,7 +194,17 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
     proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
-    return judge(network, params, features[0], proposals, valid, settings)
+    found = judge(network, params, features[0], proposals, valid, settings)
+    return dataclasses.replace(found, pooled=_pooled(features[0], image))
+
+
+def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:
+    """Mean and standard deviation [2 C] float32 of features [h, w, C] where an image [H, W, 3] shows anything."""
+    values = features.astype(jnp.float32)
+    lit = image.any(axis=-1).reshape(values.shape[0], STRIDE[0], values.shape[1], STRIDE[1]).any(axis=(1, 3))
+    weights = (lit / jnp.maximum(lit.sum(), 1))[..., None]
+    mean = (weights * values).sum(axis=(0, 1))
+    return jnp.concatenate([mean, jnp.sqrt((weights * (values - mean) ** 2).sum(axis=(0, 1)))])
 
 
 def initial(settings: Settings, key: jax.Array) -> Any:

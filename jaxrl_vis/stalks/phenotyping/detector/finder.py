@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Iterable
 from typing import Any
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
+from jaxrl_vis.stalks.phenotyping.detector.gate import Gate
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, put_back, smoothed, snip_shape
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
@@ -46,6 +48,19 @@ class Detection:
     strip: Strip | None = None
 
 
+class Detections(list[Detection]):
+    """The stalks of an image.
+
+    Args:
+        detections: The stalks.
+        doubt: See `Gate.doubt`; None where nobody knows.
+    """
+
+    def __init__(self, detections: Iterable[Detection] = (), doubt: float | None = None) -> None:
+        super().__init__(detections)
+        self.doubt = doubt
+
+
 UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
 """Distance of the upper height above the middle of the band, in heights of the band."""
 
@@ -63,8 +78,11 @@ def higher_up(stalk: np.ndarray) -> np.ndarray:
 
 
 def resize_factor(width: int, settings: Settings, density: float | None) -> float:
-    """Factor by which `resize` resizes an image ``width`` pixels wide: only where its density is known it is enlarged."""
-    return min(settings.resizing(width, density), _MAX_ENLARGED if density and settings.density else 1.0)
+    """Factor by which `resize` resizes an image ``width`` pixels wide.
+
+    It is enlarged only where its density is known, or where the networks learned from images that were.
+    """
+    return min(settings.resizing(width, density), _MAX_ENLARGED if density or not settings.density else 1.0)
 
 
 def resize(image: np.ndarray, settings: Settings, density: float | None) -> tuple[np.ndarray, tuple[float, float]]:
@@ -109,7 +127,7 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
-def _segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
+def segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
     """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle.
 
     Snips of another resolution are resized to the ``full`` size: the network knows stalks that are as many pixels wide there.
@@ -128,18 +146,20 @@ class Finder:
         params: With ``detector`` and ``segmenter``.
         settings: Beside the weights.
         least_score: Lowest score of a detection; 0.5 balances misses against false detections.
+        gate: Gate that says of each image how likely it is read wrongly; None where there is none for these weights.
 
     Attributes:
         dtype: In which convolutions are computed.
+        gate: As given.
     """
 
-    def __init__(self, params: Any, settings: Settings, least_score: float = 0.5) -> None:
-        self._params, self._settings, self._least = params, settings, least_score
+    def __init__(self, params: Any, settings: Settings, least_score: float = 0.5, gate: Gate | None = None) -> None:
+        self._params, self._settings, self._least, self.gate = params, settings, least_score, gate
         accelerated = jax.default_backend() in ("gpu", "tpu")
         self.dtype = jnp.bfloat16 if accelerated else jnp.float32
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
 
-    def __call__(self, image: np.ndarray, density: float | None = None) -> list[Detection]:
+    def __call__(self, image: np.ndarray, density: float | None = None) -> Detections:
         """Stalks of an image, from left to right, each of them once.
 
         Args:
@@ -148,20 +168,35 @@ class Finder:
         """
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), density, frame)
-        return [_moved(detection, frame) for detection in sorted(detections, key=lambda detection: sum(detection.axis))]
+        ordered = sorted(detections, key=lambda detection: sum(detection.axis))
+        return Detections((_moved(detection, frame) for detection in ordered), doubt=detections.doubt)
 
-    def _find(self, image: np.ndarray, density: float | None, frame: Frame) -> list[Detection]:
-        """Stalks of an image [h, w, 3] uint8, in which a frame shows a scene."""
+    def look(self, image: np.ndarray, density: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Look for stalks without outlining them: boxes and axes [N, 6] of all that have any score, scores [N], and the pooled
+        features [2 C] of the backbone.
+
+        Args:
+            image: [h, w, 3] uint8, without borders.
+            density: Pixels per metre at the row; None if nothing is known of the camera.
+        """
         settings = self._settings
         reduced, scale = resize(image, settings, density)
-        share = settings.width / settings.full_width / settings.resizing(image.shape[1], density)
         added = 0
         if density and settings.density:
             reduced, added = usual_lines(reduced, settings)
-        stalks_found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
-        selected = np.flatnonzero(stalks_found.valid & (stalks_found.scores >= self._least))
-        moved = stalks_found.stalks[selected] - np.array([0, added, 0, added, 0, 0], np.float32)
-        stalks, scores = in_image(moved, scale), stalks_found.scores[selected]
+        found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
+        assert found.pooled is not None
+        moved = found.stalks[found.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
+        return in_image(moved, scale), found.scores[found.valid], np.asarray(found.pooled)
+
+    def _find(self, image: np.ndarray, density: float | None, frame: Frame) -> Detections:
+        """Stalks of an image [h, w, 3] uint8, in which a frame shows a scene."""
+        settings = self._settings
+        share = settings.width / settings.full_width / settings.resizing(image.shape[1], density)
+        stalks, scores, pooled = self.look(image, density)
+        doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
+        selected = scores >= self._least
+        stalks, scores = stalks[selected], scores[selected]
         inside = np.array([_is_shown(stalk, frame) for stalk in stalks], bool)
         stalks, scores = stalks[inside], scores[inside]
         on_device = jnp.asarray(image)
@@ -175,7 +210,7 @@ class Finder:
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
         above = self._pieces(on_device, some, settings.snip_lines // 2, share)
         upper = {place: (_without_border(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
-        detections = []
+        detections = Detections(doubt=doubt)
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
                 left, top, right, bottom, above, below = (float(edge) - 0.5 for edge in stalk)
@@ -203,7 +238,7 @@ class Finder:
             part = stalks[start : start + self._batch]
             filled = np.pad(part, ((0, self._batch - len(part)), (0, 0)), mode="edge")
             snips = cut(on_device, filled, shape)
-            masks.append(_segment(self._params["segmenter"], snips, settings, self.dtype, full))
+            masks.append(segment(self._params["segmenter"], snips, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.digests import file_digest
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, Finder
+from jaxrl_vis.stalks.phenotyping.detector.gate import read_gate
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 
 
@@ -35,7 +36,7 @@ def detector_name(weights: Path) -> str:
 @functools.cache
 def _load(weights: Path, digest: str, least_score: float) -> Finder:
     params, settings, _ = read_weights(weights)
-    return Finder(params, settings, least_score)
+    return Finder(params, settings, least_score, read_gate(weights))
 
 
 def load_finder(weights: Path, least_score: float) -> Finder:

@@ -171,7 +171,7 @@ def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[
     scored: list[tuple[float, float]] = []
     free = np.ones(len(there), bool)
     for place in sorted(range(len(detections)), key=lambda number: -detections[number].score):
-        overlaps = _overlaps(np.array(detections[place].box), boxes)
+        overlaps = overlaps_with(np.array(detections[place].box), boxes)
         fitting = free & (overlaps >= IOU)
         of_clear = np.where(fitting & clear, overlaps, 0.0)
         best = int(np.argmax(of_clear)) if of_clear.any() else None
@@ -184,7 +184,7 @@ def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[
     return owners, scored
 
 
-def _overlaps(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+def overlaps_with(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Intersection over union [N] of a box [4] with boxes [N, 4]."""
     low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
     common = np.prod(np.clip(high - low, 0.0, None), axis=1)

@@ -127,7 +127,7 @@ def _no_pairs(folder: Path, patterns: Patterns | None) -> str:
     """Message that a folder holds no pairs, with what may be the reason."""
     if patterns is not None:
         return f"{folder} holds no images for --left {patterns.left!r} and --right {patterns.right!r}, nor do folders in it"
-    for path in _images(folder)[:1]:
+    for path in image_files(folder)[:1]:
         try:
             height, width = image_size(path)
         except OSError:
@@ -158,8 +158,8 @@ def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
         _check_rectified(folder, sides)
     sides = _by_times(folder, sides)
     stored = _find_folder(folder, ("disparity",))
-    inside = [] if stored is None else _images(stored, _DISPARITIES)
-    for path in [*inside, *_images(folder, _DISPARITIES)]:
+    inside = [] if stored is None else image_files(stored, _DISPARITIES)
+    for path in [*inside, *image_files(folder, _DISPARITIES)]:
         beside = path.parent == folder
         stem = readable(path.stem)
         name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if beside else stem
@@ -271,8 +271,8 @@ def _by_folder(folder: Path) -> _Sides:
 
 def _side_images(folder: Path) -> list[Path]:
     """Images of one camera: those of a folder, or of its folder ``data`` as KITTI has it."""
-    images, inside = _images(folder), folder / "data"
-    return images or (_images(inside) if inside.is_dir() else [])
+    images, inside = image_files(folder), folder / "data"
+    return images or (image_files(inside) if inside.is_dir() else [])
 
 
 def _whole_pairs(folder: Path) -> bool:
@@ -281,7 +281,7 @@ def _whole_pairs(folder: Path) -> bool:
 
 def _by_name(folder: Path) -> _Sides:
     """Images that say in their names which side they show, by the name of their pair and their side."""
-    images = {path: readable(path.stem) for path in _images(folder)}
+    images = {path: readable(path.stem) for path in image_files(folder)}
     images = {path: stem for path, stem in images.items() if "disparity" not in stem.lower()}
     stems = {stem.lower() for stem in images.values()}
     sides: _Sides = {}
@@ -333,7 +333,8 @@ def _find_folder(folder: Path, names: tuple[str, ...]) -> Path | None:
     return min(folders, key=lambda path: names.index(path.name.lower()), default=None)
 
 
-def _images(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
+def image_files(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
+    """Return the images of a folder, or its files with other suffixes, sorted by name."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
     return [path for path in paths if not path.name.startswith(".")]  # beside each image, macOS leaves ._ and its name
 

@@ -87,6 +87,7 @@ class PlotResult:
         start: Place of the first pair, which positions count from, m.
         image_width: Width of its images, pixels.
         why: More words than its flag has on why it has no count; empty where there is one, or no more to say.
+        strange: Words on why its images are unlike those that the networks know; empty where they are not.
     """
 
     row: dict[str, Any]
@@ -97,6 +98,7 @@ class PlotResult:
     start: float
     image_width: int
     why: str = ""
+    strange: str = ""
 
 
 class Page:
@@ -151,6 +153,8 @@ class Page:
         write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
         if plot.why:
             write(f'<p class="doubt">No count: {_safe(plot.why)}.</p>')
+        if plot.strange:
+            write(f'<p class="doubt">{_safe(plot.strange[:1].upper() + plot.strange[1:])}.</p>')
         if plot.stalks:
             write(_chart(plot, rejected))
             write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + table({"picture": "", **_STALK_COLUMNS}, tables))

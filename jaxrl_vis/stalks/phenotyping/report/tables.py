@@ -65,6 +65,8 @@ SKIPPED = "pairs skipped"
 """Flag of a plot of which some pairs could not be used."""
 NO_WIDTHS = "no widths"
 """Flag of a plot whose stalks were counted, but none of them measured."""
+UNFAMILIAR = "unlike what the networks know"
+"""Flag of a plot of which the gate doubts that most images were read rightly."""
 
 
 @dataclasses.dataclass(frozen=True)

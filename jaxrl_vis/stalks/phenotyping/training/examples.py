@@ -2,10 +2,12 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +36,8 @@ MAX_STALKS = 56
 """Stalks of an image that networks learn from."""
 _BARELY = 0.02  # what is seen less is not there
 _THIN = 4
+_AT_STALKS = 0.8  # of images that are cut: the share that is cut around a stalk
+_SCALES = (-0.5, 0.6)  # logarithms of the factors by which the scale of images by day varies
 _HIGHER = 0.3  # share of the stalks of which the networks also learn the piece around the upper height
 
 
@@ -66,8 +70,12 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         frames: Number of images of it, spread over it.
     """
     sequence = Sequence.of(draw(family, seed))
-    density = sequence.drive.true.focal / family.rig.distance
+    settled = sequence.plot.family
+    density = sequence.drive.true.focal / settled.rig.distance
     rng = np.random.default_rng([seed, 17])
+    by_day = settled.scene.share > 0
+    if by_day:  # nobody knows the scale of other people's images exactly
+        density *= float(np.exp(rng.uniform(*_SCALES)))
     length = len(sequence)
     chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
     examples = []
@@ -78,8 +86,61 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         masks_of = functools.partial(_instance_masks, instance, indices)
-        examples.append(_example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER))
+        example = _example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER)
+        if by_day:
+            # Lenses and scales differ from plot to plot, and each shape of snips would be a program of its own.
+            shape = snip_shape((settings.snip_lines, settings.snip_columns), family.rig.width / settings.full_width)
+            example = resized_snips(cut_out(example, (settings.lines, settings.width), rng), shape)
+        examples.append(example)
     return examples
+
+
+def resized_snips(example: Example, shape: tuple[int, int]) -> Example:
+    """Return an example whose snips, and their masks, have so many lines and columns."""
+    if not len(example.snips) or example.snips.shape[1:3] == shape:
+        return example
+    size = (shape[1], shape[0])
+    snips = np.stack([cv2.resize(snip, size, interpolation=cv2.INTER_LINEAR) for snip in example.snips])
+    masks = [cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in example.masks]
+    return dataclasses.replace(example, snips=snips, masks=np.stack(masks))
+
+
+def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:
+    """Return an example with a part of its image of at most so many lines and columns, mostly around a stalk.
+
+    Args:
+        example: The example; its snips stay as they are.
+        most: Most lines and columns.
+        rng: For the place.
+    """
+    size = example.image.shape[:2]
+    lines, columns = (min(length, limit) for length, limit in zip(size, most))
+    low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])
+    there = np.flatnonzero(example.kinds == STALK)
+    if len(there) and rng.random() < _AT_STALKS:
+        box = example.stalks[rng.choice(there)]
+        middle = np.array([box[1] + box[3], box[0] + box[2]]) / 2
+        low, high = (
+            np.clip(middle - 0.9 * np.array([lines, columns]), 0, high),
+            np.clip(middle - [0.1 * lines, 0.1 * columns], 0, high),
+        )
+    top, left = (int(rng.integers(int(first), int(last) + 1)) for first, last in zip(low, high))
+    stalks = example.stalks - np.array([left, top, left, top, left, left], np.float32)
+    inside = np.array([[lines, columns]]) > np.maximum(stalks[:, [1, 0]], 0.0)
+    shown = (np.minimum(stalks[:, [3, 2]], [lines, columns]) - np.maximum(stalks[:, [1, 0]], 0.0) > [16.0, 3.0]) & inside
+    there = shown.all(axis=1) & (example.kinds != NOTHING)
+    kinds = np.where(there, example.kinds, NOTHING)
+    image = example.image[top : top + lines, left : left + columns]
+    return dataclasses.replace(example, image=np.ascontiguousarray(image), stalks=_clipped(stalks, lines, columns), kinds=kinds)
+
+
+def _clipped(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
+    """Return stalks [T, 6] with boxes cut off where an image ends, and the axis where the box does."""
+    left, top, right, bottom, above, below = stalks.T
+    slope = (below - above) / np.maximum(bottom - top, 1e-3)
+    first, last = np.clip(top, 0, lines), np.clip(bottom, 0, lines)
+    axis = above + slope * (first - top), below + slope * (last - bottom)
+    return np.stack([np.clip(left, 0, columns), first, np.clip(right, 0, columns), last, *axis], axis=1).astype(np.float32)
 
 
 def _instance_masks(
@@ -241,27 +302,37 @@ def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | 
     return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
 
 
+_MOST_ENLARGED = 3.0
+_WIDEST_SNIP = 512  # pixels
+_WIDEST = 2048  # pixels of an image that was resized so that its boxes have the size that networks know
+
+
 def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
     """Settings whose anchors are as large as the boxes of a folder's annotations.
 
-    What was learned from images of unknown cameras is looked for in images that are reduced as those were.
+    Images of unknown cameras are resized so that boxes are as tall as the band; what was learned from them is looked for in
+    images that are resized likewise. Snips grow and shrink with them, as they show the stalk of a box.
 
     Raises:
         RequestError: The annotations or the calibration of the folder cannot be read.
     """
     data = read_annotations(folder, labels)
     densities = _densities(folder, data["images"])
-    factors = {image["id"]: resize_factor(image["width"], settings, densities[image["id"]]) for image in data["images"]}
-    sizes = np.array(
-        [
-            np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]]
-            for annotation in data["annotations"]
-            if not annotation.get("iscrowd")
-        ]
-    )
+    known = all(densities.values())
+    widths = {image["id"]: image["width"] for image in data["images"]}
+    boxes = [annotation for annotation in data["annotations"] if not annotation.get("iscrowd")]
+    if not known:
+        tall = float(np.median([annotation["bbox"][3] / widths[annotation["image_id"]] for annotation in boxes]))
+        width = round(min(settings.band_lines / tall, _WIDEST, _MOST_ENLARGED * max(widths.values())))
+        ratio = settings.full_width / settings.width
+        settings = dataclasses.replace(settings, density=0.0, width=max(width, 32), full_width=max(round(ratio * width), 32))
+    factors = {number: resize_factor(width, settings, densities[number]) for number, width in widths.items()}
+    sizes = np.array([np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]] for annotation in boxes])
+    # A snip is at least twice as wide as the boxes: trunks are thicker than stalks.
+    columns = 8 * math.ceil(2.0 * settings.full_width / settings.width * float(np.median(sizes[:, 0])) / 8)
     return dataclasses.replace(
         settings,
-        density=settings.density if all(densities.values()) else 0.0,
+        snip_columns=min(max(settings.snip_columns, columns), _WIDEST_SNIP),
         band_lines=round(float(np.median(sizes[:, 1])), 1),
         anchor_widths=tuple(round(float(width), 1) for width in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95))),
     )

@@ -1,0 +1,218 @@
+"""Fits the gate of a file of weights, and measures it: `python -m benchmarks.stalks.gate FOLDER --weights WEIGHTS`.
+
+Images of several families are drawn into FOLDER, and not again if they are there. The gate is fitted on those of the first
+seeds, its threshold too, and written beside the weights; what is printed comes from other seeds. A control sees nothing of an
+image but its mean brightness and its sharpness. Real images have no part in any of it: `--photographs MODULE:FUNCTION` names a
+function that yields (image, number of stalks, number that the boxes [N, 4] find), and these are only measured.
+"""
+
+import argparse
+import dataclasses
+import functools
+import importlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.host.devices import enable_compilation_cache
+from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
+from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, gate_path, logistic, write_gate
+from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
+from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
+from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
+from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
+from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes
+from jaxrl_vis.stalks.phenotyping.training.held_out import LEAST_SCORE, match_finds
+from jaxrl_vis_envs import plants
+from jaxrl_vis_envs.plants.pairs import Sequence
+
+FAMILIES = Path(__file__).with_name("families")
+SPECS = ("daylight_all", "daylight_near", "maize_by_day", "thin_wet")
+PLOTS = {"training": 28, "shifted": 28, "daylight_all": 36, "daylight_near": 20, "maize_by_day": 8, "thin_wet": 8}
+"""Plots of each family that the gate is fitted on; as many are tried."""
+FIRST_SEEDS = {"fit": 20_000, "test": 30_000}
+WIDTH, FRAMES = 844, 2
+RIGHT = 0.8
+"""F1 of an image's finds from which on it is read rightly."""
+MOST_FLAGGED = 0.04
+AXES = 8
+Photograph = tuple[np.ndarray, int, Callable[[np.ndarray], int]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What is known of an image: its family, pooled features, scores, F1 of its finds, mean brightness and sharpness."""
+
+    family: str
+    pooled: np.ndarray
+    scores: np.ndarray
+    f1: float
+    plain: tuple[float, float]
+
+
+def draw(folder: Path, part: str, family: str, number: int) -> Path:
+    """Draw images of one plot with their stalks into a file, unless it is there; return the file."""
+    path = folder / f"{part}_{family}_{number}.npz"
+    if path.exists():
+        return path
+    drawn_from = plants.read(FAMILIES / f"{family}.toml") if family in SPECS else plants.FAMILIES[family]
+    seed = FIRST_SEEDS[part] + number
+    sequence = Sequence.of(plants.draw(drawn_from.at_width(WIDTH), seed))
+    true, arrays = sequence.drive.true, {}
+    for place, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
+        image, instance, depth = sequence.left(int(frame))
+        thinned = np.asarray(instance[::4, ::4]), np.asarray(depth[::4, ::4])
+        stalks, kinds, _ = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
+        arrays |= {f"image_{place}": np.asarray(image), f"stalks_{place}": stalks, f"kinds_{place}": kinds}
+    density = sequence.drive.stated.focal / sequence.plot.family.rig.distance
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(path, density=density, **arrays)
+    return path
+
+
+def plain_measures(image: np.ndarray) -> tuple[float, float]:
+    """Return mean brightness and the logarithm of the variance of the Laplacian of an image [H, W, 3] uint8."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64)
+    return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
+
+
+def see(finder: Finder, image: np.ndarray, density: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return finds [N, 6] of an image in its own coordinates, their scores, and the pooled features."""
+    frame = find_frame(image)
+    stalks, scores, pooled = finder.look(fill_borders(image, frame), density)
+    over, down = frame.columns[0], frame.lines[0]
+    return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
+
+
+def f1_of(hits: int, finds: int, stalks: int) -> float:
+    """Return F1, 1 where there is nothing and nothing is found."""
+    return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
+
+
+def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
+    """Look at the images of a file of `draw`, or read what networks of this name saw in them before."""
+    kept = path.with_suffix(f".{name.split()[-1]}.npz")
+    if not kept.exists():
+        arrays = {}
+        for place, seen in enumerate(_seen_now(path, finder)):
+            values = {"pooled": seen.pooled, "scores": seen.scores, "f1": seen.f1, "plain": seen.plain}
+            arrays |= {f"{key}_{place}": value for key, value in values.items()}
+        np.savez(kept, **arrays)
+    family = path.stem.split("_", 1)[1].rpartition("_")[0]
+    with np.load(kept) as data:
+        columns = [[data[f"{key}_{place}"] for place in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
+    return [
+        Seen(family, pooled, scores, float(f1), (float(plain[0]), float(plain[1])))
+        for pooled, scores, f1, plain in zip(*columns)
+    ]
+
+
+def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
+    with np.load(path) as data:
+        for place in range(FRAMES):
+            image, truth, kinds = (data[f"{name}_{place}"] for name in ("image", "stalks", "kinds"))
+            stalks, scores, pooled = see(finder, image, float(data["density"]))
+            right, ignored = match_finds(stalks, scores, truth, kinds)
+            counted = (scores >= LEAST_SCORE) & ~ignored
+            f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
+            yield Seen("", pooled, scores, f1, plain_measures(image))
+
+
+def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
+    """Look at photographs, of whose cameras nothing is known."""
+    for image, count, found in photographs:
+        stalks, scores, pooled = see(finder, image, None)
+        boxes = stalks[scores >= LEAST_SCORE][:, :4]
+        yield Seen("photographs", pooled, scores, f1_of(found(boxes), len(boxes), count), plain_measures(image))
+
+
+def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
+    """Return the chance that a wrong one has a higher value than a right one."""
+    above = values[wrong][:, None] - values[~wrong][None, :]
+    return float(np.mean((above > 0) + 0.5 * (above == 0))) if above.size else float("nan")
+
+
+def control(fitted: list[Seen], tried: list[Seen]) -> np.ndarray:
+    """Return doubts [N] of a regression on brightness and sharpness, their squares and product."""
+
+    def inputs(images: list[Seen]) -> np.ndarray:
+        plain = (np.array([image.plain for image in images]) - [100.0, 6.0]) / [50.0, 2.0]
+        return np.concatenate([plain, plain**2, plain[:, :1] * plain[:, 1:]], axis=1)
+
+    weights = logistic(inputs(fitted), np.array([image.f1 < RIGHT for image in fitted]))
+    return weights[0] + inputs(tried) @ weights[1:]
+
+
+def report(name: str, images: list[Seen], gate: Gate, doubts_of_control: np.ndarray) -> None:
+    """Print a line of figures."""
+    wrong = np.array([image.f1 < RIGHT for image in images])
+    doubts = np.array([gate.doubt(image.pooled, image.scores) for image in images])
+    flagged = doubts > gate.threshold
+    parts = [f"{wrong.sum()} of {len(images)} read wrongly"]
+    if wrong.any() and not wrong.all():
+        roc = area_under_roc(doubts, wrong), area_under_roc(doubts_of_control, wrong)
+        parts.append(f"area under ROC {roc[0]:.3f}, control {roc[1]:.3f}")
+    if wrong.any():
+        parts.append(f"{flagged[wrong].mean():.0%} of these flagged")
+    if not wrong.all():
+        parts.append(f"{flagged[~wrong].mean():.1%} of the others")
+    print(f"{name:14} " + "; ".join(parts), flush=True)
+
+
+def _made(folder: Path, tasks: list[tuple[str, str, int]], place: int) -> dict[str, str]:
+    return {"path": str(draw(folder, *tasks[place]))}
+
+
+def main() -> None:
+    """Draw, fit, write and measure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--weights", type=Path, default=SHIPPED)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--photographs", help="module:function")
+    parser.add_argument("--drawn", action="store_true", help="use the images that are there, and draw none")
+    options = parser.parse_args()
+    # By number first, so that what was drawn when one stopped is a little of everything.
+    tasks = [
+        (part, family, number)
+        for number in range(max(PLOTS.values()))
+        for part in FIRST_SEEDS
+        for family, plots in PLOTS.items()
+        if number < plots
+    ]
+    if not options.drawn:
+        if options.workers > 1:
+            share_accelerator()
+        done = functools.partial(_made, options.folder, tasks)
+        evaluate_all(done, range(len(tasks)), options.workers, lambda place, made: print(made["path"], flush=True))
+    enable_compilation_cache()
+    finder = load_finder(options.weights, LEAST_SCORE)
+    seen: dict[str, list[Seen]] = {part: [] for part in FIRST_SEEDS}
+    for part, family, number in tasks:
+        path = options.folder / f"{part}_{family}_{number}.npz"
+        if path.exists():
+            seen[part] += seen_in(path, finder, detector_name(options.weights))
+    fitted, tried = seen["fit"], seen["test"]
+    wrong = np.array([image.f1 < RIGHT for image in fitted])
+    pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES
+    gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MOST_FLAGGED)
+    about = {"images": len(fitted), "families": list(PLOTS), "origin": "synthetic images alone"}
+    write_gate(options.weights, gate, about)
+    if options.photographs:
+        module, _, name = options.photographs.partition(":")
+        tried += seen_in_photographs(getattr(importlib.import_module(module), name)(), finder)
+    doubts = control(fitted, tried)
+    print(f"{detector_name(options.weights)}: {len(fitted)} images to fit on, {len(tried)} to try; right is F1 >= {RIGHT:g}")
+    report("all", tried, gate, doubts)
+    for family in dict.fromkeys(image.family for image in tried):
+        chosen = [place for place, image in enumerate(tried) if image.family == family]
+        report(family, [tried[place] for place in chosen], gate, doubts[chosen])
+    path = gate_path(options.weights)
+    print(f"{path}: threshold {gate.threshold:.3f}, {path.stat().st_size / 1e3:.1f} kB")
+
+
+if __name__ == "__main__":
+    main()

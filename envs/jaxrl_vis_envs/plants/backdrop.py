@@ -1,0 +1,165 @@
+"""Backdrops of plots by day: what is seen beyond the ground, by direction. NumPy only.
+
+A picture in azimuth and elevation, infinitely far away, with as much light in each direction as the renderer's radiance has.
+"""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+SHAPE = (512, 1024)
+"""Lines and columns."""
+REACH = (1.6, 2.0)
+"""Tangent of the highest elevation, and the greatest azimuth in rad, either way."""
+_HORIZON = SHAPE[0] // 2
+_PHOTOGRAPHS = (("skimage", "data"), ("sklearn", "datasets/images"))
+
+
+def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
+    """Draw a backdrop: [*SHAPE, 3] float32 radiance.
+
+    Args:
+        rng: For this purpose alone.
+        indoors: A wall and a ceiling in place of the sky and what stands before it.
+        photograph: A photograph that an installed package ships.
+        sky: Light of the sky on a white surface.
+
+    Raises:
+        ValueError: A photograph is asked for, and no package that ships some is installed.
+    """
+    if photograph:
+        return (_photograph(rng) * sky * rng.uniform(0.6, 1.6)).astype(np.float32)
+    picture = _room(rng) if indoors else _outdoors(rng)
+    return (picture * sky).astype(np.float32)
+
+
+def smooth_noise(rng: np.random.Generator, size: tuple[float, float], shape: tuple[int, int] = SHAPE) -> np.ndarray:
+    """Draw noise [*shape] from 0 to 1, evenly spread, whose features have a ``size`` in lines and columns."""
+    lines, columns = (np.fft.fftfreq(count)[:, None] for count in shape)
+    falloff = np.exp(-2.0 * (np.pi * size[0] * lines / 3) ** 2) * np.exp(-2.0 * (np.pi * size[1] * columns.T / 3) ** 2)
+    values = np.fft.ifft2(np.fft.fft2(rng.normal(size=shape)) * falloff).real
+    ranks = np.empty(values.size)
+    ranks[np.argsort(values, axis=None)] = np.linspace(0.0, 1.0, values.size)
+    return ranks.reshape(shape)
+
+
+def _outdoors(rng: np.random.Generator) -> np.ndarray:
+    """Draw a sky, and on the horizon trees, a building, a crop's canopy, or trunks and poles."""
+    elevation = ((_HORIZON - np.arange(SHAPE[0])) / _HORIZON * REACH[0])[:, None, None]
+    zenith = np.array([0.25, 0.45, 0.95]) * rng.uniform(0.5, 1.3)
+    haze = np.array([0.85, 0.92, 1.0]) * rng.uniform(0.7, 1.6)
+    share = np.exp(-np.clip(elevation, 0.0, None) / rng.uniform(0.15, 0.8))
+    picture = zenith + (haze - zenith) * share
+    cover = rng.uniform(0.0, 1.0)
+    clouds = 0.6 * smooth_noise(rng, (30, 90)) + 0.4 * smooth_noise(rng, (10, 25))
+    thick = np.clip((clouds - (1.0 - cover)) / 0.25, 0.0, 1.0)[..., None]
+    picture = picture + (np.array([1.0, 1.0, 1.02]) * rng.uniform(0.7, 1.8) - picture) * thick
+    below = np.where(rng.random() < 0.5, [0.05, 0.08, 0.03], [0.14, 0.11, 0.08]) * rng.uniform(0.5, 1.5)
+    picture = np.where(elevation < 0, below * (0.6 + 0.8 * smooth_noise(rng, (4, 10))[..., None]), picture)
+    for layer in rng.permutation(["trees", "building", "canopy", "trunks"])[: rng.integers(1, 4)]:
+        picture = {"trees": _trees, "building": _building, "canopy": _canopy, "trunks": _trunks}[layer](rng, picture)
+    return picture
+
+
+def _skyline(rng: np.random.Generator, high: float, roughness: tuple[float, float]) -> np.ndarray:
+    """Draw a mask [*SHAPE] of what reaches up to an uneven line, on the mean at the tangent ``high``."""
+    line = sum(smooth_noise(rng, (1, size), (1, SHAPE[1]))[0] * weight for size, weight in zip((8, 60), roughness))
+    top = _HORIZON * (1.0 - high * (0.5 + line) / REACH[0])
+    lines = np.arange(SHAPE[0])[:, None]
+    return (lines >= top) & (lines < _HORIZON + 12)
+
+
+def _trees(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
+    mask = _skyline(rng, rng.uniform(0.04, 0.4), (0.35, 0.65))
+    leaves = np.array([0.06, 0.10, 0.03]) * rng.uniform(0.5, 2.5) * rng.uniform(0.8, 1.2, 3)
+    texture = 0.3 + 1.4 * smooth_noise(rng, (3, 3)) * smooth_noise(rng, (14, 14))
+    return np.where(mask[..., None], leaves * texture[..., None], picture)
+
+
+def _building(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
+    left, wide = rng.integers(0, SHAPE[1] - 100), rng.integers(60, 700)
+    top = int(_HORIZON * (1.0 - rng.uniform(0.05, 0.5) / REACH[0]))
+    part = picture[top : _HORIZON + 6, left : left + wide]
+    colour = rng.uniform(0.15, 0.9) * rng.uniform(0.85, 1.15, 3)
+    columns = np.arange(part.shape[1])
+    ribs = 1.0 + rng.uniform(0.0, 0.5) * np.sin(2 * np.pi * columns / rng.uniform(3, 16))
+    picture = picture.copy()
+    picture[top : _HORIZON + 6, left : left + wide] = (
+        colour * ribs[None, :, None] * (0.9 + 0.2 * smooth_noise(rng, (20, 20), part.shape[:2])[..., None])
+    )
+    return picture
+
+
+def _canopy(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
+    """Draw a crop some rows further away: leaves, streaks that stand upright, and what shows between them."""
+    mask = _skyline(rng, rng.uniform(0.3, 1.4), (0.5, 0.3))
+    mask[_HORIZON : _HORIZON + 60] = True
+    green = np.array([0.10, 0.16, 0.04]) * rng.uniform(0.5, 1.8) * rng.uniform(0.8, 1.2, 3)
+    dry = np.array([0.30, 0.24, 0.14]) * rng.uniform(0.5, 1.5)
+    ripe = np.clip(smooth_noise(rng, (20, 5)) + rng.uniform(-0.7, 0.7), 0.0, 1.0)[..., None]
+    streaks = 0.25 + 1.5 * smooth_noise(rng, (rng.uniform(20, 80), rng.uniform(2, 5)))
+    leaves = 0.4 + 1.2 * smooth_noise(rng, (5, 9))
+    texture = (streaks * leaves)[..., None]
+    gaps = (smooth_noise(rng, (12, 5)) < rng.uniform(0.0, 0.35)) & mask
+    colours = (green + (dry - green) * ripe) * texture
+    return np.where((mask & ~gaps)[..., None], colours, picture)
+
+
+def _trunks(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
+    """Draw trunks or poles: upright, of any width and brightness, some distance behind the row."""
+    picture = picture.copy()
+    columns = np.arange(SHAPE[1])
+    for _ in range(rng.integers(3, 40)):
+        wide, at = 1.5 * (20 / 1.5) ** rng.random(), rng.uniform(0, SHAPE[1])
+        top = int(_HORIZON * (1.0 - rng.uniform(0.1, 1.5) / REACH[0]))
+        bottom = _HORIZON + rng.integers(2, 40)
+        colour = rng.uniform(0.03, 0.6) * np.array([1.0, rng.uniform(0.8, 1.0), rng.uniform(0.6, 1.0)])
+        lean = rng.normal(0.0, 0.03)
+        for line in range(max(top, 0), bottom):
+            offset = (columns - at - lean * (line - _HORIZON)) / (0.5 * wide)
+            shade = np.clip(1.0 - offset**2, 0.0, 1.0)
+            part = np.flatnonzero(shade > 0)
+            light = 0.5 + 0.8 * np.sqrt(shade[part]) * (0.8 + 0.4 * rng.random(part.size))
+            picture[line, part] = colour * light[:, None]
+    return picture
+
+
+def _room(rng: np.random.Generator) -> np.ndarray:
+    """Draw a wall and a ceiling with lamps, and dark and light furniture."""
+    picture = np.ones((*SHAPE, 3)) * rng.uniform(0.2, 0.9) * rng.uniform(0.9, 1.1, 3)
+    ceiling = int(_HORIZON * (1.0 - rng.uniform(0.3, 1.0) / REACH[0]))
+    picture[:ceiling] *= rng.uniform(0.3, 1.0)
+    for _ in range(rng.integers(5, 40)):
+        is_lamp = rng.random() < 0.25
+        line = rng.integers(0, ceiling + 1) if is_lamp else rng.integers(ceiling, _HORIZON + 80)
+        column, tall, wide = rng.integers(0, SHAPE[1]), rng.integers(4, 60), rng.integers(4, 160)
+        colour = np.full(3, rng.uniform(2.0, 6.0)) if is_lamp else rng.uniform(0.02, 0.9) * rng.uniform(0.6, 1.2, 3)
+        picture[line : line + tall, column : column + wide] = colour
+    return picture * (0.85 + 0.3 * smooth_noise(rng, (80, 120))[..., None])
+
+
+def _photograph(rng: np.random.Generator) -> np.ndarray:
+    """Return a part of an installed photograph, mirrored by chance: [*SHAPE, 3], linear, 0 to 1."""
+    paths = photograph_files()
+    if not paths:
+        raise ValueError("scene.photographs needs photographs that packages ship: pip install scikit-image, or scikit-learn")
+    with Image.open(paths[rng.integers(len(paths))]) as opened:
+        whole = np.asarray(opened.convert("RGB"))
+    tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in whole.shape[:2])
+    line, column = rng.integers(0, whole.shape[0] - tall + 1), rng.integers(0, whole.shape[1] - wide + 1)
+    part = Image.fromarray(whole[line : line + tall, column : column + wide])
+    part = part.resize((SHAPE[1], SHAPE[0]), Image.Resampling.BILINEAR)
+    values = (np.asarray(part) / 255.0) ** 2.2
+    return values[:, ::-1] if rng.random() < 0.5 else values
+
+
+def photograph_files() -> list[Path]:
+    """Return the photographs that scikit-image and scikit-learn ship, in order; none where neither is installed."""
+    found = []
+    for package, folder in _PHOTOGRAPHS:
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.origin is not None:
+            found += sorted((Path(spec.origin).parent / folder).glob("*.jpg"))
+    return found

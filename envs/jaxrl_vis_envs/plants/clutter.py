@@ -1,0 +1,135 @@
+"""Things around plants that are no stalk: poles, tubes, cables, strips, blades, pots, parts of a robot. NumPy only."""
+
+import colorsys
+import math
+
+import numpy as np
+
+from jaxrl_vis_envs.plants.family import Family
+from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
+
+_PIECE = 0.1  # m: length of the pieces of long things, so that those out of sight are left out
+_TURN = np.array([0.0, 0.0, 1.0])
+
+
+def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Leaf, list[float]]]]:
+    """Draw the things of a plot by day: round ones as chains of cones, flat ones as ribbons, each with its material."""
+    rng = generator(plot.family, plot.seed, "objects")
+    family, scene = plot.family, plot.family.scene
+    length = family.layout.plot_length + 2.0
+    round_things: list[tuple[Stalk, list[float]]] = []
+    flat_things: list[tuple[Leaf, list[float]]] = []
+    for _ in range(rng.poisson(scene.objects[0] * length)):
+        foot = np.array([rng.uniform(-1.0, length - 1.0), _beside(rng, family), 0.0])
+        kind = rng.choice(["pole", "tube", "cable", "strip", "blade", "legs"], p=[0.3, 0.15, 0.1, 0.2, 0.2, 0.05])
+        if kind in ("strip", "blade"):
+            flat_things.append((_ribbon(rng, foot, kind), material(rng, green=kind == "blade")))
+            continue
+        paint = material(rng)
+        if kind == "pole":
+            top = foot + [*rng.normal(0.0, 0.04, 2), 0.0] + _TURN * rng.uniform(0.3, 2.6)
+            round_things.append((_tube([foot, top], _thickness(rng, 0.003, 0.05)), paint))
+        elif kind == "legs":
+            for side in (-0.09, 0.09):
+                start = foot + [side, rng.uniform(0.1, 0.8), 0.0]
+                round_things.append((_tube([start, start + 0.9 * _TURN], rng.uniform(0.05, 0.08)), paint))
+        else:
+            high = rng.uniform(0.02, 1.6)
+            across = rng.normal(0.0, 1.0 if kind == "tube" else 0.05, 3) + [1.0, 0.0, 0.0]
+            across *= rng.uniform(0.5, 2.5) / np.linalg.norm(across)
+            start = foot + high * _TURN
+            radius = _thickness(rng, 0.005, 0.04) if kind == "tube" else rng.uniform(0.001, 0.005)
+            round_things.append((_tube([start, start + across], radius), paint))
+    if scene.potted:
+        round_things += _pots(rng, plot)
+    if scene.robot:
+        round_things += _robot(rng, family)
+    return round_things, flat_things
+
+
+def _beside(rng: np.random.Generator, family: Family) -> float:
+    """Draw a distance behind the row's line, m: seldom between it and the cameras."""
+    return rng.uniform(-0.3 * family.rig.distance, 0.0) if rng.random() < 0.25 else rng.uniform(0.0, 1.5)
+
+
+def _thickness(rng: np.random.Generator, low: float, high: float) -> float:
+    return low * (high / low) ** rng.random()
+
+
+def _tube(corners: list[np.ndarray], radius: float, end: float | None = None) -> Stalk:
+    """Return a tube through corners [3], m, from one radius to another; bare, without nodes."""
+    points = [corners[0]]
+    for one, other in zip(corners, corners[1:]):
+        pieces = max(math.ceil(float(np.linalg.norm(other - one)) / _PIECE), 1)
+        points += [one + (other - one) * (piece + 1) / pieces for piece in range(pieces)]
+    line = np.array(points, float)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    radii = np.linspace(radius, radius if end is None else end, len(line))
+    return Stalk(-1, line, radii, radii, arc, np.zeros(len(line)), np.zeros(0), 1.0, 0.0)
+
+
+def _ribbon(rng: np.random.Generator, foot: np.ndarray, kind: str) -> Leaf:
+    """Return an upright strip with parallel sides, or a blade that bends and comes to a point."""
+    tall = rng.uniform(0.25, 1.8)
+    knots = max(math.ceil(tall / _PIECE), 3)
+    along = np.linspace(0.0, 1.0, knots + 1)
+    lean = rng.normal(0.0, 0.06 if kind == "strip" else 0.25, 2)
+    bend = 0.0 if kind == "strip" else rng.uniform(0.0, 0.5)
+    sideways = (along + bend * along**2)[:, None] * lean * tall
+    middle = foot + np.concatenate([sideways, (along * tall)[:, None]], axis=1)
+    turn = rng.uniform(-0.8, 0.8)
+    across = np.tile([math.cos(turn), math.sin(turn), 0.0], (knots + 1, 1))
+    half = _thickness(rng, 0.004, 0.03) * (np.ones(knots + 1) if kind == "strip" else np.maximum(1.0 - along**2, 0.05))
+    return Leaf(-1, middle, across, half, kind == "strip")
+
+
+def _pots(rng: np.random.Generator, plot: Plot) -> list[tuple[Stalk, list[float]]]:
+    dark = [0.03, 0.03, 0.035] if rng.random() < 0.6 else list(colorsys.hsv_to_rgb(0.05, 0.6, 0.35))
+    pots = []
+    for stalk in plot.measured:
+        foot, tall, wide = stalk.points[0] * [1.0, 1.0, 0.0], rng.uniform(0.08, 0.19), rng.uniform(0.06, 0.14)
+        pots.append((_tube([foot, foot + tall * _TURN], 0.8 * wide, wide), plain(rng, dark)))
+        earth = _tube([foot + 0.7 * tall * _TURN, foot + 1.1 * tall * _TURN], 0.8 * wide, 0.01)
+        pots.append((earth, plain(rng, [0.06, 0.04, 0.03])))
+    return pots
+
+
+def _robot(rng: np.random.Generator, family: Family) -> list[tuple[Stalk, list[float]]]:
+    """Return an arm of thick white or grey links, which hangs into the image from aside or above, nearer than the row."""
+    grey = rng.uniform(0.5, 0.8) if rng.random() < 0.7 else rng.uniform(0.03, 0.2)
+    middle = 0.5 * family.layout.plot_length + rng.uniform(-0.5, 0.5)
+    side = rng.choice([-1.0, 1.0])
+    near = -rng.uniform(0.2, 0.6) * family.rig.distance
+    at = np.array([middle + side * rng.uniform(0.5, 0.9), near, family.rig.camera_height + rng.uniform(0.3, 0.9)])
+    links = []
+    for _ in range(rng.integers(2, 5)):
+        step = np.array([-side * rng.uniform(0.0, 0.35), rng.normal(0.0, 0.05), rng.normal(-0.15, 0.2)])
+        radius = rng.uniform(0.025, 0.065)
+        links.append((_tube([at, at + step], radius), plain(rng, [grey] * 3)))
+        at = at + step
+    return links
+
+
+def material(rng: np.random.Generator, green: bool = False) -> list[float]:
+    """Return a material of painted, plastic, metal or wooden things, or of a green blade; see `surfaces.MATERIAL`."""
+    if green:
+        return plain(rng, list(colorsys.hsv_to_rgb(rng.uniform(0.17, 0.32), rng.uniform(0.4, 0.8), rng.uniform(0.1, 0.35))))
+    kind = rng.choice(["grey", "wood", "paint", "straw"], p=[0.45, 0.25, 0.15, 0.15])
+    if kind == "grey":
+        return plain(rng, [_thickness(rng, 0.03, 0.85)] * 3)
+    hue, saturation = {
+        "wood": (rng.uniform(0.05, 0.1), rng.uniform(0.2, 0.6)),
+        "paint": (rng.random(), rng.uniform(0.4, 0.9)),
+        "straw": (rng.uniform(0.08, 0.16), rng.uniform(0.3, 0.6)),
+    }[kind]
+    grain = 0.5 if kind == "wood" else 0.05
+    return plain(rng, list(colorsys.hsv_to_rgb(hue, saturation, rng.uniform(0.1, 0.7))), grain)
+
+
+def plain(rng: np.random.Generator, colour: list[float], grain: float = 0.05) -> list[float]:
+    """Return a material of one colour, with hardly any texture, sometimes with bands."""
+    bands = rng.uniform(0.2, 0.8) if rng.random() < 0.1 else 0.0
+    return [
+        *colour, *colour, 1.0 / rng.uniform(1e-3, 6e-3), grain, 1.0 / rng.uniform(0.02, 0.1), rng.uniform(0.0, 0.25),
+        0.0, 500.0, bands, 1.0 / rng.uniform(0.05, 0.3), 0.0, rng.uniform(0.0, 0.4), rng.uniform(0.0, 50.0), 0.0,
+    ]  # fmt: skip

@@ -1,0 +1,85 @@
+"""Factors of what stands around plants by day, and what light and cameras do to it. Imports neither JAX nor MuJoCo."""
+
+import dataclasses
+
+Range = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Daylight, surroundings and cameras of plots that were not photographed with a flash at night.
+
+    With a share of 0, which is the default, a family is what its other parts say, bit for bit.
+    """
+
+    share: float = 0.0
+    """Fraction of plots by day, to which everything below applies."""
+    maize: float = 0.4
+    """Fraction of these that look like maize: thick green stalks, broad leaves."""
+    potted: float = 0.3
+    """Fraction of these that are one plant in a pot."""
+    indoors: float = 0.15
+    """Fraction of these that stand before a wall, under a ceiling."""
+    photographs: float = 0.0
+    """Fraction of these whose background is a photograph that scikit-image or scikit-learn ships."""
+    sun: Range = (0.0, 1.6)
+    """Light of the sun on a white surface that faces it; the flash's is 1 at the row."""
+    sky: Range = (0.15, 0.7)
+    """Light of the sky on a white surface."""
+    elevation: Range = (20.0, 75.0)
+    """Elevation of the sun, degrees."""
+    shadow: Range = (0.0, 1.0)
+    """Share of the sun that leaves above take away in the shadows that they cast."""
+    grass: float = 0.4
+    """Fraction of grounds that are grass; the others are soil or concrete."""
+    straw: Range = (0.0, 3.0)
+    """Factor of the number of pieces of dry leaf on the ground."""
+    distance: Range = (0.5, 1.6)
+    """Distance from the cameras to the row, m."""
+    camera_height: Range = (0.25, 1.3)
+    """Height of the cameras, m."""
+    lens: Range = (50.0, 110.0)
+    """Horizontal field of view, degrees."""
+    pitch: Range = (0.0, 25.0)
+    """Downward pitch of the cameras, degrees."""
+    yaw: Range = (0.0, 40.0)
+    """Angle between the cameras' view and the direction across the row, degrees to either side."""
+    roll: Range = (0.0, 6.0)
+    """Roll of the cameras, degrees to either side."""
+    objects: Range = (0.0, 5.0)
+    """Number of things per metre of row that are no stalk: poles, tubes, strips, blades, cables."""
+    robot: float = 0.25
+    """Fraction of plots in which parts of a robot show."""
+    brightness: Range = (0.12, 0.45)
+    """Mean radiance that the exposure aims at; 1 is white."""
+    white_balance: float = 0.1
+    """Standard deviation of the logarithm of the gains of red and blue."""
+    jpeg: Range = (35.0, 98.0)
+    """Quality of JPEG."""
+    motion: Range = (0.0, 0.003)
+    """Length of motion blur, relative to the image's width."""
+    resolution: Range = (0.35, 1.0)
+    """Resolution of the image that a camera took, relative to that of the image that it was enlarged to."""
+    borders: float = 0.2
+    """Fraction of images with black bars or wedges at their sides."""
+
+
+BOUNDS: dict[str, Range] = {
+    **{f"scene.{name}": (0.0, 1.0) for name in ("share", "maize", "potted", "indoors", "photographs", "grass", "robot")},
+    **{f"scene.{name}": (0.0, 1.0) for name in ("borders", "shadow")},
+    **{f"scene.{name}": (0.0, 20.0) for name in ("sun", "sky", "straw")},
+    "scene.elevation": (5.0, 90.0),
+    "scene.distance": (0.3, 4.0),
+    "scene.camera_height": (0.05, 3.0),
+    "scene.lens": (20.0, 130.0),
+    "scene.pitch": (0.0, 60.0),
+    "scene.yaw": (0.0, 75.0),
+    "scene.roll": (0.0, 45.0),
+    "scene.objects": (0.0, 100.0),
+    "scene.brightness": (0.01, 1.0),
+    "scene.white_balance": (0.0, 1.0),
+    "scene.jpeg": (5.0, 100.0),
+    "scene.motion": (0.0, 0.05),
+    "scene.resolution": (0.1, 1.0),
+}
+"""Limits of plausible values, by part and field."""

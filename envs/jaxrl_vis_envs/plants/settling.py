@@ -1,0 +1,95 @@
+"""One plot's family: of a family with plots by day and by night, what is drawn for this plot. NumPy only."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from jaxrl_vis_envs.plants.family import Family, Layout, Leaves, Rig, Stalks, Textures
+from jaxrl_vis_envs.plants.scene import Scene
+
+_MAIZE_STALKS = {
+    "diameter_mean": 0.022,
+    "diameter_sd": 0.004,
+    "lean_sd": (2.0, 6.0),
+    "node_spacing": (0.10, 0.22),
+    "node_swelling": (0.03, 0.12),
+    "sheaths": 0.85,
+    "sheath_length": (0.08, 0.2),
+}
+_MAIZE_LEAVES = {"lower": 0.25, "middle": 0.7, "upper": 0.95, "width_mean": 0.085, "length_mean": 0.75}
+
+
+def settle(family: Family, rng: np.random.Generator) -> Family:
+    """Draw what is common to a plot: night or day, maize or sorghum, a pot or rows, and where the cameras stand.
+
+    Args:
+        family: The family; without a share of plots by day it is returned as it is.
+        rng: For this purpose alone.
+
+    Returns:
+        A family whose ranges of the scene have one value, and whose share of plots by day is 0 or 1.
+    """
+    if family.scene.share <= 0:
+        return family
+    if rng.random() >= family.scene.share:
+        return dataclasses.replace(family, scene=Scene())
+    scene = _settled(family.scene, rng)
+    layout, stalks, leaves, textures = family.layout, family.stalks, family.leaves, family.textures
+    distance = scene.distance[0]
+    if scene.maize:
+        # A plant grows with all its measures.
+        size = rng.uniform(0.7, 1.2)
+        stalks = dataclasses.replace(stalks, **_MAIZE_STALKS | {"diameter_mean": 0.022 * size})
+        leaves = dataclasses.replace(leaves, **_MAIZE_LEAVES, density=leaves.density * rng.uniform(0.5, 1.3))
+        layout = dataclasses.replace(
+            layout, stalks_mean=layout.stalks_mean * rng.uniform(0.3, 0.6), tillers=0.0, offset_sd=0.015
+        )
+    leaves, textures = _ripeness(leaves, textures, rng)
+    if scene.potted:
+        layout = dataclasses.replace(layout, plot_length=0.3, stalks_mean=rng.integers(1, 3), stalks_sd=0.0, rows_behind=0)
+        leaves = dataclasses.replace(leaves, litter=0.0)
+        distance *= rng.uniform(1.0, 2.0)
+    leaves = dataclasses.replace(leaves, litter=leaves.litter * scene.straw[0])
+    rig = dataclasses.replace(
+        family.rig,
+        focal=0.5 * family.rig.width / math.tan(math.radians(scene.lens[0]) / 2),
+        distance=distance,
+        camera_height=scene.camera_height[0],
+        camera_height_sd=0.0,
+        distance_sd=0.0,
+        pitch=scene.pitch[0],
+    )
+    imaging = dataclasses.replace(family.imaging, flash=(0.01, 0.01))
+    return _family(family, scene, layout, stalks, leaves, textures, rig, imaging)
+
+
+def _family(
+    family: Family, scene: Scene, layout: Layout, stalks: Stalks, leaves: Leaves, textures: Textures, rig: Rig, imaging
+):
+    return dataclasses.replace(
+        family, scene=scene, layout=layout, stalks=stalks, leaves=leaves, textures=textures, rig=rig, imaging=imaging
+    )
+
+
+def _ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generator) -> tuple[Leaves, Textures]:
+    """Return leaves and textures of plants between green and dry."""
+    ripe = rng.random()
+    hue = 0.24 - 0.13 * ripe
+    changed = {"stalk_hue": (hue - 0.04, hue + 0.03), "speckles": (0.0, 0.5), "blotch_contrast": (0.1, 0.6)}
+    dry = min(max(rng.normal(ripe, 0.2), 0.0), 1.0)
+    return dataclasses.replace(leaves, dry=dry), dataclasses.replace(textures, **changed)
+
+
+def _settled(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Draw one value of each range, and yes or no for each fraction."""
+    drawn = {}
+    for field in dataclasses.fields(scene):
+        value = getattr(scene, field.name)
+        if isinstance(value, tuple):
+            low, high = value
+            number = rng.uniform(low, high)
+            drawn[field.name] = (number, number)
+        elif field.name != "white_balance" and field.name != "borders":
+            drawn[field.name] = float(rng.random() < value)
+    return dataclasses.replace(scene, **drawn | {"share": 1.0})

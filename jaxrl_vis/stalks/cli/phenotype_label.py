@@ -1,0 +1,77 @@
+"""``jaxrl-vis phenotype label``."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import check_extra
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Label:
+    """Propose boxes and outlines of stalks in your own images, to correct in CVAT, LabelMe or Label Studio and to train on."""
+
+    images: Annotated[Path, AlsoPositional()]
+    """A folder of images. Annotations are written beside them; those that are there already stay as they are."""
+    format: Literal["coco", "labelme"] = "coco"
+    """Form of the annotations: annotations.json of COCO, as CVAT (`COCO 1.0`) and Label Studio import it, or a .json of LabelMe
+    beside each image."""
+    weights: Path | None = None
+    """Weights from `phenotype train`; the shipped ones if not given."""
+    least_score: float = 0.3
+    """Lowest score of a proposal, 0 to 1: it is quicker to delete one than to draw one."""
+
+
+def label(options: Label) -> int:
+    """Write the proposals."""
+    if not 0.0 <= options.least_score <= 1.0:
+        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    check_extra("phenotyping")
+    from jaxrl_vis.stalks.phenotyping.io.folders import image_files
+    from jaxrl_vis.stalks.phenotyping.report.proposals import write_coco, write_labelme
+
+    if not options.images.is_dir():
+        raise RequestError(f"{options.images} is no folder: name the folder of the images")
+    check_writable(options.images, "IMAGES", folder=True)
+    there = options.images / "annotations.json"
+    if options.format == "coco" and there.exists():
+        raise RequestError(f"{there} is there already: move it away, so that no annotation is lost")
+    paths = image_files(options.images)
+    if not paths:
+        raise RequestError(f"there are no images in {options.images}: name a folder of PNG, JPEG, TIFF, BMP, PGM or PPM")
+    if options.format == "labelme":
+        annotated = [path for path in paths if path.with_suffix(".json").exists()]
+        paths = [path for path in paths if path not in annotated]
+        if annotated:
+            print(f"annotated already, so left alone: {len(annotated)} images")
+    print(f"{options.images}: {len(paths)} images; loading the networks ...", flush=True)
+    check_devices()
+    enable_compilation_cache()
+    from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder, resolve_weights
+    from jaxrl_vis.stalks.phenotyping.io.images import read_image, rgb8
+
+    weights = resolve_weights(options.weights)
+    find = load_finder(weights, options.least_score)
+    found, skipped = [], 0
+    for place, path in enumerate(paths, start=1):
+        try:
+            image = rgb8(read_image(path))
+        except OSError as error:
+            print(f"skipped {error}", flush=True)
+            skipped += 1
+            continue
+        detections = find(image)
+        found.append((path, (image.shape[0], image.shape[1]), detections))
+        if options.format == "labelme":
+            write_labelme(path, (image.shape[0], image.shape[1]), detections)
+        print(f"{place} of {len(paths)}  {path.name}: {len(detections)} proposals", flush=True)
+    if options.format == "coco":
+        write_coco(there, found, f"proposals of {detector_name(weights)}: correct them")
+    total = sum(len(detections) for _, _, detections in found)
+    where = there if options.format == "coco" else f"{options.images}/*.json"
+    print(f"{where}: {total} proposals in {len(found)} images; correct them, then `jaxrl-vis phenotype train`")
+    return 3 if skipped else 0

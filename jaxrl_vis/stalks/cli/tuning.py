@@ -1,0 +1,178 @@
+"""``jaxrl-vis phenotype train --data``: the part of the command that learns from annotated images."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxrl_vis.errors import RequestError
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
+from jaxrl_vis.report.outputs import check_writable
+from jaxrl_vis.stalks.cli.options import DetectorTraining
+
+if TYPE_CHECKING:
+    from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
+    from jaxrl_vis.stalks.phenotyping.training.examples import Example
+    from jaxrl_vis.stalks.phenotyping.training.photographs import Split
+    from jaxrl_vis.stalks.phenotyping.training.tuning import Tuned
+
+_STEPS = 1500
+_RATE, _RATE_FROM_RANDOM = 3e-4, 1e-3
+
+
+def train_on_images(options: DetectorTraining, folder: Path) -> int:
+    """Train on a folder of annotated images; write the weights, and a report on images that were held out beside them."""
+    began = time.monotonic()
+
+    def say(line: str) -> None:
+        print(f"{time.monotonic() - began:6.1f} s  {line}", flush=True)
+
+    say(f"reading the annotations in {folder} ...")
+    page = options.out.with_suffix(".html")
+    check_writable(page, "OUT")
+    from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
+
+    names = read_annotations(folder, options.label)
+    say(f"{folder}: {names['summary']}")
+    check_devices()
+    enable_compilation_cache()
+    from jaxrl_vis import __version__
+    from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
+    from jaxrl_vis.stalks.phenotyping.training.examples import any_outlined
+    from jaxrl_vis.stalks.phenotyping.training.tuning import Tuning, tune
+
+    start, settings, origin = _start(options, folder, say)
+    masks = any_outlined(folder, options.label)
+    if not masks:
+        say("masks stay as they are: no annotation has an outline, only boxes")
+    examples = _read_examples(options, folder, settings, len(names["images"]), say)
+    parts = _split(options, [image["file_name"] for image in names["images"]], examples, say)
+    tuning = Tuning(
+        steps=options.steps or _STEPS,
+        minutes=options.minutes,
+        batch=options.batch,
+        snips=options.snips if masks or start is None else 0,
+        rate=options.rate or (_RATE_FROM_RANDOM if start is None else _RATE),
+        seed=options.seed,
+    )
+
+    def keep(params: Any, step: int) -> None:
+        about = {"version": __version__, "origin": f"annotated images{origin}", "steps": step, "seed": options.seed}
+        write_weights(options.out, params, settings, about)
+
+    tuned = tune(examples, parts, settings, tuning, start, say, keep)
+    keep(tuned.params, tuned.steps)
+    say(f"the end: {tuned.why}; weights are those of update {tuned.steps}")
+    if parts.test:
+        _report(page, examples, parts, tuned, settings, start, masks, say)
+    size = options.out.stat().st_size / 1e6
+    say(f"{options.out}: {tuned.made} updates on annotated images{origin}, {size:.1f} MB")
+    return 0
+
+
+def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, count: int, say: Any) -> list[Example]:
+    """Read all images with their stalks and snips, and say how far it is every few seconds."""
+    from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples
+
+    examples, told = [], time.monotonic()
+    say(f"reading {count} images ...")
+    for example in annotated_examples(folder, settings, options.label):
+        examples.append(example)
+        if time.monotonic() - told > 5.0:
+            told = time.monotonic()
+            say(f"{len(examples)} of {count} images read")
+    return examples
+
+
+def _split(options: DetectorTraining, names: list[str], examples: list[Example], say: Any) -> Split:
+    """Split the images by photograph, and say how many are where."""
+    from jaxrl_vis.stalks.phenotyping.training.photographs import FEWEST, photographs_of, split
+
+    parts = split(photographs_of(names, [example.image for example in examples]), options.seed)
+    if not parts.test:
+        say(
+            f"{parts.photographs} photographs, fewer than {FEWEST}: none is held out, so nothing tells how good the weights are"
+        )
+    else:
+        say(
+            f"{len(examples)} images of {parts.photographs} photographs: {len(parts.train)} to learn from, {len(parts.stop)} "
+            f"to decide when to stop, {len(parts.test)} for the report"
+        )
+    return parts
+
+
+def _report(
+    page: Path,
+    examples: list[Example],
+    parts: Split,
+    tuned: Tuned,
+    settings: Settings,
+    start: Any,
+    masks: bool,
+    say: Any,
+) -> None:
+    """Write the page that compares the weights before and after, and print its numbers."""
+    import jax.numpy as jnp
+
+    from jaxrl_vis.stalks.phenotyping.report.training_page import write_page
+    from jaxrl_vis.stalks.phenotyping.training.held_out import mask_overlap, score
+
+    test = [examples[place] for place in parts.test]
+    scores = {name: score(finds) for name, finds in (("before", tuned.before), ("after", tuned.after))}
+    overlaps = dict.fromkeys(scores, math.nan)
+    if masks:
+        pairs = {"before": start, "after": tuned.params}
+        overlaps = {
+            name: mask_overlap(params["segmenter"], test, settings, jnp.float32)
+            for name, params in pairs.items()
+            if params is not None
+        }
+    for name, each in scores.items():
+        overlap = overlaps.get(name, math.nan)
+        say(
+            f"{name:6} on {each.images} held-out images: {each.right} of {each.labels} stalks found, {each.finds - each.right} "
+            f"false finds, F1 {each.f1:.2f}, AP50 {each.ap50:.2f}"
+            + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
+        )
+    facts = [
+        f"{len(parts.train)} images to learn from, {len(parts.stop)} to decide when to stop, {len(parts.test)} for this page; "
+        f"{parts.photographs} photographs, no copy of one on both sides.",
+        f"{tuned.made} updates in {tuned.update_s / 60:.1f} min after {tuned.compile_s:.0f} s of compilation; the end: "
+        f"{tuned.why}; the weights are those of update {tuned.steps}.",
+    ]
+    write_page(page, facts, test, {"before": tuned.before, "after": tuned.after}, scores, overlaps)
+    say(f"{page}: the held-out images, before and after")
+
+
+def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Settings, str]:
+    """Return parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
+    from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
+    from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.stalks.phenotyping.training.examples import settings_for
+
+    start = options.start or "shipped"
+    if start == "random":
+        return None, settings_for(folder, Settings(), options.label), ""
+    params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
+    fitting = settings_for(folder, settings, options.label)
+    if not 0.5 <= fitting.band_lines / settings.band_lines <= 2.0:
+        why = (
+            f"boxes of {folder} are {fitting.band_lines:.0f} pixels tall in images of {fitting.width}, and those that "
+            f"the weights `{start}` find {settings.band_lines:.0f}"
+        )
+        if options.start is not None:
+            raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
+        say(f"starting from random weights: {why}")
+        return None, fitting, ""
+    # What was learned goes with its anchors, so those of the annotations are not taken. How many candidates there are is no
+    # part of it: what the head has not seen yet it learns now.
+    settings = dataclasses.replace(
+        fitting,
+        band_lines=settings.band_lines,
+        anchor_widths=settings.anchor_widths,
+        candidates=Settings().candidates,
+    )
+    return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"

@@ -1,0 +1,108 @@
+"""Writes finds as annotations that labelling programs open, to be corrected by a person."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import jaxrl_vis
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.io.annotations import coco
+
+_TOLERANCE = 0.8  # pixels by which an outline of few corners differs from the mask
+
+
+def outline(detection: Detection) -> list[float]:
+    """Return the outline of a find's mask within its box: column, line, ... of its corners, where the first pixel is 0 to 1.
+
+    It goes around the outermost pixels of each line, as a stalk is one strip; the box where the mask shows nothing.
+    """
+    left, top, right, bottom = (edge + 0.5 for edge in detection.box)
+    lines = np.arange(detection.mask.shape[0]) + detection.corner[0] + 0.5
+    mask = (np.asarray(detection.mask, float) >= 0.5) & ((lines >= top) & (lines <= bottom))[:, None]
+    rows = np.flatnonzero(mask.any(axis=1))
+    if rows.size < 2:
+        return [left, top, right, top, right, bottom, left, bottom]
+    first = mask[rows].argmax(axis=1) + detection.corner[1]
+    last = mask.shape[1] - mask[rows][:, ::-1].argmax(axis=1) + detection.corner[1]
+    sides = [_simplified(np.stack([side, lines[rows]], axis=1)) for side in (first, last)]
+    # Outer corners of the first and the last pixels, not their middles.
+    for side in sides:
+        side[0, 1] -= 0.5
+        side[-1, 1] += 0.5
+    return np.concatenate([sides[0], sides[1][::-1]]).round(1).ravel().tolist()
+
+
+def _simplified(points: np.ndarray) -> np.ndarray:
+    """Return points [K, 2] with those left out that lie on a line between others."""
+    return cv2.approxPolyDP(points.astype(np.float32)[:, None], _TOLERANCE, closed=False)[:, 0].astype(float)
+
+
+def write_coco(path: Path, found: Sequence[tuple[Path, tuple[int, int], list[Detection]]], about: str) -> None:
+    """Write the finds of several images as COCO.
+
+    Args:
+        path: The file; images are named from its folder.
+        found: File, size (height, width) and finds of each image.
+        about: Description of the data set.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    images, annotations = [], []
+    for number, (image, (height, width), detections) in enumerate(found, start=1):
+        name = image.relative_to(path.parent).as_posix()
+        images.append({"id": number, "file_name": name, "width": width, "height": height})
+        for detection in detections:
+            corners = np.reshape(outline(detection), (-1, 2))
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            ahead = np.roll(corners, -1, axis=0)
+            area = 0.5 * abs(float((corners[:, 0] * ahead[:, 1] - corners[:, 1] * ahead[:, 0]).sum()))
+            annotations.append(
+                {
+                    "image_id": number,
+                    "bbox": [*low.tolist(), *(high - low).round(1).tolist()],
+                    "area": round(area, 1),
+                    "segmentation": [corners.ravel().tolist()],
+                    "score": round(detection.score, 3),
+                }
+            )
+    document = coco(images, annotations, {"description": about, "version": jaxrl_vis.__version__})
+    write_atomically(path, json.dumps(document) + "\n")
+
+
+def write_labelme(image: Path, size: tuple[int, int], detections: list[Detection]) -> None:
+    """Write the finds of one image as LabelMe's .json beside it.
+
+    Args:
+        image: Its file.
+        size: Height and width, pixels.
+        detections: The finds.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    shapes = [
+        {
+            "label": "stalk",
+            "points": np.reshape(outline(detection), (-1, 2)).tolist(),
+            "group_id": None,
+            "description": f"score {detection.score:.2f}",
+            "shape_type": "polygon",
+            "flags": {},
+        }
+        for detection in detections
+    ]
+    document = {
+        "version": "5.5.0",
+        "flags": {},
+        "shapes": shapes,
+        "imagePath": image.name,
+        "imageData": None,
+        "imageHeight": size[0],
+        "imageWidth": size[1],
+    }
+    write_atomically(image.with_suffix(".json"), json.dumps(document) + "\n")

@@ -1,0 +1,95 @@
+"""A page that compares networks before and after a training, on images that were held out. It is one file."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxrl_vis.host.files import write_atomically
+from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
+from jaxrl_vis.stalks.phenotyping.report.qc import picture, table
+from jaxrl_vis.stalks.phenotyping.report.qc_style import SCRIPT, STYLE
+from jaxrl_vis.stalks.phenotyping.training.examples import Example
+from jaxrl_vis.stalks.phenotyping.training.held_out import LEAST_SCORE, Finds, Score
+
+_ANNOTATED, _RIGHT, _FALSE = (255, 225, 60), (70, 235, 100), (255, 105, 75)
+_MOST = 60  # pictures
+_COLUMNS = {
+    "weights": "weights",
+    "images": "images",
+    "labels": "annotated",
+    "right": "found",
+    "false": "false finds",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+    "ap50": "AP50",
+    "masks": "overlap of masks",
+}
+
+
+def write_page(
+    path: Path,
+    facts: Sequence[str],
+    examples: Sequence[Example],
+    finds: Mapping[str, Sequence[Finds]],
+    scores: Mapping[str, Score],
+    overlaps: Mapping[str, float],
+) -> None:
+    """Write the page.
+
+    Args:
+        path: The file, .html.
+        facts: Lines about the training.
+        examples: The images.
+        finds: Finds in each image, by the name of the weights.
+        scores: Scores of these, by the same name.
+        overlaps: Overlap of masks, by the same name; not a number, or missing, where unknown.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    rows = []
+    for name, each in scores.items():
+        values = dataclasses.asdict(each) | {"masks": overlaps.get(name, math.nan), "false": each.finds - each.right}
+        texts = {key: f"{value:.2f}" if isinstance(value, float) else value for key, value in values.items()}
+        rows.append({"weights": name, **{key: "" if text == "nan" else text for key, text in texts.items()}})
+    figures = []
+    for place, example in enumerate(examples[:_MOST]):
+        shown = {name: draw_finds(example, each[place]) for name, each in finds.items()}
+        pictures = "".join(picture(image, f"image {place + 1}, {name}", "pair") for name, image in shown.items())
+        figures.append(f"<figure>{pictures}<figcaption>{' | '.join(shown)}</figcaption></figure>")
+    parts = [
+        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Training on own images</title>',
+        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>',
+        "<h1>Networks before and after training, on images that were held out</h1>",
+        *(f"<p>{fact}</p>" for fact in facts),
+        table(_COLUMNS, rows),
+        f"<p>Yellow: annotated. Green: found, with a score of {LEAST_SCORE:g} or more. Red: found where nothing is annotated."
+        "</p>",
+        *figures,
+        f"<script>{SCRIPT}</script></body></html>\n",
+    ]
+    write_atomically(path, "".join(parts))
+
+
+def draw_finds(example: Example, finds: Finds) -> np.ndarray:
+    """Return a reduced image [h, w, 3] uint8 with its annotations and finds."""
+    canvas = example.image.copy()
+    for stalk in example.stalks[example.kinds == STALK]:
+        _box(canvas, stalk, _ANNOTATED)
+    for stalk, score, right in zip(finds.stalks, finds.scores, finds.right):
+        if score >= LEAST_SCORE:
+            colour = _RIGHT if right else _FALSE
+            _box(canvas, stalk, colour)
+            place = (round(float(stalk[0])), max(round(float(stalk[1])) - 4, 12))
+            cv2.putText(canvas, f"{score:.2f}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+    return canvas
+
+
+def _box(canvas: np.ndarray, stalk: np.ndarray, colour: tuple[int, int, int]) -> None:
+    left, top, right, bottom = (round(float(edge)) for edge in stalk[:4])
+    cv2.rectangle(canvas, (left, top), (right, bottom), colour, 1, cv2.LINE_AA)

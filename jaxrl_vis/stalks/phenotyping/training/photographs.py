@@ -1,0 +1,88 @@
+"""Images of one photograph, and the split of a folder's images into those that are learned from and those that are held out.
+
+Exports of labelling programs hold copies of a photograph that were turned, relit or cut, and frames of a video are nearly the
+same. A copy on either side of a split would make a test of memory of it.
+"""
+
+import dataclasses
+import re
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+_SIDE = 16  # pixels of a thumbnail
+_ALIKE = 0.97  # correlation of the thumbnails of copies
+_COPY = re.compile(r"([._-]rf[._-][0-9a-f]{6,}|[ ._-]*(aug|copy|flip|mirror|rot)[a-z]*[ ._-]*\d*|[ ._-]*\(\d+\))$")
+FEWEST = 5
+"""Photographs below which nothing is held out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Split:
+    """Indices of the images of each part.
+
+    Attributes:
+        train: Learned from.
+        stop: What decides when training ends.
+        test: Shown in the report, and used for no decision.
+        photographs: Number of photographs of which there are images.
+    """
+
+    train: tuple[int, ...]
+    stop: tuple[int, ...]
+    test: tuple[int, ...]
+    photographs: int
+
+
+def photographs_of(names: Sequence[str], images: Sequence[np.ndarray]) -> np.ndarray:
+    """Number the photographs that images show: [N] int, equal for images of one.
+
+    Args:
+        names: Their files; what labelling programs append to the names of copies does not count.
+        images: [h, w, 3] uint8 of any size.
+    """
+    thumbnails = np.array([_thumbnail(image) for image in images])
+    flat = thumbnails.reshape(len(images), -1)
+    mirrored = thumbnails[:, :, ::-1].reshape(len(images), -1)
+    alike = np.maximum(flat @ flat.T, flat @ mirrored.T) > _ALIKE
+    stems = [_stem(name) for name in names]
+    alike |= np.array([[one == other for other in stems] for one in stems])
+    number = np.arange(len(images))
+    for _ in range(len(images)):
+        lowest = np.where(alike, number, len(images)).min(axis=1)
+        if (lowest == number).all():
+            break
+        number = lowest
+    return number
+
+
+def _stem(name: str) -> str:
+    stem = name.lower().rpartition("/")[2].rpartition(".")[0]
+    while (shorter := _COPY.sub("", stem)) and shorter != stem:
+        stem = shorter
+    return stem
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    grey = cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float64).mean(axis=2)
+    grey -= grey.mean()
+    return grey / max(float(np.sqrt((grey**2).sum())), 1e-9)
+
+
+def split(photographs: np.ndarray, seed: int) -> Split:
+    """Split images by photograph: a fifth for the report, a sixth of the rest to stop by; nothing where there are few.
+
+    Args:
+        photographs: [N] int, see `photographs_of`.
+        seed: Of the choice.
+    """
+    groups = np.random.default_rng([seed, 23]).permutation(np.unique(photographs))
+    count = len(groups)
+    test = max(round(count / 5), 1) if count >= FEWEST else 0
+    stop = max(round((count - test) / 6), 1) if count >= FEWEST else 0
+
+    def part(chosen: np.ndarray) -> tuple[int, ...]:
+        return tuple(np.flatnonzero(np.isin(photographs, chosen)).tolist())
+
+    return Split(part(groups[test + stop :]), part(groups[test : test + stop]), part(groups[:test]), count)
