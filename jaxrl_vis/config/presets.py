@@ -163,10 +163,10 @@ def preset(name: str, **overrides: Any) -> Config:
     values = TASKS.get((name, env.removeprefix("Visual")), TaskValues())
     config = config.replace(**values.choose(env.startswith("Visual"), method))
     algorithm = str(overrides.get("algorithm", config.run.algorithm))
-    return config.replace(**{**_of_algorithm(config, algorithm), **overrides})
+    return config.replace(**{**_algorithm_overrides(config, algorithm), **overrides})
 
 
-def _of_algorithm(config: Config, algorithm: str) -> dict[str, Any]:
+def _algorithm_overrides(config: Config, algorithm: str) -> dict[str, Any]:
     """Return the values that an algorithm has otherwise than DDPG."""
     if algorithm == "td3":  # the actor and the targets wait
         return {name: max(2, config.value(name)) for name in ("actor_interval", "target_update_interval")}

@@ -138,7 +138,7 @@ def weighted_grad(
     shared: Selector = everything,
     way: Way = "per_loss",
     has_aux: bool = False,
-    reduce: Selector = everything,
+    reduce: Callable[[Any], Any] = everything,
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
     encode: Encode | None = None,
 ) -> Callable[..., Weighted]:

@@ -113,7 +113,7 @@ class Auxiliary:
         view: View,
         latents: dict[str, jax.Array],
         batch: Batch,
-        latent_weights: Mapping[str, jax.Array] | None = None,
+        latent_scales: Mapping[str, jax.Array] | None = None,
     ) -> dict[str, jax.Array]:
         """Compute the loss of each task, [] float32 by name.
 
@@ -122,11 +122,11 @@ class Auxiliary:
             view: Inputs that all tasks share.
             latents: [B, L] of the tasks' own views, by name.
             batch: The transitions, with targets.
-            latent_weights: [] float32 by name, factors of each loss's gradient in its latents; None: 1.
+            latent_scales: [] float32 by name, factors of each loss's gradient in its latents; None: 1.
         """
         views = self._views(view, latents, batch)
-        if latent_weights is not None:
-            views = {name: _scale_latents(view, latent_weights[name]) for name, view in views.items()}
+        if latent_scales is not None:
+            views = {name: _scale_latents(view, latent_scales[name]) for name, view in views.items()}
         return {name: task.loss(heads[name], views[name]) for name, task in self.tasks.items()}
 
     def predictions(

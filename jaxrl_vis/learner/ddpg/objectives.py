@@ -242,5 +242,5 @@ class Objectives:
             return {}
         patches = inputs.observed if self.networks.uses_kernel else None
         view = View(latents.before, batch.action, latents.after, image, patches=patches)
-        latent_weights = weights if self.auxiliary.weighting.heads == "always" else None
-        return self.auxiliary.losses(params["heads"], view, latents.views, batch, latent_weights)
+        latent_scales = weights if self.auxiliary.weighting.heads == "always" else None
+        return self.auxiliary.losses(params["heads"], view, latents.views, batch, latent_scales)

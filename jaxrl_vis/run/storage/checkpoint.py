@@ -377,7 +377,7 @@ class Checkpoints:
             RequestError: The checkpoint is damaged, or of another schema.
         """
         with self._damage_as_request_error(tier, iteration):
-            return self._manifest(tier, iteration)
+            return self._read_manifest(tier, iteration)
 
     def restore(self, tier: str, manifest: dict[str, Any], template: LoopState) -> Restored:
         """Restore one checkpoint completely, and compare it with the checksums in its manifest.
@@ -405,7 +405,7 @@ class Checkpoints:
                 if tier == RECENT:
                     loop, progress = self.recent.restore(iteration, template)
                     return Restored(RECENT, iteration, loop.train, loop, progress)
-                manifest = self._manifest(tier, iteration)
+                manifest = self._read_manifest(tier, iteration)
                 return self._restored(tier, iteration, template, with_rest and tier == FULL, manifest)
             except Unusable as damage:
                 if (tier, iteration) not in self._reported:
@@ -413,7 +413,7 @@ class Checkpoints:
                 self._reported.add((tier, iteration))
         return None
 
-    def _manifest(self, tier: str, iteration: int) -> dict[str, Any]:
+    def _read_manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         import orbax.checkpoint as ocp
 
         manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]

@@ -12,7 +12,7 @@ from jaxrl_vis.stalks.cli.options import check_extra
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Figure:
+class _FigureOptions:
     """Options of all figures."""
 
     name: ClassVar[str]
@@ -38,7 +38,7 @@ class _Figure:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PerceptionFigure(_Figure):
+class PerceptionFigure(_FigureOptions):
     """Draw figure 4.4: from a stereo pair of a synthetic run to grasp points."""
 
     name: ClassVar[str] = "4.4"
@@ -48,7 +48,7 @@ class PerceptionFigure(_Figure):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PathFigure(_Figure):
+class PathFigure(_FigureOptions):
     """Draw figure 4.5: the planned path of the grip to a stalk of a synthetic run, and the path taken."""
 
     name: ClassVar[str] = "4.5"
@@ -60,7 +60,7 @@ class PathFigure(_Figure):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class GraspsFigure(_Figure):
+class GraspsFigure(_FigureOptions):
     """Draw figure 4.6: attempts and grasps of 16 runs of half a metre."""
 
     name: ClassVar[str] = "4.6"

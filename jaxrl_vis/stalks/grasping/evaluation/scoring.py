@@ -192,7 +192,7 @@ def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> flo
 
 def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
     """Compare painted masks with true ones."""
-    far = [_between_outlines(*both) for both in masks]
+    far = [_mean_outline_distance(*both) for both in masks]
     return MaskScore(
         hits=int(sum((painted & true).sum() for painted, true in masks)),
         painted=int(sum(painted.sum() for painted, _ in masks)),
@@ -201,7 +201,7 @@ def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
     )
 
 
-def _between_outlines(painted: np.ndarray, true: np.ndarray) -> float:
+def _mean_outline_distance(painted: np.ndarray, true: np.ndarray) -> float:
     """Mean distance of the outlines of two masks, in both directions, pixels; not a number where one has none."""
     outlines = [mask.astype(np.uint8) - cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) for mask in (painted, true)]
     if not all(outline.any() for outline in outlines):

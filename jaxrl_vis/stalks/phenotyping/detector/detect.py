@@ -157,7 +157,7 @@ def within(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
 
 
 def heads(
-    network: Detector, params: Any, features: jax.Array, method: Literal["propose", "judge_all"]
+    network: Detector, params: Any, features: jax.Array, method: Literal["propose", "classify"]
 ) -> tuple[jax.Array, jax.Array]:
     """Logits and codes from one of the detector's heads."""
     logits, codes = network.apply(params, features, method=method)
@@ -169,7 +169,7 @@ def judge(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
     """Judge proposals [P, 6] of one image with features [H, W, C]: stalks, without duplicates."""
-    logits, codes = heads(network, params, region_features(features, proposals), "judge_all")
+    logits, codes = heads(network, params, region_features(features, proposals), "classify")
     stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
     valid = valid & (scores >= settings.least_score)
     selected = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)

@@ -89,7 +89,7 @@ class Detector(nn.Module):
         count = x.shape[0]
         return self.objectness(x).reshape(count, -1), self.offsets(x).reshape(count, -1, 6)
 
-    def judge_all(self, regions: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def classify(self, regions: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Logits [R] and codes [R, 6] of regions [R, h, w, C]."""
         x = regions.astype(self.dtype)
         for look in self.looks:
@@ -100,7 +100,7 @@ class Detector(nn.Module):
     def __call__(self, images: jax.Array, regions: jax.Array) -> tuple[jax.Array, ...]:
         """Everything once, to make parameters."""
         features = self.features(images)
-        return (features, *self.propose(features), *self.judge_all(regions))
+        return (features, *self.propose(features), *self.classify(regions))
 
 
 class Segmenter(nn.Module):

@@ -75,7 +75,7 @@ def detector_loss(
         alike = 0.5 * (overlap(proposals[:, :4], truth[:, :4]) + band_overlap(proposals, truth))
         which, shows, none = assign(alike, kinds, 0.5, 0.45)
         shows, none = shows & valid, none & valid
-        judged, refined = heads(network, params, region_features(features, proposals), "judge_all")
+        judged, refined = heads(network, params, region_features(features, proposals), "classify")
         weight = (shows | none).astype(jnp.float32)
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
