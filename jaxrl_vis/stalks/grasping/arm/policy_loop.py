@@ -57,7 +57,7 @@ def reach_by_policy(
     Args:
         stands: True stalks around each of B arms.
         detected: Detected stalks around each arm, in the same order.
-        targets: [B, 3] float32, where the jaws should close, m in the plot's frame; used for the goal images and the error.
+        targets: [B, 3] float32, where the jaws should close, m in the plot's frame; the policy sees them in goal images only.
         policy: Policy of a run of VisualStalkReach.
         key: [B], typed keys for sampling the wind.
         wind_mm: Amplitude of the stalks' sway, mm.
