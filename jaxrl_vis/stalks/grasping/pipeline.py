@@ -78,7 +78,7 @@ class Request:
         finder: Name of the mask network; part of the request, so that results of different networks are not mixed.
         calibrations: Calibration of each run, by the run's name.
         mount: Mount of the pair.
-        speed: Speed of the robot, m/s, for runs with times but no distances; None if unknown.
+        speed: Speed of the robot, m/s, for runs whose odometry holds times but no distances; None if there are none.
         reachable: Function that returns True for points within the arm's reach; None without an arm.
     """
 

@@ -42,7 +42,7 @@ _AHEAD = 1.5  # looks: horizon of the linear extrapolation of a stalk's motion
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The attempts of one run, before the arm moves.
+    """Planned attempts of one run.
 
     Attributes:
         run: Number of the run.

@@ -15,7 +15,7 @@ class Generator(nn.Module):
     """U-Net from images [N, H, W, 3] to [N, H, W, outputs] float32. H and W must be multiples of 2^len(channels).
 
     Attributes:
-        channels: Channels of each level; multiples of 8.
+        channels: Channels of each level; all but the first must be multiples of 8.
         outputs: Number of output channels: 3 for painted images in -1 to 1, 1 for logits of the mask.
         dtype: Compute dtype of the convolutions.
     """

@@ -43,7 +43,7 @@ class Plan:
         batch: Number of crops per update.
         crop: Height and width of a crop, pixels.
         rate: Peak learning rate of the generator.
-        average: Decay rate of the exponential moving average of the generator's parameters.
+        average: Decay rate of the exponential moving average of the generator's parameters; lower in the first updates.
         seed: Seed of initialisation, crops and augmentation.
     """
 

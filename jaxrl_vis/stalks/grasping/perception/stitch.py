@@ -18,7 +18,7 @@ from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, thinned
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """A rigid motion: p -> rotation p + shift.
+    """Rigid motion p -> ``rotation`` @ p + ``shift``.
 
     Attributes:
         rotation: [3, 3] float64.
