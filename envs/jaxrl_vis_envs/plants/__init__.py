@@ -2,8 +2,8 @@
 
     family      parameters of the fields and their variation: TRAINING
     shifts      families with shifted factors: SHIFTED, `shift`     spec    a family from a file: `read`
-    scene       factors of plots by day    settling   what is drawn of them for one plot
-    clutter     things that are no stalk   backdrop   what is far away       degrading  what plain cameras do to images
+    scene       factors of plots by day    settling   values of these factors sampled for one plot
+    clutter     objects around the plants  backdrop   distant background     degrading  effects of simple cameras on images
     field       one plot: stalks and leaves in metres       cameras    trajectory of a camera pair past it
     surfaces    the plot as cones and triangles             tables     surfaces visible to a camera, by tile
     drawing     rays to radiance, in JAX                    imaging    radiance to pixel values

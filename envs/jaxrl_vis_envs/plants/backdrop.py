@@ -1,6 +1,6 @@
-"""Backdrops of plots by day: what is seen beyond the ground, by direction. NumPy only.
+"""Backdrops of plots by day, beyond the ground. NumPy and Pillow only.
 
-A picture in azimuth and elevation, infinitely far away, with as much light in each direction as the renderer's radiance has.
+A backdrop is an image in azimuth and tangent of the elevation, infinitely far away, in the units of the renderer's radiance.
 """
 
 import importlib.util
@@ -10,24 +10,27 @@ import numpy as np
 from PIL import Image
 
 SHAPE = (512, 1024)
-"""Lines and columns."""
+"""Height and width of a backdrop, pixels."""
 REACH = (1.6, 2.0)
-"""Tangent of the highest elevation, and the greatest azimuth in rad, either way."""
+"""Maximum tangent of the elevation, and maximum azimuth in rad, to either side."""
 _HORIZON = SHAPE[0] // 2
 _PHOTOGRAPHS = (("skimage", "data"), ("sklearn", "datasets/images"))
 
 
 def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
-    """Draw a backdrop: [*SHAPE, 3] float32 radiance.
+    """Sample a backdrop.
 
     Args:
-        rng: For this purpose alone.
-        indoors: A wall and a ceiling in place of the sky and what stands before it.
-        photograph: A photograph that an installed package ships.
-        sky: Light of the sky on a white surface.
+        rng: Random number generator.
+        indoors: Whether to draw a wall and a ceiling instead of the sky and a skyline.
+        photograph: Whether to use a photograph shipped with an installed package instead; takes precedence over ``indoors``.
+        sky: Light of the sky on a white surface, which scales the radiance.
+
+    Returns:
+        [*SHAPE, 3] float32 radiance.
 
     Raises:
-        ValueError: A photograph is asked for, and no package that ships some is installed.
+        ValueError: ``photograph`` is True, and no package that ships photographs is installed.
     """
     if photograph:
         return (_photograph(rng) * sky * rng.uniform(0.6, 1.6)).astype(np.float32)
@@ -36,7 +39,13 @@ def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky
 
 
 def smooth_noise(rng: np.random.Generator, size: tuple[float, float], shape: tuple[int, int] = SHAPE) -> np.ndarray:
-    """Draw noise [*shape] from 0 to 1, evenly spread, whose features have a ``size`` in lines and columns."""
+    """Sample smooth noise [*shape], uniformly distributed in 0 to 1.
+
+    Args:
+        rng: Random number generator.
+        size: Height and width of the features, pixels.
+        shape: Height and width of the result, pixels.
+    """
     lines, columns = (np.fft.fftfreq(count)[:, None] for count in shape)
     falloff = np.exp(-2.0 * (np.pi * size[0] * lines / 3) ** 2) * np.exp(-2.0 * (np.pi * size[1] * columns.T / 3) ** 2)
     values = np.fft.ifft2(np.fft.fft2(rng.normal(size=shape)) * falloff).real
@@ -46,7 +55,7 @@ def smooth_noise(rng: np.random.Generator, size: tuple[float, float], shape: tup
 
 
 def _outdoors(rng: np.random.Generator) -> np.ndarray:
-    """Draw a sky, and on the horizon trees, a building, a crop's canopy, or trunks and poles."""
+    """Sample a sky with clouds, a ground, and one to three of: trees, a building, a crop's canopy, trunks."""
     elevation = ((_HORIZON - np.arange(SHAPE[0])) / _HORIZON * REACH[0])[:, None, None]
     zenith = np.array([0.25, 0.45, 0.95]) * rng.uniform(0.5, 1.3)
     haze = np.array([0.85, 0.92, 1.0]) * rng.uniform(0.7, 1.6)
@@ -64,7 +73,7 @@ def _outdoors(rng: np.random.Generator) -> np.ndarray:
 
 
 def _skyline(rng: np.random.Generator, high: float, roughness: tuple[float, float]) -> np.ndarray:
-    """Draw a mask [*SHAPE] of what reaches up to an uneven line, on the mean at the tangent ``high``."""
+    """Sample a mask [*SHAPE] bool from the horizon up to an uneven skyline with a mean tangent of about ``high``."""
     line = sum(smooth_noise(rng, (1, size), (1, SHAPE[1]))[0] * weight for size, weight in zip((8, 60), roughness))
     top = _HORIZON * (1.0 - high * (0.5 + line) / REACH[0])
     lines = np.arange(SHAPE[0])[:, None]
@@ -93,7 +102,7 @@ def _building(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 
 
 def _canopy(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    """Draw a crop some rows further away: leaves, streaks that stand upright, and what shows between them."""
+    """Paste the canopy of a distant crop: leaves, upright streaks, and gaps that show what is behind."""
     mask = _skyline(rng, rng.uniform(0.3, 1.4), (0.5, 0.3))
     mask[_HORIZON : _HORIZON + 60] = True
     green = np.array([0.10, 0.16, 0.04]) * rng.uniform(0.5, 1.8) * rng.uniform(0.8, 1.2, 3)
@@ -108,7 +117,7 @@ def _canopy(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 
 
 def _trunks(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    """Draw trunks or poles: upright, of any width and brightness, some distance behind the row."""
+    """Paste trunks or poles of any width and brightness, upright up to a small lean."""
     picture = picture.copy()
     columns = np.arange(SHAPE[1])
     for _ in range(rng.integers(3, 40)):
@@ -127,7 +136,7 @@ def _trunks(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 
 
 def _room(rng: np.random.Generator) -> np.ndarray:
-    """Draw a wall and a ceiling with lamps, and dark and light furniture."""
+    """Sample a wall and a ceiling, with rectangles as lamps and furniture."""
     picture = np.ones((*SHAPE, 3)) * rng.uniform(0.2, 0.9) * rng.uniform(0.9, 1.1, 3)
     ceiling = int(_HORIZON * (1.0 - rng.uniform(0.3, 1.0) / REACH[0]))
     picture[:ceiling] *= rng.uniform(0.3, 1.0)
@@ -141,7 +150,7 @@ def _room(rng: np.random.Generator) -> np.ndarray:
 
 
 def _photograph(rng: np.random.Generator) -> np.ndarray:
-    """Return a part of an installed photograph, mirrored by chance: [*SHAPE, 3], linear, 0 to 1."""
+    """Sample a crop of an installed photograph, mirrored with probability 0.5: [*SHAPE, 3] in linear light, 0 to 1."""
     paths = photograph_files()
     if not paths:
         raise ValueError("scene.photographs needs photographs that packages ship: pip install scikit-image, or scikit-learn")
@@ -156,7 +165,7 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
 
 
 def photograph_files() -> list[Path]:
-    """Return the photographs that scikit-image and scikit-learn ship, in order; none where neither is installed."""
+    """Return the paths of the photographs shipped with scikit-image and scikit-learn, in fixed order; empty without them."""
     found = []
     for package, folder in _PHOTOGRAPHS:
         spec = importlib.util.find_spec(package)

@@ -2,8 +2,8 @@
 
 Camera frame: x to the right of the image, y down, z forwards. The cameras look along the world's y axis and move along its x
 axis; the right one is a baseline further along. Both are rectified: a point at (X, Y, Z) in the left camera's frame projects to
-column centre + f X / Z in the left image and a disparity f B / Z further left in the right one, on the same line up to a small
-error. The centre of the first pixel (column 0, line 0) is at (0.0, 0.0).
+column centre + f X / Z in the left image and a disparity f B / Z further left in the right one, in the same row up to a small
+error. The centre of the first pixel (column 0, row 0) is at (0.0, 0.0).
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ class Calibration:
     Attributes:
         width, height: Image size, pixels.
         focal: Focal length, pixels.
-        centre: Column and line of the left camera's principal point.
+        centre: Column and row of the left camera's principal point, pixels.
         baseline: Distance between the cameras, m.
         offset: Disparity at infinite depth, pixels: the column of the left principal point minus that of the right one.
     """
@@ -72,13 +72,13 @@ class Drive:
     """Trajectory of the cameras past one plot.
 
     Attributes:
-        true: Actual cameras.
-        stated: Cameras according to their calibration.
-        poses: One per pair.
-        times: [F] float64, s.
+        true: Actual calibration of the cameras.
+        stated: Calibration as known to users, with its errors.
+        poses: Actual pose of the left camera for each of F pairs.
+        times: [F] float64, times of the pairs, s.
         odometry: [F] float64, distance along the row reported by the robot, m, from 0.
-        line_offset: Vertical offset of the right image downwards, lines.
-        line_slope: Change of this offset per column.
+        line_offset: Downward offset of the right image, pixels.
+        line_slope: Change of this offset per column, pixels.
     """
 
     true: Calibration

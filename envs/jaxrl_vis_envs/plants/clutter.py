@@ -1,4 +1,4 @@
-"""Things around plants that are no stalk: poles, tubes, cables, strips, blades, pots, parts of a robot. NumPy only."""
+"""Objects around plants: poles, tubes, cables, strips, blades, pots, parts of a robot. NumPy only."""
 
 import colorsys
 import math
@@ -8,12 +8,16 @@ import numpy as np
 from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Leaf, Plot, Stalk, generator
 
-_PIECE = 0.1  # m: length of the pieces of long things, so that those out of sight are left out
+_PIECE = 0.1  # m: maximum length of the pieces of long objects, so that pieces out of sight can be culled
 _TURN = np.array([0.0, 0.0, 1.0])
 
 
 def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Leaf, list[float]]]]:
-    """Draw the things of a plot by day: round ones as chains of cones, flat ones as ribbons, each with its material."""
+    """Sample the objects of a plot by day.
+
+    Returns:
+        Round objects as chains of cones, and flat ones as ribbons, each with its material (`surfaces.MATERIAL`).
+    """
     rng = generator(plot.family, plot.seed, "objects")
     family, scene = plot.family, plot.family.scene
     length = family.layout.plot_length + 2.0
@@ -48,7 +52,7 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
 
 
 def _beside(rng: np.random.Generator, family: Family) -> float:
-    """Draw a distance behind the row's line, m: seldom between it and the cameras."""
+    """Sample the y coordinate of an object, m: behind the row, or with probability 0.25 in front of it."""
     return rng.uniform(-0.3 * family.rig.distance, 0.0) if rng.random() < 0.25 else rng.uniform(0.0, 1.5)
 
 
@@ -57,7 +61,7 @@ def _thickness(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _tube(corners: list[np.ndarray], radius: float, end: float | None = None) -> Stalk:
-    """Return a tube through corners [3], m, from one radius to another; bare, without nodes."""
+    """Return a tube through corners [3], m, whose radius goes from ``radius`` to ``end``, m; None for a constant radius."""
     points = [corners[0]]
     for one, other in zip(corners, corners[1:]):
         pieces = max(math.ceil(float(np.linalg.norm(other - one)) / _PIECE), 1)
@@ -69,7 +73,7 @@ def _tube(corners: list[np.ndarray], radius: float, end: float | None = None) ->
 
 
 def _ribbon(rng: np.random.Generator, foot: np.ndarray, kind: str) -> Leaf:
-    """Return an upright strip with parallel sides, or a blade that bends and comes to a point."""
+    """Sample an upright ribbon: a ``strip`` with parallel sides, or a ``blade`` that bends and tapers."""
     tall = rng.uniform(0.25, 1.8)
     knots = max(math.ceil(tall / _PIECE), 3)
     along = np.linspace(0.0, 1.0, knots + 1)
@@ -95,7 +99,7 @@ def _pots(rng: np.random.Generator, plot: Plot) -> list[tuple[Stalk, list[float]
 
 
 def _robot(rng: np.random.Generator, family: Family) -> list[tuple[Stalk, list[float]]]:
-    """Return an arm of thick white or grey links, which hangs into the image from aside or above, nearer than the row."""
+    """Sample an arm of two to four thick light or dark links that reaches into the image, between cameras and row."""
     grey = rng.uniform(0.5, 0.8) if rng.random() < 0.7 else rng.uniform(0.03, 0.2)
     middle = 0.5 * family.layout.plot_length + rng.uniform(-0.5, 0.5)
     side = rng.choice([-1.0, 1.0])
@@ -111,7 +115,7 @@ def _robot(rng: np.random.Generator, family: Family) -> list[tuple[Stalk, list[f
 
 
 def material(rng: np.random.Generator, green: bool = False) -> list[float]:
-    """Return a material of painted, plastic, metal or wooden things, or of a green blade; see `surfaces.MATERIAL`."""
+    """Sample a material, grey, wooden, painted or straw-like, or that of a green blade; see `surfaces.MATERIAL`."""
     if green:
         return plain(rng, list(colorsys.hsv_to_rgb(rng.uniform(0.17, 0.32), rng.uniform(0.4, 0.8), rng.uniform(0.1, 0.35))))
     kind = rng.choice(["grey", "wood", "paint", "straw"], p=[0.45, 0.25, 0.15, 0.15])
@@ -127,7 +131,7 @@ def material(rng: np.random.Generator, green: bool = False) -> list[float]:
 
 
 def plain(rng: np.random.Generator, colour: list[float], grain: float = 0.05) -> list[float]:
-    """Return a material of one colour, with hardly any texture, sometimes with bands."""
+    """Sample a material of one colour (RGB, 0 to 1), with fibres of contrast ``grain`` and, in one of ten cases, bands."""
     bands = rng.uniform(0.2, 0.8) if rng.random() < 0.1 else 0.0
     return [
         *colour, *colour, 1.0 / rng.uniform(1e-3, 6e-3), grain, 1.0 / rng.uniform(0.02, 0.1), rng.uniform(0.0, 0.25),

@@ -1,4 +1,7 @@
-"""Effects of plain cameras on images by day: white balance, low resolution, motion blur, JPEG, black borders. NumPy only."""
+"""Effects of simple cameras on images by day: white balance, low resolution, motion blur, JPEG, black borders.
+
+NumPy and Pillow only.
+"""
 
 import io
 
@@ -9,15 +12,15 @@ from jaxrl_vis_envs.plants.scene import Scene
 
 
 def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image as a plain camera would have saved it, and which pixels still show the scene.
+    """Degrade an image as a simple camera does.
 
     Args:
         image: [H, W, 3] uint8.
         scene: Settled factors.
-        rng: Of this image; equal for both images of a pair.
+        rng: Random number generator; with equal seeds for both images of a pair, so that both are degraded alike.
 
     Returns:
-        [H, W, 3] uint8, and [H, W] bool, False on black borders.
+        The degraded image [H, W, 3] uint8, and a mask [H, W] bool, False on black borders.
     """
     height, width = image.shape[:2]
     gains = np.exp(scene.white_balance * rng.normal(size=3) * [1.0, 0.2, 1.0])
@@ -41,7 +44,7 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
 
 
 def _moved(image: np.ndarray, length: float) -> np.ndarray:
-    """Return an image blurred along its lines over ``length`` pixels."""
+    """Apply horizontal motion blur over ``length`` pixels."""
     taps = round(length) + 1
     if taps < 2:
         return image
@@ -51,7 +54,7 @@ def _moved(image: np.ndarray, length: float) -> np.ndarray:
 
 
 def _border(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Draw a bar or a wedge at one or two sides: [H, W] bool."""
+    """Sample a mask [H, W] bool of bars or wedges at one or two sides."""
     line, column = np.mgrid[0:height, 0:width]
     covered = np.zeros((height, width), bool)
     for _ in range(rng.integers(1, 3)):

@@ -28,7 +28,7 @@ from jaxrl_vis_envs.plants.texture import noise, ramp
 _GROUND_FAR = 3.5  # m: beyond, the ground is black at night
 _HORIZON = 200.0  # m: by day
 _CANOPY = 1.6  # m: height of the leaves that cast shadows by day
-# The rays of a pixel have distinct columns and lines, so that edges of any direction are antialiased.
+# The rays of a pixel have distinct subpixel columns and rows, so that edges of any direction are antialiased.
 _RAYS = {1: ((0.0, 0.0),), 4: ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))}
 _TILES_PER_BATCH = 256  # on an accelerator
 # Number of surfaces tested per loop iteration on an accelerator, where reading and writing the hits so far in each iteration
@@ -41,10 +41,10 @@ class Day(NamedTuple):
 
     Attributes:
         sun: [3] unit vector towards the sun, in the world.
-        sunlight, skylight: [3] light on a white surface, red, green and blue.
-        shadow: [4] share of the sunlight that shadows take away, share of the ground that they cover, and their size and that
-            of the gaps in them, m.
-        backdrop: [h, w, 3] radiance beyond everything, see `backdrop`.
+        sunlight, skylight: [3] light of sun and sky on a white surface, red, green and blue.
+        shadow: [4] fraction of the sunlight that shadows block, fraction of the area that they cover, and feature sizes of
+            the two layers of their pattern, m.
+        backdrop: [h, w, 3] radiance of the background at infinity, see `backdrop`.
     """
 
     sun: jax.Array
@@ -60,13 +60,13 @@ class Shot(NamedTuple):
     Attributes:
         focal: [] focal length, pixels.
         centre: [2] principal point, pixels.
-        lines: [2] vertical offset and slope of the image lines, see `Drive`.
+        lines: [2] vertical offset of the image, pixels, and its slope per column; see `Drive`.
         rotation: [3, 3] from the world to the camera.
         position: [3] of the camera in the world, m.
         flash: [3] position of the flash in the camera's frame, m.
         light: [3] intensity of the flash (1: a white surface at ``reference`` facing it has radiance 1), intensity of ambient
             light, and the distance ``reference`` in m.
-        day: Daylight; None at night, where the program is one without it.
+        day: Daylight; None at night, for which a separate program is compiled.
     """
 
     focal: jax.Array
@@ -207,7 +207,7 @@ def _nearest(
     falling = x * up[0] + y * up[1] + up[2]
     ground = jnp.where(falling < -1e-6, -shot.position[2] / jnp.minimum(falling, -1e-6), FAR)
     is_visible = ground < _GROUND_FAR
-    if shot.day is not None:  # the ground goes on to the horizon
+    if shot.day is not None:  # the ground extends to the horizon
         is_visible = falling < -1e-3
         ground = jnp.minimum(ground, _HORIZON)
     start = _Hit(jnp.where(is_visible, ground, FAR), jnp.zeros(x.shape, jnp.int32), is_visible.astype(jnp.int32))
@@ -358,10 +358,10 @@ def _daylight(
     """Compute radiance by sun and sky at points of the camera's frame, m: red, green and blue."""
     sun = tuple(shot.rotation[i] @ day.sun for i in range(3))
     facing = _dot(at.normal, sun)
-    # Leaves let light through.
+    # Leaves transmit light.
     lit = jnp.maximum(facing, jnp.where(is_leaf, -0.45, 0.0) * facing)
     place = [sum(point[i] * shot.rotation[i, k] for i in range(3)) + shot.position[k] for k in range(3)]
-    # Leaves at one height cast the shadows: where the ray to the sun passes it.
+    # Shadows are cast by a canopy at one height: look up its pattern where the ray to the sun intersects it.
     rise = jnp.maximum(_CANOPY - place[2], 0.0) / jnp.maximum(day.sun[2], 0.1)
     u, v = (place[k] + rise * day.sun[k] for k in range(2))
     depth, cover, size, gap = day.shadow

@@ -306,7 +306,7 @@ class Family:
     name: str = "training"
     """Name of the family."""
     stream: int = 1
-    """Families with different streams use independent random numbers for all seeds."""
+    """Number of the random stream; families with different streams use independent random numbers for all seeds."""
     layout: Layout = Layout()
     """Positions of plants."""
     stalks: Stalks = Stalks()
@@ -320,7 +320,7 @@ class Family:
     imaging: Imaging = Imaging()
     """Light and sensor."""
     scene: Scene = Scene()
-    """Plots by day, and what surrounds them."""
+    """Daylight, surroundings and cameras of plots by day."""
 
     def __post_init__(self) -> None:
         _check_value("stream", 1, self.stream)

@@ -23,7 +23,7 @@ class Stalk:
     """One stalk, as a chain of tapered elliptic cones.
 
     Attributes:
-        row: 0 for the near row, which is measured; higher for the rows behind.
+        row: 0 for the near row, which is measured; higher for the rows behind; -1 for round objects (`clutter`).
         points: [K, 3] float64, centre of the stalk at each knot, m, from the ground upwards.
         radius: [K] float64, mean radius at each knot, including sheath and node, m.
         bare_radius: [K] float64, mean radius without sheaths and nodes, m.
@@ -97,7 +97,7 @@ class Plot:
     """Contents of a plot, and of the rows behind it.
 
     Attributes:
-        family: Family it was sampled from; of one with plots by day and by night, what was drawn for this plot.
+        family: Family that it was sampled from, after `settle`: for plots by day, with the values sampled for this plot.
         seed: Seed of the sample.
         stalks: Stalks, those of the near row first, sorted by position.
         leaves: All leaves and the litter.
@@ -130,7 +130,7 @@ def draw(family: Family, seed: int) -> Plot:
 
     Args:
         family: Family to sample from.
-        seed: At least 0; equal families and seeds give equal plots.
+        seed: Seed of the plot, at least 0; equal families and seeds give equal plots.
 
     Raises:
         ValueError: The seed is not an integer of at least 0.

@@ -1,4 +1,4 @@
-"""Families for grasping: the same plants, passed by the short-baseline stereo pair of a robot that stops to grasp them.
+"""Families for grasping: plants of the training family, seen by the short-baseline stereo pair of a robot that stops to grasp.
 
 The pair resembles a MultiSense S7: 1024 x 1024 pixels, a field of view of 80 degrees, a baseline of 70 mm, 1 m above the ground
 (the thesis, section 4.1). Its vendor states a minimum range of about 0.4 m, twice what the thesis says, so the row is 0.55 m

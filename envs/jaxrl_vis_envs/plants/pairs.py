@@ -22,7 +22,7 @@ _FLASH = np.array([0.05, -0.10, -0.02])
 
 @functools.lru_cache(maxsize=2)
 def daylight(family: Family, seed: int) -> drawing.Day | None:
-    """Draw the daylight and the backdrop of a plot, whose family is settled; None at night."""
+    """Sample the daylight and the backdrop of a plot from its settled family; None at night."""
     scene = family.scene
     if scene.share <= 0:
         return None
@@ -40,11 +40,11 @@ def daylight(family: Family, seed: int) -> drawing.Day | None:
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """One stereo pair, and the ground truth of its left image.
+    """One stereo pair, and the ground truth of its left image. Arrays are on the device.
 
     Attributes:
-        left, right: [H, W, 3] uint8, on the device.
-        instance: [H, W] int32: index in `Plot.stalks`, or a negative label, see `surfaces`.
+        left, right: [H, W, 3] uint8, RGB.
+        instance: [H, W] int32, index in `Plot.stalks`, or a negative label (see `surfaces`).
         depth: [H, W] float32, planar, m; infinite where nothing is visible.
         disparity: [H, W] float32, pixels; 0 where nothing is visible.
         pose: Pose of the left camera.

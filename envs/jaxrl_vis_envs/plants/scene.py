@@ -1,4 +1,4 @@
-"""Factors of what stands around plants by day, and what light and cameras do to it. Imports neither JAX nor MuJoCo."""
+"""Factors of plots by day: daylight, surroundings and cameras. Imports neither JAX nor MuJoCo."""
 
 import dataclasses
 
@@ -7,31 +7,31 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Daylight, surroundings and cameras of plots that were not photographed with a flash at night.
+    """Daylight, surroundings and cameras of plots by day, which are not photographed with a flash at night.
 
-    With a share of 0, which is the default, a family is what its other parts say, bit for bit.
+    With the default ``share`` of 0, all plots are at night and the other fields have no effect.
     """
 
     share: float = 0.0
-    """Fraction of plots by day, to which everything below applies."""
+    """Fraction of plots by day, to which all other fields apply."""
     maize: float = 0.4
-    """Fraction of these that look like maize: thick green stalks, broad leaves."""
+    """Fraction of plots by day that look like maize: thick green stalks, broad leaves."""
     potted: float = 0.3
-    """Fraction of these that are one plant in a pot."""
+    """Fraction of plots by day with a few potted plants instead of rows."""
     indoors: float = 0.15
-    """Fraction of these that stand before a wall, under a ceiling."""
+    """Fraction of plots by day that are indoors, in front of a wall and under a ceiling, without sun."""
     photographs: float = 0.0
-    """Fraction of these whose background is a photograph that scikit-image or scikit-learn ships."""
+    """Fraction of plots by day whose background is a photograph shipped with scikit-image or scikit-learn."""
     sun: Range = (0.0, 1.6)
-    """Light of the sun on a white surface that faces it; the flash's is 1 at the row."""
+    """Sunlight on a white surface that faces the sun, relative to the flash at the row."""
     sky: Range = (0.15, 0.7)
-    """Light of the sky on a white surface."""
+    """Light of the sky on a white surface, relative to the flash at the row."""
     elevation: Range = (20.0, 75.0)
     """Elevation of the sun, degrees."""
     shadow: Range = (0.0, 1.0)
-    """Share of the sun that leaves above take away in the shadows that they cast."""
+    """Fraction of the sunlight that is blocked in the shadows of the leaves above."""
     grass: float = 0.4
-    """Fraction of grounds that are grass; the others are soil or concrete."""
+    """Fraction of plots by day whose ground is grass; the others have soil or concrete."""
     straw: Range = (0.0, 3.0)
     """Factor of the number of pieces of dry leaf on the ground."""
     distance: Range = (0.5, 1.6)
@@ -47,19 +47,19 @@ class Scene:
     roll: Range = (0.0, 6.0)
     """Roll of the cameras, degrees to either side."""
     objects: Range = (0.0, 5.0)
-    """Number of things per metre of row that are no stalk: poles, tubes, strips, blades, cables."""
+    """Mean number of objects other than plants per metre of row: poles, tubes, strips, blades, cables, legs."""
     robot: float = 0.25
-    """Fraction of plots in which parts of a robot show."""
+    """Fraction of plots by day with parts of a robot in view."""
     brightness: Range = (0.12, 0.45)
-    """Mean radiance that the exposure aims at; 1 is white."""
+    """Target mean brightness of the auto exposure; 1 is white."""
     white_balance: float = 0.1
     """Standard deviation of the logarithm of the gains of red and blue."""
     jpeg: Range = (35.0, 98.0)
-    """Quality of JPEG."""
+    """Quality of the JPEG compression."""
     motion: Range = (0.0, 0.003)
     """Length of motion blur, relative to the image's width."""
     resolution: Range = (0.35, 1.0)
-    """Resolution of the image that a camera took, relative to that of the image that it was enlarged to."""
+    """Resolution at which an image is compressed, before it is enlarged to its size, relative to that size."""
     borders: float = 0.2
     """Fraction of images with black bars or wedges at their sides."""
 

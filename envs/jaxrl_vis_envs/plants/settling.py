@@ -1,4 +1,4 @@
-"""One plot's family: of a family with plots by day and by night, what is drawn for this plot. NumPy only."""
+"""Sampling of the factors that are common to one plot, for families with plots by day and by night. NumPy only."""
 
 import dataclasses
 import math
@@ -21,14 +21,15 @@ _MAIZE_LEAVES = {"lower": 0.25, "middle": 0.7, "upper": 0.95, "width_mean": 0.08
 
 
 def settle(family: Family, rng: np.random.Generator) -> Family:
-    """Draw what is common to a plot: night or day, maize or sorghum, a pot or rows, and where the cameras stand.
+    """Sample the factors that are common to a plot: night or day, maize or sorghum, pots or rows, camera poses and light.
 
     Args:
-        family: The family; without a share of plots by day it is returned as it is.
-        rng: For this purpose alone.
+        family: Family to sample from; returned unchanged if it has no plots by day.
+        rng: Random number generator.
 
     Returns:
-        A family whose ranges of the scene have one value, and whose share of plots by day is 0 or 1.
+        By night, the family with the default scene, whose share is 0. By day, a family with a share of 1, one value in each
+        range of its scene and 0 or 1 for its fractions (``borders`` apart), and its other parts adapted to these.
     """
     if family.scene.share <= 0:
         return family
@@ -38,7 +39,7 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
     layout, stalks, leaves, textures = family.layout, family.stalks, family.leaves, family.textures
     distance = scene.distance[0]
     if scene.maize:
-        # A plant grows with all its measures.
+        # Factor of the stalks' diameter, common to the plot.
         size = rng.uniform(0.7, 1.2)
         stalks = dataclasses.replace(stalks, **_MAIZE_STALKS | {"diameter_mean": 0.022 * size})
         leaves = dataclasses.replace(leaves, **_MAIZE_LEAVES, density=leaves.density * rng.uniform(0.5, 1.3))
@@ -73,7 +74,7 @@ def _family(
 
 
 def _ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generator) -> tuple[Leaves, Textures]:
-    """Return leaves and textures of plants between green and dry."""
+    """Sample the ripeness of the plants, between green and dry, and return leaves and textures adapted to it."""
     ripe = rng.random()
     hue = 0.24 - 0.13 * ripe
     changed = {"stalk_hue": (hue - 0.04, hue + 0.03), "speckles": (0.0, 0.5), "blotch_contrast": (0.1, 0.6)}
@@ -82,7 +83,7 @@ def _ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generator) -> t
 
 
 def _settled(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Draw one value of each range, and yes or no for each fraction."""
+    """Sample one value from each range, and 0 or 1 for each fraction but ``borders``."""
     drawn = {}
     for field in dataclasses.fields(scene):
         value = getattr(scene, field.name)

@@ -14,7 +14,7 @@ GROUND = -2
 NOTHING = -1
 """Label where nothing is within the rendered depth."""
 OBJECT = -(1 << 20)
-"""Label of things that are no plant, as a pole."""
+"""Label of objects other than plants, such as poles."""
 LITTER = -3
 """Label of litter; that of the leaves of stalk n is `LITTER` - 1 - n."""
 
@@ -37,13 +37,13 @@ class Surfaces:
         arcs: [C, 2] float64, arc length along the stalk at both ends.
         sheath, node: [C, 2] float64, weight of sheath or node at both ends, 0 to 1.
         oval: [C, 2] float64, ratio of maximum to minimum diameter, and direction of the maximum in rad.
-        cone_stalk, cone_material: [C] int32.
+        cone_stalk, cone_material: [C] int32, index of the stalk (or `OBJECT`), and row of the materials.
         corners: [T, 3, 3] float64, corners of each triangle.
         along, across, offset: [T, 3] float64, coordinates of each corner: m along the midrib, -1 to 1 across it, and m across
         it.
         normals: [T, 3, 3] float64, unit normal of the leaf at each corner.
-        triangle_instance, triangle_material: [T] int32.
-        materials: [M, len(MATERIAL)] float32.
+        triangle_instance, triangle_material: [T] int32, label of the leaf, and row of the materials.
+        materials: [M, len(MATERIAL)] float32, see `MATERIAL`.
     """
 
     start: np.ndarray
@@ -185,7 +185,7 @@ def _material(
 
 
 def _ground_by_day(rng: np.random.Generator, grass: bool, soil: list[float]) -> list[float]:
-    """Return the material of grass, or of soil or concrete of any brightness."""
+    """Sample the material of a ground by day: grass, or soil or concrete of any brightness."""
     place = soil[-2]
     if grass:
         colour = colorsys.hsv_to_rgb(rng.uniform(0.18, 0.3), rng.uniform(0.4, 0.8), rng.uniform(0.08, 0.3))

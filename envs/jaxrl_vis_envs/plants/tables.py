@@ -1,4 +1,4 @@
-"""Tables of the surfaces that one camera sees of a plot, for the rendering program, with a list per tile. NumPy only.
+"""Tables of the surfaces of a plot that one camera sees, with a list per tile, for the renderer. NumPy only.
 
 A ray through a pixel is d = (x, y, 1) in the camera's frame, so that the ray parameter is the planar depth.
 
@@ -35,7 +35,7 @@ class View:
         triangles: [T, TRIANGLE_HIT + TRIANGLE_SHADING] float32.
         triangle_instance, triangle_material: [T] int32.
         materials: [M, ...] float32, as in `Surfaces`.
-        tiles: [N, 2] int32, first column and line of each tile.
+        tiles: [N, 2] int32, first column and row of each tile, pixels.
         cone_ranges, triangle_ranges: [N, 2] int32, begin and end of each tile's part of the lists.
         cone_list, triangle_list: [...] int32, rows of the tables, tile by tile.
     """
@@ -126,7 +126,7 @@ def _may_be_in_sight(points: np.ndarray, pose: Pose, camera: Calibration) -> np.
 
 
 def _boxes(points: np.ndarray, reach: np.ndarray, camera: Calibration) -> np.ndarray:
-    """Return the tile ranges [N, 4] (first column and line, last column and line) that contain the spheres of radius ``reach``
+    """Return the tile ranges [N, 4] (first column and row, last column and row) that contain the spheres of radius ``reach``
     [N] about ``points`` [N, K, 3]; empty for spheres that are too near or too far.
     """
     with np.errstate(all="ignore"):
@@ -151,7 +151,7 @@ def _in_sight(boxes: np.ndarray, columns: int, lines: int) -> np.ndarray:
 
 
 def _lists(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows visible in each tile, tile by tile, and the range [N, 2] of each tile's rows."""
+    """Return the indices of the table rows visible in each tile, tile by tile, and the range [N, 2] of each tile's part."""
     first = np.maximum(boxes[:, :2], 0)
     last = np.minimum(boxes[:, 2:], [columns - 1, lines - 1])
     wide, high = (last - first + 1).T if len(boxes) else np.zeros((2, 0), np.int64)

@@ -1,6 +1,6 @@
 """Ground truth of the stalks in one stereo pair: boxes, visibility, and edges. NumPy only.
 
-Columns and lines are those of the left image, with (0, 0) at the centre of the first pixel. A box is (left, top, right,
+Columns and rows are those of the left image, with (0, 0) at the centre of the first pixel. A box is (left, top, right,
 bottom), the outer edges of its pixels: a box around the first pixel alone is (-0.5, -0.5, 0.5, 0.5).
 """
 
@@ -26,7 +26,7 @@ class StalkInView:
 
     Attributes:
         stalk: Index in `Plot.stalks`; the same in all pairs.
-        box: Box around the whole stalk within the image, including hidden parts.
+        box: Box around the whole stalk within the image, including occluded parts.
         visible_box: Box around the visible pixels; None if there are none.
         visible: Visible fraction of its area inside the image.
         pixels: Number of visible pixels.
@@ -55,7 +55,7 @@ def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray |
         heights: [K] above the ground, m; by default, the stalk's own knots.
 
     Returns:
-        [K, 2, 2] float64: (left, right) x (column, line), pixels.
+        [K, 2, 2] float64: (left, right) x (column, row), pixels.
     """
     arcs = stalk.arc if heights is None else np.interp(heights, stalk.points[:, 2], stalk.arc)
     middle = np.stack([np.interp(arcs, stalk.arc, stalk.points[:, axis]) for axis in range(3)], axis=1)
@@ -100,8 +100,8 @@ def stalks_in_view(
         plot: The plot.
         pose: Pose of the left camera.
         camera: Actual calibration of the cameras.
-        instance: [H, W] int32, of a `Pair`.
-        depth: [H, W] float32 planar depth, m.
+        instance: [H, W] int32, instance image of a `Pair`.
+        depth: [H, W] float32, planar depth, m.
         band: Lower and upper limit of the band, m above the ground.
     """
     stalks = []
@@ -174,7 +174,7 @@ def _around(column: np.ndarray, line: np.ndarray) -> Box:
 
 
 def _pixels(box: Box, camera: Calibration) -> tuple[slice, slice]:
-    """Return the lines and columns of an image that contain a box, with a margin."""
+    """Return the slices of rows and columns of an image that contain a box, with a margin of 20 pixels."""
     left, top, right, bottom = box
     return (
         slice(max(int(top) - 20, 0), min(int(bottom) + 21, camera.height)),

@@ -1,12 +1,12 @@
-"""Folders of pairs to grasp points: `run` reads, perceives and writes, and continues where it was stopped.
+"""Batch processing from folders of pairs to grasp points: `run` reads, perceives and writes, and resumes if interrupted.
 
-    OUT/run.json                 what was asked for: a folder holds the results of one request
-        runs/RUN.json            what came of one run, and of which files; not computed again while these are the same, unless
+    OUT/run.json                 the request: a folder holds the results of one request
+        runs/RUN.json            result of one run and state of its input files; computed again only if these change, or if
                                  pairs were skipped
-        overlays/RUN.png         the last left image, its stalks in red, and the grasp points in it
+        overlays/RUN.png         last left image with its stalks in red and the grasp points
         points.csv  runs.csv  skipped.csv
 
-Tables are always made from the files under runs/. One run is in memory at a time.
+Tables are always built from the files under runs/. Only one run is in memory at a time.
 """
 
 import dataclasses
@@ -32,9 +32,9 @@ from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, PlotFolder, PairFiles], np.ndarray]
-"""From a left image [H, W, 3] uint8 and its files to the mask of the stalks of the near row, [H, W] bool."""
+"""Function from a left image [H, W, 3] uint8 and its files to the mask of the near row's stalks, [H, W] bool."""
 Reachable = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""From points [B, 3] and stops [S, 3] in the robot frame of the last stop, m, to True for points in the arm's reach, [B]."""
+"""Function from points [B, 3] and stops [S, 3], m in the robot frame of the last stop, to [B] bool, True within reach."""
 
 RUN_COLUMNS = (
     "run",
@@ -75,11 +75,11 @@ class Request:
     Attributes:
         out: Folder of the results.
         variant: Steps that follow the thesis.
-        finder: Name of the network of masks; results of another one are not mixed with it.
-        calibrations: Calibration of each run by its name.
+        finder: Name of the mask network; part of the request, so that results of different networks are not mixed.
+        calibrations: Calibration of each run, by the run's name.
         mount: Mount of the pair.
-        speed: Speed of the robot, m/s, where only times are known.
-        reachable: Function that returns True for points that the arm can go to; None if nothing is known of an arm.
+        speed: Speed of the robot, m/s, for runs whose odometry holds times but no distances; None if there are none.
+        reachable: Function that returns True for points within the arm's reach; None without an arm.
     """
 
     out: Path
@@ -92,21 +92,21 @@ class Request:
 
     @property
     def method(self) -> str:
-        """In the tables."""
+        """Name of the variant, as written to the tables."""
         return str(self.variant)
 
 
 def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
-    """Write the results of runs.
+    """Perceive runs and write their results; runs that are already up to date are not computed again.
 
     Args:
         runs: Folders of pairs.
         find: Function that returns the mask of a pair.
-        request: The request.
+        request: Request, with the folder of the results.
         done: Called after each run with its row.
 
     Returns:
-        A row for each pair that was skipped: run, pair and why.
+        A row for each pair that was skipped: run, pair, and reason.
 
     Raises:
         RequestError: The folder holds other results, or a run's odometry cannot be read.
@@ -146,7 +146,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
 
 
 def _sources(folder: PlotFolder) -> dict[str, Any]:
-    """Return the state of everything that the record of a run depends on, beside the request."""
+    """Return the state of the files that the record of a run depends on."""
     return {
         "odometry": file_state(folder.folder / "odometry.csv"),
         "pairs": {pair.name: pair_state(pair) for pair in folder.pairs},
@@ -154,13 +154,23 @@ def _sources(folder: PlotFolder) -> dict[str, Any]:
 
 
 def _is_whole(record: dict[str, Any]) -> bool:
-    """Return True for a record with all columns and without skipped pairs, which are tried again."""
+    """Return True for a record with all columns and no skipped pairs; others are computed again."""
     known = record["row"].keys() == set(RUN_COLUMNS) and all(row.keys() == set(POINT_COLUMNS) for row in record["points"])
     return known and record["skipped"] == []
 
 
 def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
-    """Return the record of one run: its row, those of its points, and those of pairs that were skipped."""
+    """Compute the record of one run, and write its overlay.
+
+    Args:
+        folder: Folder of the run.
+        driven: Distance driven at each pair by the pair's name, m; None if unknown.
+        find: Function that returns the mask of a pair.
+        request: The request.
+
+    Returns:
+        The row of the run, and the rows of its points and of skipped pairs.
+    """
     calibration = request.calibrations[folder.name]
     views: list[View] = []
     skipped: list[Row] = []
@@ -184,7 +194,7 @@ def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, req
 
 
 def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
-    """[B] bool, which grasp points the arm can go to; None where nothing is known of an arm."""
+    """Return [B] bool, True for grasp points within the arm's reach from any stop; None without an arm."""
     if request.reachable is None:
         return None
     points = np.array([point.point for point in perception.points]).reshape(-1, 3)
@@ -193,7 +203,7 @@ def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
 
 
 def _row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
-    """The row of a run; without a perception, none of its pairs could be used."""
+    """Return the row of a run; ``perception`` is None if none of its pairs was usable."""
     row: Row = dict.fromkeys(RUN_COLUMNS, "")
     row |= {"run": folder.name, "pairs": len(views), "pairs_skipped": skipped, "grasp_points": 0}
     row |= {"method": request.method, "version": jaxrl_vis.__version__}
@@ -218,7 +228,7 @@ def _row(folder: PlotFolder, request: Request, skipped: int, perception: Percept
 
 
 def _points(folder: PlotFolder, request: Request, perception: Perception) -> list[Row]:
-    """The rows of the grasp points of a run, in the robot frame of its last pair."""
+    """Return the rows of the grasp points of a run, in the robot frame of its last pair."""
     can = _can_reach(request, perception)
     rows = []
     for place, point in enumerate(perception.points):
@@ -243,7 +253,7 @@ def _points(folder: PlotFolder, request: Request, perception: Perception) -> lis
 
 
 def draw_points(left: np.ndarray, perception: Perception, calibration: Calibration, mount: Mount) -> np.ndarray:
-    """The last left image with its stalks in red and the grasp points in it, numbered as in the table: [H, W, 3] uint8."""
+    """Draw stalks in red and grasp points, numbered as in the table, on a copy of the last left image: [H, W, 3] uint8."""
     image = left.copy()
     red = perception.clouds[-1].red
     image[red] = (0.4 * image[red] + 0.6 * np.array([255, 0, 0])).astype(np.uint8)

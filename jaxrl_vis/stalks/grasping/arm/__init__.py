@@ -1,1 +1,1 @@
-"""The grasping arm in simulation: choice of an approach, control, and reaches among stalks in wind."""
+"""Simulation of the grasping arm: choice of an approach, control, and reaches among stalks in wind."""

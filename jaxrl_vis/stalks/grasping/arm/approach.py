@@ -1,4 +1,4 @@
-"""Geometry of a reach: what the arm can reach, how much room other stalks leave it, and from where it approaches a stalk best.
+"""Geometry of a reach: reachability of targets, clearance of the gripper to other stalks, and the best approach to a stalk.
 
 Source: section 4.2.2 of the thesis.
 """
@@ -11,20 +11,23 @@ from jaxrl_vis.stalks.grasping.arm.control import FOLDED, better_side
 from jaxrl_vis_envs.tasks import stalk_arm
 
 _ROOM_POINTS, _TURN_POINTS = 40, 16
-_FOLDED_ROOM = 0.02  # m, of the tips of the folded jaws from the middle of the nearest stalk that they reach for
+_FOLDED_ROOM = 0.02  # m, minimum distance between the tips of the folded arm's jaws and the centre of the target
 
 
 def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return True where the arm's lengths and joint limits let its grip be at a target: [...] bool. Nothing else counts.
+    """Return True where a target is within the arm's lengths and joint limits; obstacles are ignored.
 
     Args:
-        rail_pose: [..., 3], `Stands.origin`: the place on the row's line that the arm faces, m in the plot's frame.
-        target: [..., 3], m in the plot's frame.
+        rail_pose: [..., 3], `Stands.origin`: point of the row's line that the arm faces, m in the plot's frame.
+        target: [..., 3], target of the grip, m in the plot's frame.
+
+    Returns:
+        [...] bool.
     """
     local = np.asarray(target, float) - np.asarray(rail_pose, float)
     place = local[..., :2] - np.array(stalk_arm.SHOULDER)
     distance = np.linalg.norm(place, axis=-1)
-    # Folded, the open jaws have to be this side of the stalk.
+    # With the arm folded, the open jaws must be in front of the stalk.
     far_enough = distance >= FOLDED + stalk_arm.TIPS + _FOLDED_ROOM
     start = local.copy()
     start[..., :2] = stalk_arm.SHOULDER + place * (FOLDED / np.maximum(distance, 1e-9))[..., None]
@@ -33,18 +36,18 @@ def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: bool = True) -> np.ndarray:
-    """Return the room that other stalks leave the open gripper on its path, with the elbow to either side.
+    """Return the clearance between other stalks and the open gripper on its path, with the elbow to either side.
 
     Args:
         target: [B, 3], m in the frame of the stand.
-        others: [B, M, 2], where the middles of other stalks are at the target's height, m; nan for none.
-        radii: [B, M], of these, m.
-        whole_way: As the folded arm turns, and from there outwards, forearm included; if not, beside the open jaws at the
-            target alone. While it turns, the arm comes from another height: stalks are taken to stand upright.
+        others: [B, M, 2], centres of other stalks at the target's height, m in the frame of the stand; NaN for absent ones.
+        radii: [B, M], radii of these stalks, m.
+        whole_way: Whether to include the forearm and the whole path, on which the folded arm turns and then extends; if not,
+            only the open jaws at the target. Stalks are assumed vertical, although the arm turns at other heights.
 
     Returns:
-        [B, 2] float64, for the elbow at 1 and -1: the least distance between a stalk and the gripper, m. Negative where they
-        would overlap, infinite where there are no others.
+        [B, 2] float64, for the solutions 1 and -1: minimum distance between a stalk and the gripper, m. Negative if they
+        overlap, infinite if there are no others.
     """
     target, others = np.asarray(target, float), np.asarray(others, float)
     from_shoulder = target[:, :2] - np.array(stalk_arm.SHOULDER)
@@ -74,12 +77,12 @@ def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: b
 
 
 class Approach(NamedTuple):
-    """From where, and with which solution, a stalk is reached.
+    """Stop and kinematic solution for reaching a stalk.
 
     Attributes:
-        stop: Index of the place of the mast; -1 where none will do.
-        side: Solution of the kinematics: 1 or -1.
-        room: Room that other stalks leave the open gripper on its path, m; -inf if there is no path.
+        stop: Index of the stop; -1 if the stalk is out of reach from all stops.
+        side: Solution of the inverse kinematics, 1 or -1.
+        room: Clearance between the open gripper and other stalks on its path, m; -inf if there is no path.
     """
 
     stop: int
@@ -90,14 +93,14 @@ class Approach(NamedTuple):
 def best_approach(
     origins: np.ndarray, target: np.ndarray, others: np.ndarray, radii: np.ndarray, enough: float = 0.02
 ) -> Approach:
-    """The way with most room from any of the places where the robot stops, the shortest of those with ``enough`` of it.
+    """Return the approach with maximum room over all stops and solutions; among those with ``enough`` room, the shortest.
 
     Args:
         origins: [S, 3], `Stands.origin` of each stop, m in the plot's frame.
         target: [3], m in the plot's frame.
-        others: [M, 2], where other stalks are at the target's height, as far as is known, m in the plot's frame.
-        radii: [M], of these, m.
-        enough: More room than this is no better, m.
+        others: [M, 2], centres of the other known stalks at the target's height, m in the plot's frame.
+        radii: [M], radii of these stalks, m.
+        enough: Room above which more is no better, m.
     """
     origins, target = np.asarray(origins, float).reshape(-1, 3), np.asarray(target, float)
     local = target - origins
@@ -107,13 +110,16 @@ def best_approach(
     if not can.any():
         return Approach(-1, int(better_side(target, np)), -np.inf)
     distance = np.linalg.norm(local[:, :2] - np.array(stalk_arm.SHOULDER), axis=-1)
-    # A millimetre of room is worth a metre of way: it only decides between equals.
+    # A millimetre of room outweighs a metre of path length, which thus only breaks ties.
     worth = np.where(can[:, None], np.minimum(rooms, enough) - 1e-3 * distance[:, None], -np.inf)
     stop, column = np.unravel_index(np.argmax(worth), worth.shape)
     return Approach(int(stop), (1, -1)[int(column)], float(rooms[stop, column]))
 
 
 def _to_box(aside: np.ndarray, ahead: np.ndarray, half_width: float, back: float, front: float) -> np.ndarray:
-    """Distance in m of points from a rectangle: ``aside`` of its middle line, and ``ahead`` along it; negative inside."""
+    """Return signed distances (m) of points from a rectangle, negative inside.
+
+    Points are ``aside`` of the rectangle's centre line and ``ahead`` along it, on which it extends from ``back`` to ``front``.
+    """
     outside = np.stack([aside - half_width, np.maximum(back - ahead, ahead - front)])
     return np.linalg.norm(np.maximum(outside, 0.0), axis=0) + np.minimum(outside.max(axis=0), 0.0)

@@ -1,8 +1,8 @@
-"""Choice of an approach to a stalk: the stop, the solution of the arm's kinematics and the height, or none at all.
+"""Choice of an approach to a stalk: stop, solution of the inverse kinematics, and height; or refusal.
 
-Stalks lean, so that what is in the way at one height is not at another one. Of all stops, both solutions and the heights around
-the grasp point, the way is chosen on which the other stalks leave most room, as far as is known of them. Where that is too
-little, the arm is not sent: it would push other stalks, or hold two of them. Refused targets are counted as such.
+Stalks lean, so that a stalk that blocks the path at one height does not at another. Over all stops, both solutions and heights
+around the grasp point, the approach is chosen with maximum room between the gripper and the other detected stalks. If the room
+is too small, the arm is not sent, because it would push other stalks, or hold two; such targets are counted as refused.
 """
 
 from collections.abc import Sequence
@@ -14,22 +14,22 @@ from jaxrl_vis.stalks.grasping.arm import approach
 from jaxrl_vis.stalks.grasping.perception.lines import HEIGHTS, GraspPoint
 
 MIN_ROOM = 0.0045
-"""Room in m beside the open gripper, on its whole way, with less of which the arm is not sent."""
+"""Minimum room beside the open gripper on its whole path, m, below which the arm is not sent."""
 _ENOUGH_ROOM = 0.02  # m: more room is no better
 _STEPS = tuple(sign * step for step in np.arange(0.0, 0.31, 0.05) for sign in (-1.0, 1.0))
-# m, from the height of the grasp point: further away the line is not believed
-_UNSURE = 0.005  # m per m: how much less is known of a stalk away from the height of its grasp point
-_USUAL_RADIUS = 0.007  # m: radius of a stalk whose thickness is not known
+# m, candidate heights relative to the grasp point: farther away, the line is not reliable
+_UNSURE = 0.005  # m per m: penalty on the room for the distance from the height of the grasp point
+_USUAL_RADIUS = 0.007  # m: radius of stalks of unknown thickness
 
 
 class Choice(NamedTuple):
-    """An approach to a stalk.
+    """Chosen approach to a stalk.
 
     Attributes:
-        stop: Index of the stop; -1 where the arm's geometry does not let it be reached from any.
-        side: Solution of the kinematics: 1 or -1.
-        room: Room that other stalks leave the open gripper on its path, m; -inf if there is no path.
-        point: [3] float64, where the jaws are to close, m.
+        stop: Index of the stop; -1 if the stalk is out of reach from all stops.
+        side: Solution of the inverse kinematics, 1 or -1.
+        room: Clearance between the open gripper and other stalks on its path, m; -inf if there is no path.
+        point: [3] float64, where the jaws should close, m, in the frame of the grasp points.
     """
 
     stop: int
@@ -39,17 +39,17 @@ class Choice(NamedTuple):
 
     @property
     def is_blocked(self) -> bool:
-        """True if it could be reached, but other stalks are in the way."""
+        """True if the stalk is within reach, but other stalks leave less than `MIN_ROOM`."""
         return self.stop >= 0 and self.room < MIN_ROOM
 
 
 def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> list[Choice]:
-    """Choose a way to each of the stalks that were found.
+    """Choose an approach to each of the detected stalks.
 
     Args:
         points: Grasp points, in one robot frame.
-        stops: [S, 3], `Stands.origin` of each place where the robot may stop, in the same frame, m.
-        heights: Lowest and highest grasp, m above the ground.
+        stops: [S, 3], `Stands.origin` of each possible stop, in the same frame, m.
+        heights: Minimum and maximum height of a grasp, m above the ground.
     """
     chosen = []
     for point in points:
@@ -67,7 +67,7 @@ def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float
 
 
 def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float]) -> list[Choice]:
-    """The stop that is nearest along the row for each stalk, and the height between two that is nearest to its grasp point.
+    """Choose the stop nearest to each stalk along the row, and the height of its grasp point, clipped to ``heights``.
 
     Args:
         points, stops, heights: See `choose`.
@@ -83,14 +83,19 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
 
 
 def _approach_at(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndarray, height: float) -> approach.Approach:
-    """The best way to one of the points at a height, among all others as they are there."""
+    """Return the best approach to one of the points at a height, with all others as obstacles at this height."""
     others = [other for other in points if other is not point]
     beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
     return approach.best_approach(stops, point.at_height(height), beside[:, :2], stalk_radii(others, height), _ENOUGH_ROOM)
 
 
 def stalk_radii(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
-    """Radii [B] of stalks at a height, or at their grasp points, m: a usual one where a thickness is not known."""
+    """Return the radii [B] of stalks, m; a default for unknown thickness.
+
+    Args:
+        points: Grasp points of B stalks.
+        height: Height above the ground, m; None for the height of each grasp point.
+    """
     thickness = [point.thickness if height is None else point.thickness_at(height) for point in points]
     radii = 0.5 * np.array(thickness, float)
     return np.where(np.isfinite(radii), radii, _USUAL_RADIUS)

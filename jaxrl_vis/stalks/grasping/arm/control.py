@@ -1,10 +1,10 @@
-"""The arm's way to a stalk and its controllers: a straight line out of the first joint, PID and PI, springs in the joints.
+"""Planned path of the arm to a stalk, and its controllers: PID for the elastic joints, PI for the slide.
 
-A reach takes two seconds. While the slide goes to the height of the target, the folded arm turns towards it. Then the grip
-moves along the straight line that the first joint and the target define, until the stalk is between the jaws. Both solutions
-of the inverse kinematics move the grip along the same line; they differ in where the forearm comes from.
+A reach takes two seconds until the jaws close. While the slide moves to the height of the target, the folded arm turns towards
+it. Then the grip moves along the straight line through the first joint and the target, until the stalk is between the jaws.
+Both solutions of the inverse kinematics move the grip along the same line; they differ in the pose of the forearm.
 
-Source: section 4.2.2 of the thesis. It tuned its gains by hand and does not state them; ours are tuned by hand, too.
+Source: section 4.2.2 of the thesis, whose gains were tuned by hand and are not stated; those here are tuned by hand, too.
 """
 
 import dataclasses
@@ -20,25 +20,25 @@ RATE = 250.0
 FOLDED = 0.34
 """Distance of the grip from the first joint before it moves outwards, m."""
 HOME = (0.0, stalk_arm.SHOULDER[1] + FOLDED, 0.85)
-"""Position in which the grip waits, m in the frame of a stand."""
+"""Home position of the grip, m in the frame of a stand."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Durations of the parts of a reach, s."""
+    """Durations of the phases of a reach, s."""
 
     turn: float = 0.8
-    """The slide moves and the folded arm turns."""
+    """Movement of the slide and turn of the folded arm."""
     extend: float = 1.0
-    """The grip moves outwards along the line."""
+    """Movement of the grip outwards along the line."""
     refine_edges: float = 0.2
-    """The grip waits for what the controllers still lack."""
+    """Settling of the controllers at the target."""
     close: float = 0.4
-    """The jaws close."""
+    """Closing of the jaws."""
 
     @property
     def reach(self) -> float:
-        """Until the jaws close."""
+        """Duration until the jaws begin to close, s."""
         return self.turn + self.extend + self.refine_edges
 
 
@@ -49,11 +49,11 @@ class Gains(NamedTuple):
     integral: Any = (600.0, 300.0)  # N m/(rad s)
     derivative: Any = (18.0, 7.0)  # N m s/rad
     spring: Any = (180.0, 90.0)  # N m/rad, the elastic part of a joint
-    torque: Any = (30.0, 15.0)  # N m, the most
-    motor: float = 120.0  # 1/s, how fast a motor follows what it is told
+    torque: Any = (30.0, 15.0)  # N m, maximum
+    motor: float = 120.0  # 1/s, inverse time constant of a motor
     slide_proportional: float = 25.0  # 1/s
     slide_integral: float = 4.0  # 1/s^2
-    slide_speed: float = 1.0  # m/s, the most
+    slide_speed: float = 1.0  # m/s, maximum
     slide_drive: float = 400.0  # N s/m
     jaw_force: float = 10.0  # N
 
@@ -62,9 +62,9 @@ class Drive(NamedTuple):
     """State of the controllers.
 
     Attributes:
-        integral: [3] float32, the integrated errors of slide, shoulder and elbow, m s and rad s.
-        motor: [2] float32, where the motors before the springs of shoulder and elbow are, rad.
-        error: [2] float32, the last errors of shoulder and elbow, rad.
+        integral: [3] float32, integrated errors of slide, shoulder and elbow, m s and rad s.
+        motor: [2] float32, angles of the motors behind the springs of shoulder and elbow, rad.
+        error: [2] float32, last errors of shoulder and elbow, rad.
     """
 
     integral: jax.Array
@@ -73,24 +73,29 @@ class Drive(NamedTuple):
 
 
 def smooth(share: Any) -> Any:
-    """Minimum jerk: how far, of 1, a movement has come after a ``share`` of its time; at rest at both ends."""
+    """Return the fraction of a minimum-jerk movement done after the fraction ``share`` of its time, clipped to 0 to 1."""
     share = jnp.clip(share, 0.0, 1.0)
     return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
 
 def better_side(target: Any, numeric: Any = jnp) -> Any:
-    """The solution, 1 or -1, whose forearm points more squarely at the row, for ``target`` [..., 3] (m, frame of a stand)."""
+    """Return the solution, 1. or -1., whose forearm points more squarely at the row: [...].
+
+    Args:
+        target: [..., 3], m in the frame of a stand.
+        numeric: Module to compute with, `jax.numpy` or `numpy`.
+    """
     return numeric.where(target[..., 0] > stalk_arm.SHOULDER[0], 1.0, -1.0)
 
 
 def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> jax.Array:
-    """Return the planned position of the grip at a time, on its path from `HOME` to ``target``: [3] m.
+    """Return the planned position [3] of the grip at a time, on its path from ``start`` to ``target``, m.
 
     Args:
         target: [3], m in the frame of a stand.
-        start: [3], where the grip was at time 0, m.
-        time: [] since the start, s.
-        timing: Timing of the reach.
+        start: [3], position of the grip at time 0, m in the same frame.
+        time: [], time since the start, s.
+        timing: Durations of the phases of the reach.
     """
     shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
     turned = smooth(time / timing.turn)
@@ -105,22 +110,22 @@ def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> j
 
 
 def start_drive(joints: jax.Array) -> Drive:
-    """Controllers of an arm at rest at ``joints`` [3]."""
+    """Return the initial state of the controllers for an arm at rest at ``joints`` [3]: slide, shoulder, elbow (m, rad)."""
     return Drive(jnp.zeros(3, jnp.float32), joints[1:3], jnp.zeros(2, jnp.float32))
 
 
 def drive(state: Drive, joints: jax.Array, velocity: jax.Array, wanted: jax.Array, gains: Gains) -> tuple[Drive, jax.Array]:
-    """One period of the controllers.
+    """Advance the controllers by one period.
 
     Args:
         state: State of the controllers.
-        joints: [3], slide, shoulder and elbow, m and rad.
-        velocity: [3], of these, m/s and rad/s.
-        wanted: [3], where they should be.
+        joints: [3], positions of slide, shoulder and elbow, m and rad.
+        velocity: [3], their velocities, m/s and rad/s.
+        wanted: [3], their setpoints, m and rad.
         gains: Gains of the controllers.
 
     Returns:
-        What they remember now; and what acts on the joints [3], N and N m.
+        The new state, and the generalised forces [3] on the joints, N and N m.
     """
     period = 1.0 / RATE
     error = wanted - joints
@@ -129,7 +134,7 @@ def drive(state: Drive, joints: jax.Array, velocity: jax.Array, wanted: jax.Arra
     proportional, integrating, derivative, spring, most = parts
     slope = (error[1:] - state.error) / period
     wish = jnp.clip(proportional * error[1:] + integrating * integral[1:] + derivative * slope, -most, most)
-    # A motor gives a torque by how far it winds up the spring between itself and its joint.
+    # Series elastic actuators: torque is the deflection of the spring between motor and joint.
     motor = state.motor + period * gains.motor * (joints[1:] + wish / spring - state.motor)
     torque = jnp.clip(spring * (motor - joints[1:]), -most, most)
     speed = gains.slide_proportional * error[0] + gains.slide_integral * integral[0]

@@ -1,8 +1,8 @@
-"""Reaches by a policy that learned VisualStalkReach, in the physics of `reach`: the third of the loops.
+"""Reaches by a policy trained on VisualStalkReach, in the physics of `reach`: the loop ``policy``.
 
-The goal picture shows the stalks that the pipeline has found, in still air, with the gripper at the one that it is to take: it
-is drawn from detections, without truth. From then on the policy sees through the camera over the arm's shoulder, 25 times a
-second, and says by how much the place moves to which the grip is driven. After two seconds the jaws close; it goes on to act.
+The goal image shows the detected stalks in still air, with the gripper at the target; it is rendered from detections, without
+ground truth. The policy then observes images from the camera over the arm's shoulder at 25 Hz, and its actions displace the
+setpoint of the grip. After two seconds the jaws close, while the policy continues to act.
 """
 
 import copy
@@ -29,13 +29,13 @@ from jaxrl_vis_envs.tasks import stalk_arm
 from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, within_reach
 
 STALKS = 4
-"""Stalks of a stand: as many as the task has unless told otherwise."""
+"""Number of stalks in a stand, the default of the task."""
 HEIGHTS = (0.6, 0.9)
-"""Heights of the goals that the task draws unless told otherwise, m."""
+"""Minimum and maximum height of a goal, m, the default of the task."""
 
 
 def check_policy(policy: Policy) -> None:
-    """Raise a `RequestError` unless the policy can drive the arm."""
+    """Raise a `RequestError` unless the policy is of VisualStalkReach and observes single images."""
     if not isinstance(policy.env, StalkReach) or policy.env.observation_spec.dtype != jnp.uint8:
         raise RequestError(f"--policy must be a run of VisualStalkReach, not of {policy.env_name}")
     if policy.env.frame_stack != 1:
@@ -43,7 +43,7 @@ def check_policy(policy: Policy) -> None:
 
 
 class _Moving(NamedTuple):
-    """An arm on its way, and the place [3] (m, frame of the stand) to which its grip is driven."""
+    """State of an arm during a reach, and setpoint [3] of its grip, m in the frame of the stand."""
 
     reaching: Reaching
     place: jax.Array
@@ -52,18 +52,22 @@ class _Moving(NamedTuple):
 def reach_by_policy(
     stands: Stands, detected: Stands, targets: np.ndarray, policy: Policy, key: jax.Array, wind_mm: float
 ) -> ReachResult:
-    """Let the policy bring each arm to its target, and close the jaws there.
+    """Simulate reaches in which the policy moves each arm to its target and the jaws close there.
 
     Args:
-        stands: The true stalks around each of B arms.
-        detected: The stalks that were found there, in the same order of arms.
-        targets: [B, 3] float32, where the jaws should close, m in the plot's frame; only the goal pictures know them.
+        stands: True stalks around each of B arms.
+        detected: Detected stalks around each arm, in the same order.
+        targets: [B, 3] float32, where the jaws should close, m in the plot's frame; the policy sees them in goal images only.
         policy: Policy of a run of VisualStalkReach.
-        key: [B], typed: the winds.
+        key: [B], typed keys for sampling the wind.
         wind_mm: Amplitude of the stalks' sway, mm.
 
     Returns:
-        What came of it; its ``path`` is the place to which the grip was driven.
+        Results of the reaches; ``path`` holds the setpoints of the grip. Arms whose target is out of reach hold and touch
+        nothing.
+
+    Raises:
+        RequestError: The policy is not one of VisualStalkReach, or does not observe single images.
     """
     check_policy(policy)
     can = reachable(stands.origin, targets)
@@ -93,7 +97,7 @@ def reach_by_policy(
 
 @functools.lru_cache(maxsize=4)
 def _programs(policy: Policy) -> tuple[Any, Any]:
-    """Goal pictures [B, C, H, W] from the stalks that were found and the targets; and episodes, reaches of B arms."""
+    """Return the compiled programs that render goal images of B arms from detected stalks and targets, and simulate reaches."""
     env: Any = policy.env
     arms, gains, timing = arms_among(STALKS), Gains(), Timing()
     observer = ImageObserver(arms.mj_model, env.camera, env.config)

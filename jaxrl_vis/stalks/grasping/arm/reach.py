@@ -1,11 +1,11 @@
-"""Many arms that reach for stalks at once: physics, contacts and wind in one compiled program.
+"""Batched simulation of arms that reach for stalks: physics, contacts and wind in one compiled program.
 
-    stands = stands_at(plot, x, targets)                     # jaxrl_vis_envs.plants.stand: the stalks around each arm
+    stands = stands_at(plot, x, targets)                     # jaxrl_vis_envs.plants.stand: stalks around each arm
     result = reach(stands, targets, jax.random.key(0), wind_mm=10.0)
-    result.held                                              # [B, N] bool: which stalks the jaws hold, by contact
+    result.held                                              # [B, N] bool: stalks that the jaws hold, by contact
 
-What a grasp holds comes of the contacts of the jaws with the stalks, which bend and are pushed; no rule decides it. Programs
-are compiled for 8, 16, 32, ... arms, and reused for fewer.
+Stalks bend and are pushed by the arm; which of them a grasp holds is determined from their contacts with the jaws. Programs are
+compiled for 8, 16, 32, ... arms, and reused for fewer.
 """
 
 import dataclasses
@@ -34,9 +34,9 @@ _POINTS_A_CALL = 5
 INTERVAL = _STEPS_A_POINT / control.RATE
 """Time between two points of a path, s."""
 LOOK = _POINTS_A_CALL * INTERVAL
-"""Time between two looks on the way, s."""
-_MIN_ARMS = 8  # arms in a program
-_TOUCH = 0.0015  # m, a jaw this near to a stalk presses on it: soft contacts give way by some tenths of a millimetre
+"""Time between two calls of ``look``, s."""
+_MIN_ARMS = 8  # minimum batch size of a compiled program
+_TOUCH = 0.0015  # m, a jaw nearer to a stalk presses on it: soft contacts give way by some tenths of a millimetre
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,13 +45,13 @@ class ReachResult:
 
     Attributes:
         held: [B, N] bool, stalks between the closed jaws.
-        path: [B, T, 3] float32, where the grip should have been, m in the plot's frame.
-        taken: [B, T, 3] float32, where it was.
-        touched: [B, N] bool, stalks that the arm's links touched: upper arm and forearm at any time.
+        path: [B, T, 3] float32, planned positions of the grip, m in the plot's frame.
+        taken: [B, T, 3] float32, actual positions of the grip, m in the plot's frame.
+        touched: [B, N] bool, stalks that upper arm or forearm touched at any time.
         brushed: [B, N] bool, stalks that the open jaws or the palm touched before the jaws began to close.
-        reachable: [B] bool, whether the arm's geometry lets the grip be at the target.
-        error: [B] float32, distance of the grip from the target when the jaws began to close, m; nan where it was not sent.
-        poses: [B, T, J] float32, positions of all joints on the way, for drawing (`video`).
+        reachable: [B] bool, whether the target is within the arm's reach.
+        error: [B] float32, distance of the grip from the target when the jaws began to close, m; NaN if out of reach.
+        poses: [B, T, J] float32, positions of all joints of the model, for rendering (`video`).
         interval: Time between two points of a path, s.
     """
 
@@ -67,12 +67,13 @@ class ReachResult:
 
 
 class ArmView(NamedTuple):
-    """The true view from B arms on their path, from which a detector may compute what it can.
+    """True state of B reaches at one time, from which a ``look`` function may simulate detections.
 
     Attributes:
-        time: Since the start, s.
-        grip: [B, 3] float32, where the grips are, m in the plot's frame.
-        stalks: [B, N, 3] float32, where the middles of the stalks are at the height of the target; nan for absent ones.
+        time: Time since the start, s.
+        grip: [B, 3] float32, positions of the grips, m in the plot's frame.
+        stalks: [B, N, 3] float32, centres of the stalks at the height of the target, m in the plot's frame; NaN for absent
+            ones.
     """
 
     time: float
@@ -81,13 +82,13 @@ class ArmView(NamedTuple):
 
 
 class Reaching(NamedTuple):
-    """One arm on its way.
+    """State of one arm during a reach.
 
     Attributes:
-        data: The physics.
+        data: State of the physics, an `mjx.Data`.
         drive: State of the controllers.
-        start: [3] float32, where the grip was at time 0, m in the frame of the stand.
-        touched, brushed: [N] bool, so far.
+        start: [3] float32, position of the grip at time 0, m in the frame of the stand.
+        touched, brushed: [N] bool, stalks touched so far; see `ReachResult`.
     """
 
     data: Any
@@ -98,7 +99,7 @@ class Reaching(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Constants of one arm's reach: its stalks, the wind, and the side of its elbow (1 or -1)."""
+    """Constants of one arm's reach: shapes of its stalks, wind, and solution of the inverse kinematics (1 or -1)."""
 
     shape: Shape
     gusts: Gusts
@@ -106,18 +107,26 @@ class Scene(NamedTuple):
 
 
 class Arms(NamedTuple):
-    """The model of an arm among N stalks, and where things are in it."""
+    """MJX model of an arm among N stalks, with lookup tables.
+
+    Attributes:
+        mj_model: Model in MuJoCo.
+        model: The same as an `mjx.Model`.
+        layout: Indices of the stalks in the model.
+        rest: `mjx.Data` of the model at rest.
+        contacts: For each geom of the arm by name, [N] indices of its contacts with the stalks' upper segments.
+    """
 
     mj_model: mujoco.MjModel
     model: Any
     layout: Layout
     rest: Any
-    contacts: dict[str, np.ndarray]  # geom of the arm -> its contacts with the stalks, in their order
+    contacts: dict[str, np.ndarray]
 
 
 @functools.cache
 def arms_among(stalks: int) -> Arms:
-    """The model of an arm among so many stalks."""
+    """Build the model of an arm among a number of ``stalks``; cached."""
     mj_model = stalk_arm.build(stalks)
     layout = bending.read_layout(mj_model)
     rest = mjx_model.still_data(mj_model)
@@ -140,21 +149,23 @@ def reach(
     sides: np.ndarray | None = None,
     look: Callable[[ArmView], np.ndarray] | None = None,
 ) -> ReachResult:
-    """Send each arm to its target and close its jaws there.
+    """Simulate reaches: each arm moves to its target and closes its jaws there.
 
     Args:
-        stands: The stalks around each of B arms.
+        stands: True stalks around each of B arms.
         targets: [B, 3] float32, where the jaws should close, m in the plot's frame.
-        key: [] or [B], typed: the wind; one for all arms, or one each, so that an arm's wind is the same in any company.
+        key: [] or [B], typed keys for sampling the wind: one for all arms, which is split, or one each, so that an arm's wind
+            does not depend on the other arms.
         wind_mm: Amplitude of the stalks' sway (`bending.Gusts.strength`), mm; [] or [B], 0 to 20 in the field.
-        timing: Durations of the parts of a reach.
-        gains: Gains of the controllers.
-        sides: [B], 1 or -1: which of the two solutions each arm takes (see `approach.room`). None for `control.better_side`.
-        look: Called every `LOOK` s on the way and while the jaws close; returns targets [B, 3] in place of those before, nan
-            where they stay. None: the arm moves without looking again.
+        timing: Durations of the phases of a reach; None for the default.
+        gains: Gains of the controllers; None for the default.
+        sides: [B], 1 or -1, solution of the inverse kinematics of each arm (see `approach.room`); None for
+            `control.better_side`.
+        look: Function called every `LOOK` s during the reach and while the jaws close, which returns new targets [B, 3], m in
+            the plot's frame, with NaN to keep the old one; None for an open loop.
 
     Returns:
-        What came of it. Arms whose target cannot be reached are not sent: they hold and touch nothing.
+        Results of the reaches. Arms whose target is out of reach are not sent: they hold and touch nothing.
 
     Raises:
         ValueError: Shapes differ, a target is not finite, or the wind is negative.
@@ -177,7 +188,7 @@ def reach(
         raise ValueError(f"there must be one key, or one for each of {count} arms, got {list(key.shape)}")
     if not count:
         return _empty(stands, timing)
-    # The rest of the program's arms do what the first one does.
+    # Pad the batch to the size of the program with copies of the first arm.
     fill = np.concatenate([np.arange(count), np.zeros(max(_MIN_ARMS, 1 << (count - 1).bit_length()) - count, int)])
     start, advance = _programs(stands.stalk.shape[1], timing, gains)
     shape = jax.tree.map(lambda part: part[fill], bending.shapes(stands))
@@ -211,7 +222,7 @@ def reach(
 def _looked(
     look: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
-    """Targets [B, 3] after another look; those of before where there is no new one, or the arm cannot go there."""
+    """Return the targets [B, 3] after another look, unchanged where it gives none or one that is out of reach."""
     places = np.where(stands.present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
     updated = np.asarray(look(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
     if updated.shape != targets.shape:
@@ -226,7 +237,7 @@ def _calls(seconds: float) -> int:
 
 
 def _empty(stands: Stands, timing: Timing) -> ReachResult:
-    """The result of no reach."""
+    """Return the result of an empty batch."""
     points, stalks = _POINTS_A_CALL * (_calls(timing.reach) + _calls(timing.close)), stands.stalk.shape[1]
     none, path = np.zeros((0, stalks), bool), np.zeros((0, points, 3), np.float32)
     poses = np.zeros((0, points, arms_among(stalks).mj_model.nq), np.float32)
@@ -249,7 +260,7 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
 
 
 def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
-    """An arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
+    """Return the initial state of an arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
     model = bending.fit(arms.model, arms.layout, scene.shape)
     data = bending.placed(arms.rest, arms.layout, scene.shape)
     swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
@@ -262,7 +273,12 @@ def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = control.H
 def _advance(
     arms: Arms, scene: Scene, reaching: Reaching, target: jax.Array, timing: Timing, gains: Gains
 ) -> tuple[Reaching, dict[str, jax.Array]]:
-    """`LOOK` s of a reach to ``target`` [3] (m, frame of the stand): the arm then, and what there is to report."""
+    """Advance a reach to ``target`` [3] (m, frame of the stand) by `LOOK` s.
+
+    Returns:
+        The new state, and a report: path, actual positions and poses at each point, held and touched stalks, and the positions
+        of the stalks at the target's height.
+    """
     model = bending.fit(arms.model, arms.layout, scene.shape)
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
@@ -291,14 +307,14 @@ def _advance(
 def period(
     arms: Arms, model: Any, scene: Scene, reaching: Reaching, wanted: jax.Array, is_closing: jax.Array, gains: Gains
 ) -> Reaching:
-    """One period of the controllers, and of the physics.
+    """Advance controllers and physics by one control period.
 
     Args:
-        arms: The model at rest.
-        model: The same with the stalks of the scene (`bending.fit`).
+        arms: Model with its lookup tables.
+        model: Model with the stalks of the scene (`bending.fit`).
         scene: Constants of the reach.
-        reaching: The arm.
-        wanted: [3], where the grip should be, m in the frame of the stand.
+        reaching: State of the arm.
+        wanted: [3], setpoint of the grip, m in the frame of the stand.
         is_closing: [] bool, whether the jaws close.
         gains: Gains of the controllers.
     """
@@ -315,7 +331,7 @@ def period(
 
 
 def held_stalks(arms: Arms, data: Any) -> jax.Array:
-    """Return True for the stalks that the closed jaws hold, [N] bool: between the jaws, and at least one jaw presses on it."""
+    """Return True for stalks that the jaws hold, [N] bool: those between the jaws on which at least one jaw presses."""
     across, along = stalk_arm.grip_frame(data.qpos[:3])
     grip = stalk_arm.grip_at(data.qpos[:3])
     places = (bending.at_height(data, arms.layout, grip[2]) - grip)[:, :2]

@@ -1,1 +1,1 @@
-"""Synthetic runs with exact truth: attempts of the arm, and scores of masks, stitches and grasps."""
+"""Evaluation on synthetic runs with exact ground truth: grasp attempts, and scores of masks, stitches and grasps."""

@@ -1,11 +1,11 @@
-"""From grasp points to attempts: where the robot stops for each, which way the arm goes, and what comes of it.
+"""From grasp points to attempts: planning of stops and approaches, their simulation, and the results.
 
-The robot stops where it took its pairs, and knows these places by its stitches. `choice` says from which of them, and how, it
-tries each grasp point. The truth is used only to see what the jaws hold, and what they could have held.
+The robot stops where it took its pairs, and knows these positions from its stitches. `choice` chooses the stop and approach for
+each grasp point. The ground truth is used only to score what the jaws hold, and what they could have held.
 
-open    the arm goes to where the grasp point was seen, and does not look again
-again   every tenth of a second the pair at the stop finds the stalk anew; the arm follows to where it will be
-policy  a policy of VisualStalkReach brings it there, by images from over the arm's shoulder (`policy_loop`)
+open    open loop: the arm moves to the grasp point as perceived, without looking again
+again   every 0.1 s the pair at the stop detects the stalk again, and the arm follows its predicted position
+policy  a policy of VisualStalkReach moves the arm, by images from over its shoulder (`policy_loop`)
 """
 
 import dataclasses
@@ -33,29 +33,29 @@ from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatena
 
 Loop = Literal["open", "again", "policy"]
 
-_MAX_ARMS = 1024  # arms in a program
-_AROUND = 0.1  # m: above and below the grasp a pair is asked for the stalk again; so far a line is as good as straight
-_BESIDE = 0.015  # m: what it shows further away from the line is another stalk
-_MIN_SEGMENTS = 5  # chords
-_AHEAD = 1.5  # looks: a stalk is expected to go on as it did for so long after it was seen
+_MAX_ARMS = 1024  # arms per call of a compiled program
+_AROUND = 0.1  # m: range above and below the grasp in which a pair detects the stalk again, short enough for a straight line
+_BESIDE = 0.015  # m: segments farther than this from the line belong to another stalk
+_MIN_SEGMENTS = 5  # minimum number of segments
+_AHEAD = 1.5  # looks: horizon of the linear extrapolation of a stalk's motion
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The attempts of one run, before the arm moves.
+    """Planned attempts of one run.
 
     Attributes:
-        run: Its number.
-        targets: [B, 3] float64, m in the plot's frame.
-        stalks: [B] int, the stalk that each is matched with; -1 for none.
-        errors: [B] float64, horizontal distance from that stalk, m; nan for none.
-        sides: [B] float64, 1 or -1: which solution the arm takes.
-        refused: [B] bool, whether other stalks are in the way of the arm, so that it is not sent.
-        again: [B, 2] float64, by how much the pair at the stop alone is wrong about where the stalk is, along and across the
-            row, m; nan where it does not show it.
-        stands: The true stalks around the arm, from where it tries each.
-        standing: The stalks of the stretch.
-        seen: The stalks that were found around the arm, as `stands` without truth; None where nothing asks for them.
+        run: Number of the run.
+        targets: [B, 3] float64, where the jaws should close, m in the plot's frame.
+        stalks: [B] int, index of the stalk that each target is matched with; -1 for none.
+        errors: [B] float64, horizontal distance of the target from that stalk, m; NaN for none.
+        sides: [B] float64, 1 or -1: solution of the inverse kinematics.
+        refused: [B] bool, whether the arm is not sent because other stalks are in its path.
+        again: [B, 2] float64, error of the stalk's position as detected by the pair at the stop alone, along and across the
+            row, m; NaN where the pair does not show the stalk.
+        stands: True stalks around the arm at the stop of each attempt.
+        standing: True stalks of the stretch that the run passes.
+        detected: Detected stalks around the arm, laid out as `stands`; None unless planned for a policy, or without targets.
     """
 
     run: int
@@ -74,11 +74,14 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     """Plan the attempts of a run.
 
     Args:
-        scene: The run.
-        perception: Its perception.
+        scene: Images and ground truth of the run.
+        perception: Perception of the run.
         number: Number of the run.
-        for_policy: As the task that a policy has learned: from the stop that is nearest to the stalk, at one of its heights,
-            among as many stalks; and nothing is refused.
+        for_policy: Plan as in the task that policies are trained on: from the stop nearest to the stalk, within the task's
+            range of heights, among its number of stalks, and without refusals.
+
+    Returns:
+        The attempts at targets that are matched with a stalk of the stretch, or with none and within the stretch.
     """
     plot, poses = scene.plot, scene.drive.poses
     low, high = driven_stretch(plot)
@@ -120,18 +123,21 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
 
 
 def mast_positions(perception: Perception) -> np.ndarray:
-    """[S, 3], `Stands.origin` of the places where the pairs were taken, as the stitches say, in the last one's frame, m."""
+    """Return the `Stands.origin` [S, 3] of each stop as estimated by the stitches, m in the robot frame of the last pair."""
     return np.array([motion(np.array([0.0, MAST_DISTANCE, 0.0])) for motion in perception.to_last]) * [1.0, 1.0, 0.0]
 
 
 def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
-    """Return the chosen point, or others [..., 3], as the robot at the stop knows them: [..., 3], m in the plot's frame."""
+    """Map the chosen point, or ``points`` [..., 3], to the plot's frame by the stitches and the true pose at the stop.
+
+    Points are in the robot frame of the last pair, m. The result [..., 3] contains the errors of the stitches.
+    """
     from_there = perception.to_last[choice.stop].inverse()(choice.point if points is None else points)
     return scene.drive.poses[choice.stop].to_world(scene.mount.pose.to_camera(from_there))
 
 
 def _detected_around(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
-    """The stalks that were found around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
+    """Return the detected stalks around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
     height = float(choice.point[2])
     ends = np.array([point.at_height(np.array([height, height + _AROUND])) for point in perception.points])
     ends = _from_stop(choice, scene, perception, ends)
@@ -139,14 +145,15 @@ def _detected_around(choice: Choice, x: float, target: np.ndarray, scene: Scene,
 
 
 def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
-    """By how much [2] m a target is beside its stalk; nan without one."""
+    """Return the horizontal offset [2] of a target from its stalk, m; NaN without one."""
     return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
 
 
 def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, chords: dict[int, StalkSegments]) -> np.ndarray:
-    """By how much [2] m the pair at the stop alone shows the stalk beside where all pairs do; nan where it does not show it.
+    """Return the horizontal offset [2] m between the stalk as detected by the pair at the stop alone and by all pairs.
 
-    Axes are those of the robot at the last pair, from which those at other stops and of the plot differ by little.
+    NaN if there is no stop or its pair does not show the stalk. Axes are those of the robot at the last pair, which differ
+    little from those at other stops and of the plot.
     """
     if choice.stop < 0:
         return np.full(2, np.nan)
@@ -158,11 +165,11 @@ def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, c
 
 
 def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """Return True for the points that the arm's geometry lets it reach from any of the places where the left camera was.
+    """Return True for points that are within the arm's reach from any of the stops.
 
     Args:
         points: [B, 3], m in the robot frame of one pair.
-        stops: [S, 3], where the robot frames of all pairs begin in that frame, m.
+        stops: [S, 3], origins of the robot frames of all pairs in that frame, m.
 
     Returns:
         [B] bool.
@@ -172,7 +179,7 @@ def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
 
 
 def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
-    """The true stalks of the stretch, and whether and how freely they could be reached at the preferred height."""
+    """Return the true stalks of the stretch, with their reachability and room at the preferred height."""
     low, high = driven_stretch(plot)
     middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)
     radii = np.array([0.5 * stalk.diameter(PREFERRED) for stalk in plot.measured])
@@ -190,14 +197,17 @@ def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, .
 def carry_out(
     plans: Iterable[Plan], wind_mm: float, loop: Loop = "open", policy: Policy | None = None, seed: int = 0
 ) -> list[Attempt]:
-    """Send an arm to each target of all runs that is not refused, side by side.
+    """Simulate an arm for each target of all runs, in batches.
 
     Args:
-        plans: One for each run.
+        plans: One plan for each run; for the loop ``policy``, made with ``for_policy``.
         wind_mm: Amplitude of the stalks' sway, mm. The wind around an arm depends neither on other runs nor on the loop.
-        loop: Loop of the arm: with or without a second look, or a policy.
-        policy: For that loop, and plans that were made for it.
+        loop: Control loop of the arm: open, with repeated detection, or a policy.
+        policy: Policy of the loop ``policy``; None for the others.
         seed: Seed of the wind.
+
+    Returns:
+        One attempt for each target, in the order of the plans; refused ones hold and touch nothing.
     """
     attempts: list[Attempt] = []
     for block in _blocks(list(plans)):
@@ -221,7 +231,7 @@ def carry_out(
 
 
 def wind_keys(runs: np.ndarray, places: np.ndarray, seed: int = 0) -> jax.Array:
-    """Keys [B] of the winds over the attempts in some ``places`` of some ``runs``, both [B] int."""
+    """Return typed keys [B] for sampling the wind of attempts number ``places`` [B] int of runs ``runs`` [B] int."""
     of_runs = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), runs)
     return jax.vmap(jax.random.fold_in)(of_runs, places)
 
@@ -229,12 +239,12 @@ def wind_keys(runs: np.ndarray, places: np.ndarray, seed: int = 0) -> jax.Array:
 def to_attempts(
     stands: Stands, result: ReachResult, runs: np.ndarray, stalks: np.ndarray, errors: np.ndarray, refused: np.ndarray
 ) -> list[Attempt]:
-    """Convert the results of B reaches to attempts, for the score.
+    """Convert the results of B reaches to attempts for the score.
 
     Args:
-        stands: The stalks around each arm.
-        result: Their results.
-        runs, stalks, errors, refused: [B], see `Plan`.
+        stands: True stalks around each arm.
+        result: Results of the reaches.
+        runs, stalks, errors, refused: [B] each, see `Plan`.
     """
     attempts = []
     for place in range(len(stands)):
@@ -256,15 +266,16 @@ def to_attempts(
 
 
 def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[ArmView], np.ndarray]:
-    """Return a function that finds the targets [B, 3] again from the view on the way, for `reach`.
+    """Return a ``look`` function for `reach` that simulates detecting the targets [B, 3] again on the way.
 
-    The pair at the stop stands still. What it finds is where the stalk is, plus the error that it alone made with this stalk
-    at rest; what it did not show at rest it does not find again. A result is there one look later, and the stalk is expected
-    to go on as it did between the last two. That the arm itself may hide the stalk is left out.
+    The pair at the stop does not move. It detects the stalk at its true position plus the error that the pair alone makes with
+    this stalk at rest; stalks that it does not show at rest are not detected. A detection is available one look later, and the
+    position is extrapolated linearly from the last two. Occlusion by the arm itself is not modelled. The function keeps the
+    history of one batch of reaches: do not reuse it for another.
 
     Args:
-        stands: The stalks around each arm.
-        stalks: [B] int, which one each is for.
+        stands: True stalks around each arm.
+        stalks: [B] int, index of the stalk that each arm reaches for; -1 for none.
         again: [B, 2], see `Plan`.
     """
     known = (stands.stalk == stalks[:, None]) & (stalks >= 0)[:, None]
@@ -280,14 +291,14 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[A
             return np.full_like(place, np.nan)
         before, last = places[-3:-1]
         ahead = _AHEAD * (last - before)
-        ahead[:, 2] = 0.0  # the height of the grasp stays what it was chosen to be
+        ahead[:, 2] = 0.0  # keep the chosen height of the grasp
         return last + ahead
 
     return look
 
 
 def _blocks(plans: list[Plan]) -> Iterator[list[Plan]]:
-    """Plans that are carried out together: as many as have at most `_MAX_ARMS` targets, but at least one."""
+    """Yield batches of consecutive plans with at most `_MAX_ARMS` targets in total, or single larger ones; skip empty plans."""
     block: list[Plan] = []
     for plan in plans:
         if not len(plan.targets):

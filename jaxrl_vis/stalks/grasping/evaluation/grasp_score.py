@@ -1,8 +1,8 @@
 """Score of grasps: one target, one stalk between the jaws. NumPy and SciPy only.
 
-The thesis counts stalks: 1 - |grasped - attempted| / attempted, averaged over runs. Misses and double grasps cancel there.
-Here an attempt succeeds if exactly the stalk that it was for is between the jaws at closure. Failures are counted by kind,
-beside the thesis's ratio.
+The thesis counts stalks: 1 - |grasped - attempted| / attempted, averaged over runs, where misses and double grasps cancel.
+Here an attempt succeeds if exactly its target stalk is between the jaws at closure. Failures are counted by kind, and the
+thesis's ratio is computed as well.
 """
 
 import dataclasses
@@ -14,26 +14,26 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 ROOM = 0.005
-"""Room in m beside the open jaws with less of which a stalk is crowded: the jaws cannot take it alone."""
+"""Minimum room beside the open jaws, m, below which a stalk is crowded: the jaws cannot take it alone."""
 NEIGHBOUR_EDGES = (0.0, 0.03, 0.04, 0.05, 0.065, 0.1, math.inf)
-"""Bounds of the classes of distances to the nearest neighbour, m, middle to middle."""
+"""Bin edges of distances to the nearest neighbour, m, centre to centre."""
 OUTCOMES = ("success", "miss", "wrong stalk", "several", "unreachable", "refused")
 STAGES = ("grasped", "not detected", "aimed beside", "out of reach", "refused", "not held", "several held")
 
 
 @dataclasses.dataclass(frozen=True)
 class Attempt:
-    """One grasp point that the arm was to go to.
+    """Attempt at one grasp point, and its result.
 
     Attributes:
-        run: In which run.
-        stalk: Index of the stalk that the grasp point is matched to (`match`); None where no stalk is there.
+        run: Number of the run.
+        stalk: Index of the stalk that the grasp point is matched with (`match`); None if there is none.
         held: Indices of the stalks between the closed jaws.
-        reachable: The arm could go there; if not, nothing is held.
-        refused: It could, and was not sent: other stalks were in its path, as far as was known. Then nothing is held.
-        collided: Links other than the jaws touched a stalk that the attempt was not for.
-        brushed: The same for the open jaws.
-        aim_error: Horizontal distance of the grasp point from the middle of the stalk, m; nan without one.
+        reachable: Whether the grasp point is within the arm's reach; if not, nothing is held.
+        refused: Whether the arm was not sent because detected stalks were in its path; if so, nothing is held.
+        collided: Whether upper arm or forearm touched a stalk other than the target.
+        brushed: Whether the gripper touched such a stalk before the jaws began to close.
+        aim_error: Horizontal distance of the grasp point from the centre of the stalk, m; NaN without one.
     """
 
     run: int
@@ -52,7 +52,7 @@ class Attempt:
 
     @property
     def outcome(self) -> str:
-        """One of `OUTCOMES`."""
+        """Outcome, one of `OUTCOMES`."""
         if not self.reachable:
             return "unreachable"
         if self.refused:
@@ -66,14 +66,15 @@ class Attempt:
 
 @dataclasses.dataclass(frozen=True)
 class Standing:
-    """One stalk of the stretch that a run passes: the truth.
+    """Ground truth of one stalk of the stretch that a run passes.
 
     Attributes:
-        run: In which run.
-        stalk: Its index.
-        reachable: The arm's geometry lets it be grasped from somewhere in the run.
-        room: Least distance from other stalks that it leaves the open gripper, m; see `approach.room`.
-        neighbour: Distance to the nearest other stalk at the height of the grasp, middle to middle, m.
+        run: Number of the run.
+        stalk: Index of the stalk.
+        reachable: Whether the stalk is within the arm's reach from any stop of the run.
+        room: Clearance between the open gripper and other stalks on the best path, m; -inf if unreachable; see
+            `approach.room`.
+        neighbour: Distance to the nearest other stalk at the height of the grasp, centre to centre, m; inf if there is none.
     """
 
     run: int
@@ -84,18 +85,18 @@ class Standing:
 
     @property
     def crowded(self) -> bool:
-        """True if the jaws cannot take it alone."""
+        """True if the jaws cannot take the stalk alone: its `room` is less than `ROOM`."""
         return self.room < ROOM
 
 
 @dataclasses.dataclass(frozen=True)
 class Share:
-    """So many of so many, with Wilson's interval of 95 %; all nan where there are none.
+    """Proportion with its Wilson interval of 95 %; NaN if the total is 0.
 
     Attributes:
-        name: Name of the share.
+        name: Name of the proportion.
         count: Number of hits.
-        of: Total.
+        of: Total number.
     """
 
     name: str
@@ -104,12 +105,12 @@ class Share:
 
     @property
     def share(self) -> float:
-        """Share, 0 to 1."""
+        """Proportion, 0 to 1."""
         return self.count / self.of if self.of else math.nan
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Lowest and highest share that fit."""
+        """Lower and upper bound of the Wilson interval."""
         return wilson(self.count, self.of)
 
     def __str__(self) -> str:
@@ -124,21 +125,21 @@ class Score:
     """Score of all runs.
 
     Attributes:
-        of_sent: Successes, of the attempts for which the arm moved.
-        with_room: Stalks grasped alone, of those that can be reached and leave the open jaws room.
-        crowded: The same of those that can be reached and do not.
-        of_reachable: The same of all that can be reached: with room and crowded.
-        of_all: The same of all stalks of the stretch: the whole process.
-        outcomes: Attempts by what came of them; one row for each of `OUTCOMES`, of all attempts.
-        stages: Stalks that can be reached, by the stage that failed; one row for each of `STAGES`.
-        false_targets: Attempts at places without a stalk, of all attempts.
-        collisions: Attempts sent whose links touched another stalk, of those sent.
-        brushes: Attempts sent whose open jaws touched another stalk, of those sent.
-        touches: Attempts sent of which either did, of those sent.
-        by_neighbour: Stalks grasped alone, of those that can be reached, by distance to the nearest neighbour.
-        thesis_ratio: The thesis's metric, mean over runs with attempts; nan without any.
-        runs: Runs with attempts.
-        aim_errors: [A] float64, `Attempt.aim_error` of the attempts at a stalk, m.
+        of_sent: Successes among the attempts that were sent.
+        with_room: Stalks grasped alone among the reachable ones that are not crowded.
+        crowded: Stalks grasped alone among the reachable ones that are crowded.
+        of_reachable: Stalks grasped alone among all reachable ones.
+        of_all: Stalks grasped alone among all stalks of the stretches: the end-to-end success rate.
+        outcomes: Attempts with each of `OUTCOMES` among all attempts.
+        stages: Reachable stalks by the stage that they came to, one entry for each of `STAGES`.
+        false_targets: Attempts without a matched stalk among all attempts.
+        collisions: Attempts whose links touched another stalk, among those sent.
+        brushes: Attempts whose open gripper touched another stalk, among those sent.
+        touches: Attempts with a collision or a brush, among those sent.
+        by_neighbour: Stalks grasped alone among the reachable ones in each bin of `NEIGHBOUR_EDGES`.
+        thesis_ratio: The thesis's metric, mean over runs with attempts sent; NaN if there are none.
+        runs: Number of runs with attempts sent.
+        aim_errors: [A] float64, `Attempt.aim_error` of the attempts with a matched stalk, m.
     """
 
     of_sent: Share
@@ -159,7 +160,7 @@ class Score:
 
     @property
     def shares(self) -> tuple[Share, ...]:
-        """All rows, in the order of a table."""
+        """All proportions, in the order of a table's rows."""
         first = (self.of_sent, self.with_room, self.crowded, self.of_reachable, self.of_all)
         return (
             *first,
@@ -174,7 +175,16 @@ class Score:
 
 
 def wilson(count: int, of: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's interval of a share ``count / of``; (nan, nan) for none. ``z`` is the normal quantile: 95 %."""
+    """Return the Wilson interval of a proportion ``count / of``; (NaN, NaN) if ``of`` is 0.
+
+    Args:
+        count: Number of hits.
+        of: Total number.
+        z: Quantile of the standard normal distribution; the default gives 95 % coverage.
+
+    Raises:
+        ValueError: ``count`` is not from 0 to ``of``.
+    """
     if not 0 <= count <= of:
         raise ValueError(f"a count must be from 0 to what it is of, got {count} of {of}")
     if not of:
@@ -186,12 +196,12 @@ def wilson(count: int, of: int, z: float = 1.959964) -> tuple[float, float]:
 
 
 def match(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
-    """Match grasp points with stalks one to one: as many pairs as possible, at the least total distance.
+    """Match grasp points with stalks one to one: as many pairs as possible, with minimum total distance.
 
     Args:
-        points: [P, 2], where the arm is to go, m.
-        stalks: [S, 2], where the middles of the stalks are at the heights of the grasps, m; or [P, S, 2] where these differ.
-        gate: Greatest distance of a pair, m.
+        points: [P, 2], grasp points, m.
+        stalks: [S, 2], centres of the stalks at the height of the grasps, m; or [P, S, 2] if heights differ.
+        gate: Maximum distance of a pair, m.
 
     Returns:
         [P] int: index of the stalk, -1 for none.
@@ -212,12 +222,12 @@ def match(points: np.ndarray, stalks: np.ndarray, gate: float) -> np.ndarray:
 
 
 def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: float = 0.015) -> Score:
-    """Put the attempts beside the truth.
+    """Score attempts against the ground truth.
 
     Args:
         attempts: Attempts of all runs, at most one for each stalk.
         stalks: All stalks of the stretches that the runs pass.
-        tolerance: An attempt is aimed beside its stalk where it fails and its aim is further off than this, m.
+        tolerance: Aim error above which a failed attempt that was sent counts as aimed beside its stalk, m.
 
     Raises:
         ValueError: Two attempts of a run are for one stalk, a stalk is listed twice, or an attempt is for an unknown stalk.
@@ -273,7 +283,7 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
 
 
 def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
-    """The thesis's metric, mean over the runs in which the arm was sent, and the number of these; nan for none."""
+    """Return the thesis's metric, averaged over the runs in which the arm was sent (NaN for none), and their number."""
     sent: Counter[int] = Counter()
     held: Counter[int] = Counter()
     for attempt in attempts:
@@ -285,7 +295,7 @@ def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
 
 
 def _stage(attempt: Attempt | None, tolerance: float) -> str:
-    """Return the one of `STAGES` that a stalk came to."""
+    """Return the stage, one of `STAGES`, that a stalk came to; ``attempt`` is None if the stalk was not detected."""
     if attempt is None:
         return "not detected"
     if attempt.outcome == "success":

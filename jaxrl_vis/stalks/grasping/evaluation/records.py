@@ -1,6 +1,6 @@
-"""Records of `grasp eval` as JSON: for each run its perception's score, the plan of its attempts, and their results.
+"""Records of `grasp eval` as JSON: score of the perception, plans of the attempts, and their results for each run.
 
-Everything that follows is computed from what was kept, so that it is the same whether a run was evaluated now or before.
+Summaries are computed from the stored records alone, so that they do not depend on when a run was evaluated.
 """
 
 import dataclasses
@@ -27,9 +27,9 @@ from jaxrl_vis_envs.plants import Family
 from jaxrl_vis_envs.plants.stand import Stands
 
 SCHEMA = 2
-"""Schema of the records: those with another one cannot be resumed."""
-_DIGITS = 6  # of lengths in m
-# Files and folders that train networks or draw figures and videos.
+"""Schema of the records; files with another one cannot be resumed."""
+_DIGITS = 6  # decimal places of lengths in m
+# Files and folders that train networks or draw figures and videos: changes there keep records valid.
 _CHANGES_NO_RECORD = ("examples.py", "mask_training.py", "variation.py", "report")
 
 
@@ -38,11 +38,11 @@ class Conditions:
     """Conditions under which runs are evaluated.
 
     Attributes:
-        family: Family that rows are drawn from.
-        weights: File of the weights of the network of masks; None for true masks.
+        family: Family that rows are sampled from.
+        weights: Weights file of the mask network; None for true masks.
         masks: Name of that network, or ``truth``.
         variant: Steps that follow the thesis.
-        workers: Number of processes that share the machine; records state it, as it bears on the time that a pair takes.
+        workers: Number of processes that share the machine; stored in the records because it affects the time per pair.
     """
 
     family: Family
@@ -59,22 +59,22 @@ def evaluate_runs(
     started: Callable[[int], None],
     done: Callable[[int, Record], None],
 ) -> RecordFile:
-    """Evaluate runs, side by side in several processes, before an arm moves.
+    """Evaluate the perception of runs and plan their attempts, in parallel processes; `reach_all` carries these out.
 
     Args:
-        conditions: For all runs.
+        conditions: Conditions of all runs.
         numbers: Seeds of the rows.
-        path: JSON file of the records, which is written after each run; None for no file. Runs that it holds already are not
-            evaluated again.
-        started: Called once with the number of runs that the file holds already.
-        done: Called after each run with its number and its record.
+        path: JSON file of the records, written after each run; None for no file. Runs that it already holds are not evaluated
+            again.
+        started: Called once with the number of runs that the file already holds.
+        done: Called after each run with its number and record.
 
     Returns:
         The records of all runs.
 
     Raises:
         RequestError: The file holds records of another evaluation, or cannot be read.
-        WorkerError: A process was ended from outside.
+        WorkerError: A worker process was ended from outside.
     """
     about = {
         "synthetic": True,
@@ -99,10 +99,10 @@ def evaluate_runs(
 
 
 def evaluate_run(conditions: Conditions, number: int) -> Record:
-    """Evaluate one run, before an arm moves, and return its record.
+    """Evaluate the perception of one run, plan its attempts, and return its record, without reaches.
 
     Args:
-        conditions: For all runs.
+        conditions: Conditions of all runs.
         number: Seed of the row.
     """
     scene = draw_scene(conditions.family, number)
@@ -121,7 +121,7 @@ def evaluate_run(conditions: Conditions, number: int) -> Record:
 
 
 def summarise(records: Sequence[Record]) -> dict[str, Any]:
-    """Summarise the records of runs: the figures of `scoring.summary`, and of all reaches that all of them have."""
+    """Summarise the records of runs: the figures of `scoring.summary`, and of each kind of reaches that all records hold."""
     figures: dict[str, Any] = summary([read_score(record) for record in records])
     figures["devices"] = sorted({record["device"] for record in records})
     figures["workers"] = sorted({record["workers"] for record in records})
@@ -132,21 +132,21 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
 
 
 def score_figures(score: Score) -> dict[str, Any]:
-    """A score as JSON."""
+    """Return the thesis's ratio and all proportions of a score, as values for JSON."""
     shares = {share.name: {"count": share.count, "of": share.of, "interval": share.interval} for share in score.shares}
     return {"thesis_ratio": score.thesis_ratio, "shares": shares}
 
 
 @dataclasses.dataclass(frozen=True)
 class Reaches:
-    """A kind of reaches, for all targets.
+    """Kind of reaches, with its parameters; ``str`` gives its name in the records.
 
     Attributes:
-        loop: Loop of the arm: with or without a second look, or a policy.
+        loop: Control loop of the arm: open, with repeated detection, or a policy.
         wind_mm: Amplitude of the stalks' sway, mm.
-        for_policy: All loops have the scenes of the policy's task; see `attempts.plan`.
-        policy: For that loop.
-        policy_name: Its name.
+        for_policy: Whether attempts are planned as in the policy's task, for any loop; see `attempts.plan`.
+        policy: Policy of the loop ``policy``; None for the others.
+        policy_name: Name of the policy.
     """
 
     loop: Loop
@@ -161,15 +161,15 @@ class Reaches:
 
     @property
     def plan(self) -> str:
-        """Under what name its plan is kept."""
+        """Key of the plan in a record."""
         return "plan_for_policy" if self.for_policy else "plan"
 
 
 def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> None:
-    """Send the arm to all targets of the runs that were not carried out in this way yet, and keep what came of it.
+    """Carry out reaches of one kind in the runs whose records lack them, and add the attempts to the records.
 
     Args:
-        table: The records of all runs.
+        table: Records of all runs, changed in place and written to their file.
         numbers: Numbers of the runs.
         reaches: Kind of reaches.
     """
@@ -186,7 +186,7 @@ def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> No
 
 
 def grasp_score(records: Iterable[Record], name: str) -> Score:
-    """The score of what came of all reaches of one kind, named as `Reaches` are."""
+    """Return the score of all reaches of one kind in the records; ``name`` is the string of its `Reaches`."""
     attempts, standing = [], []
     for record in records:
         number, reaches = int(record["number"]), record["reaches"][name]
@@ -240,19 +240,19 @@ def _plan_record(made: Plan) -> Record:
 
 
 def read_plan(number: int, record: Record, name: str = "plan") -> Plan:
-    """A plan of a run.
+    """Return a plan of a run from its record.
 
     Args:
         number: Number of the run.
-        record: Its record.
-        name: Name of the plan in the record.
+        record: Record of the run.
+        name: Key of the plan in the record.
     """
     values = record[name]
     return Plan(
         run=number,
         targets=np.array(values["targets"], float).reshape(-1, 3),
         stalks=np.array(values["stalks"], int),
-        errors=np.array(values["errors"], float),  # not a number where there is None
+        errors=np.array(values["errors"], float),  # None becomes NaN
         sides=np.array(values["sides"], float),
         refused=np.array(values["refused"], bool),
         again=np.array(values["again"], float).reshape(-1, 2),

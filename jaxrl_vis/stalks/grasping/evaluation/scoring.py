@@ -1,10 +1,10 @@
-"""Scores of masks, stitches and grasp points against the exact truth of synthetic rows, which are drawn for it.
+"""Scores of masks, stitches and grasp points against the exact ground truth of synthetic rows, rendered for this purpose.
 
 row -> five pairs -> perception -> grasp points         as `run` does, without files
     -> true stalks, poses and masks                     from the row itself
 
-Only the half metre that the robot drives along counts: the stalks that stand there at the preferred height. A grasp point hits
-the stalk that it is matched with, one to one, if it lies within 30 mm of that stalk's middle at its own height.
+Only stalks count that at the preferred height stand within the 0.5 m that the robot drives along. A grasp point hits the stalk
+that it is matched with, one to one, if it lies within 30 mm of that stalk's centre at its own height.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from jaxrl_vis_envs.plants import Drive, Family, Plot, Pose, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 
 RADIUS = 0.03
-"""Greatest distance of a grasp point from the stalk that it is matched with, m: half the mean spacing."""
+"""Maximum distance between a grasp point and its matched stalk, m: half the mean spacing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +33,8 @@ class MaskScore:
     """Agreement of masks with the truth, over the pairs of a run.
 
     Attributes:
-        hits, painted, true: Pixels that are rightly painted, painted, and of stalks.
-        boundary: Mean distance between the outlines of both masks, in both directions, pixels; not a number without outlines.
+        hits, painted, true: Numbers of true positive, predicted, and true pixels of stalks.
+        boundary: Mean distance between the outlines of both masks, in both directions, pixels; NaN without outlines.
     """
 
     hits: int
@@ -45,15 +45,15 @@ class MaskScore:
 
 @dataclasses.dataclass(frozen=True)
 class RunScore:
-    """One run.
+    """Score of one run's perception.
 
     Attributes:
         seed: Seed of the row.
-        true: Stalks in the stretch.
-        found: Grasp points in the stretch, and those that are matched with a stalk in it.
+        true: Number of stalks in the stretch.
+        detected: Number of grasp points that are matched with a stalk in the stretch, or with none and lie in it.
         errors: [K] float64, horizontal distance of each matched grasp point from its stalk, mm.
         stitches: [S] float64, horizontal error of each stitch, mm.
-        refused: Stitches that were refused.
+        refused: Number of stitches that were refused.
         seconds: Time per pair, by stage, s.
         mask: Agreement of masks with the truth; None for true masks.
         notes: Irregularities, in words.
@@ -72,14 +72,14 @@ class RunScore:
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One run, drawn.
+    """Rendered images and ground truth of one synthetic run.
 
     Attributes:
-        plot: The plants.
-        drive: Path and properties of the cameras.
-        mount: Their nominal mount.
-        views: The pairs.
-        masks: [F, H, W] bool, true masks.
+        plot: Plants of the row.
+        drive: Trajectory and calibration of the cameras.
+        mount: Nominal mount of the cameras.
+        views: Stereo pairs.
+        masks: [F, H, W] bool, true masks of the left images.
     """
 
     plot: Plot
@@ -90,7 +90,7 @@ class Scene:
 
 
 def draw_scene(family: Family, seed: int) -> Scene:
-    """Draw the pairs of a row."""
+    """Sample a row from a family and render its pairs and true masks."""
     sequence = Sequence.of(draw(family, seed))
     views, masks = [], []
     for pair in sequence:
@@ -101,12 +101,15 @@ def draw_scene(family: Family, seed: int) -> Scene:
 
 
 def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAULT_VARIANT) -> tuple[RunScore, Perception]:
-    """Run everything on a scene and compares.
+    """Run the perception on a scene and score it against the ground truth.
 
     Args:
-        scene: The pairs and the truth.
+        scene: Pairs and ground truth of the run.
         mask: Function that returns the mask of an image; None for true masks.
         variant: Steps that follow the thesis.
+
+    Returns:
+        The score, and the perception itself.
     """
     painted: dict[int, np.ndarray] = {}
 
@@ -138,7 +141,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
 
 
 def in_world(perception: Perception, scene: Scene) -> np.ndarray:
-    """Grasp points [B, 3] in the plot's frame, m: the robot stands where the last pair was taken, and is mounted as stated."""
+    """Return grasp points [B, 3] in the plot's frame, m, by the true pose at the last pair and the nominal mount."""
     points = np.array([point.point for point in perception.points]).reshape(-1, 3)
     return scene.drive.poses[-1].to_world(scene.mount.pose.to_camera(points))
 
@@ -151,15 +154,15 @@ def driven_stretch(plot: Plot) -> tuple[float, float]:
 
 
 def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]:
-    """Matches grasp points with stalks of the near row, one to one.
+    """Match grasp points with stalks of the near row, one to one.
 
     Args:
-        targets: [B, 3] in the plot's frame, m.
-        plot: The plants.
+        targets: [B, 3], grasp points in the plot's frame, m.
+        plot: Plants of the row.
 
     Returns:
-        How many stalks there are in the stretch, how many grasp points, without those of stalks beyond it, and the distances
-        [K] of those that hit, m.
+        Number of stalks in the stretch; number of grasp points that are matched with one of them, or with no stalk and lie in
+        the stretch; and horizontal distances [K] of the matched ones, m.
     """
     low, high = driven_stretch(plot)
     inside = np.array([low <= stalk.at_height(PREFERRED)[0][0] <= high for stalk in plot.measured], bool)
@@ -175,7 +178,7 @@ def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]
 
 
 def true_motion(before: Pose, after: Pose, mount: Mount) -> Motion:
-    """Return the motion from the robot frame of one pair to that of another one, by the true poses of their cameras."""
+    """Return the true motion from the robot frame of one pair to that of another, by the poses of their cameras."""
     nominal = mount.pose
     rotation = nominal.rotation.T @ after.rotation @ before.rotation.T @ nominal.rotation
     origin = nominal.to_world(after.to_camera(before.to_world(nominal.to_camera(np.zeros(3)))))
@@ -183,7 +186,7 @@ def true_motion(before: Pose, after: Pose, mount: Mount) -> Motion:
 
 
 def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> float:
-    """Mean horizontal distance in m between where a stitch puts places of the row, and where they are."""
+    """Return the mean horizontal error of a stitch over points of the row, m."""
     away = float(0.5 * (before.position[1] + after.position[1]))
     places = np.array([[x, -away, z] for x in (-0.2, 0.0, 0.2) for z in (0.5, 0.75, 1.0)])
     difference = motion(places) - true_motion(before, after, mount)(places)
@@ -191,7 +194,7 @@ def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> flo
 
 
 def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
-    """Compare painted masks with true ones."""
+    """Score pairs of predicted and true masks."""
     far = [_mean_outline_distance(*both) for both in masks]
     return MaskScore(
         hits=int(sum((painted & true).sum() for painted, true in masks)),
@@ -202,7 +205,7 @@ def _mask_score(masks: list[tuple[np.ndarray, np.ndarray]]) -> MaskScore:
 
 
 def _mean_outline_distance(painted: np.ndarray, true: np.ndarray) -> float:
-    """Mean distance of the outlines of two masks, in both directions, pixels; not a number where one has none."""
+    """Return the mean distance of the outlines of two masks, in both directions, pixels; NaN if either has none."""
     outlines = [mask.astype(np.uint8) - cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) for mask in (painted, true)]
     if not all(outline.any() for outline in outlines):
         return math.nan
@@ -216,7 +219,7 @@ def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
     Returns:
         ``f1``, ``precision`` and ``recall`` of stalks, ``point_median_mm`` and ``point_p95_mm``, ``stitch_median_mm`` and
         ``stitch_p95_mm``, ``stitches_refused``, ``seconds_per_pair`` and its parts, for networks ``mask_f1`` and
-        ``mask_boundary_px``, and how much there was of each. Not a number where there was nothing.
+        ``mask_boundary_px``, and the counts that they are computed from. NaN if there is nothing to average.
     """
     scores = list(scores)
     true, detected = sum(score.true for score in scores), sum(score.detected for score in scores)

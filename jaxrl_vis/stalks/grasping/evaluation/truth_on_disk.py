@@ -1,4 +1,4 @@
-"""Masks from the truth that `grasp synth` wrote beside its images: what a perfect network would paint."""
+"""True masks from the ground truth that `grasp synth` writes beside its images, instead of a network's."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from jaxrl_vis_envs.documents import read_json
 
 
 def find_truth(image: np.ndarray | None, folder: PlotFolder, pair: PairFiles) -> np.ndarray:
-    """Return the true mask [H, W] bool of a pair of a synthetic run; ``image`` is not looked at.
+    """Return the true mask [H, W] bool of the left image of a pair of a synthetic run; ``image`` is ignored.
 
     Raises:
-        RequestError: The run is not synthetic, or was written without masks.
+        RequestError: The run is not synthetic, or holds no masks of this image.
     """
     try:
         count = int(read_json(folder.folder / "plot.json")["count"])

@@ -1,6 +1,6 @@
-"""Masks of stalks: an image painted red where it shows a stalk of the near row.
+"""Masks of the stalks of the near row: networks that paint stalks red or segment them, and their training.
 
-networks    generator and discriminator of pix2pix      painter     images to masks, and weights in a file
-examples    images with their masks, synthetic          loop        adversarial training, and plain segmentation beside it
-variation   other light, colours and textures
+mask_networks   generator and discriminator of pix2pix      painter         inference of masks, and files of weights
+examples        synthetic images with their masks           mask_training   adversarial or segmentation training
+variation       augmentation of light, colours and texture  loading         networks by file of weights or by loss
 """

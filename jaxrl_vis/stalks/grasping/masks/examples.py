@@ -1,4 +1,4 @@
-"""Training examples of the generator: left images of synthetic rows, with masks of the stalks of the near row."""
+"""Training examples for the generator: left images of synthetic rows, with masks of the stalks of the near row."""
 
 import dataclasses
 
@@ -11,11 +11,11 @@ from jaxrl_vis_envs.plants.pairs import Sequence
 
 @dataclasses.dataclass(frozen=True)
 class Example:
-    """One image.
+    """Training example.
 
     Attributes:
-        image: [H, W, 3] uint8.
-        mask: [H, W] bool, pixels of stalks of the near row.
+        image: [H, W, 3] uint8, RGB.
+        mask: [H, W] bool, True for pixels of stalks of the near row.
     """
 
     image: np.ndarray
@@ -23,23 +23,23 @@ class Example:
 
 
 def true_mask(instance: jax.Array | np.ndarray, count: int) -> np.ndarray:
-    """Pixels of the stalks of the near row: [H, W] bool.
+    """Return the mask [H, W] bool of the stalks of the near row.
 
     Args:
-        instance: [H, W] int, which stalk each pixel shows; those of the near row come first.
-        count: Stalks of the near row.
+        instance: [H, W] int, index of the stalk that each pixel shows, those of the near row first; negative for none.
+        count: Number of stalks of the near row.
     """
     instance = np.asarray(instance)
     return (instance >= 0) & (instance < count)
 
 
 def synthetic_examples(family: Family, seed: int, frames: int = 2) -> list[Example]:
-    """Examples of one row of a family.
+    """Render examples of one row of a family.
 
     Args:
-        family: Family that the row is drawn from.
+        family: Family that the row is sampled from.
         seed: Seed of the row.
-        frames: Number of images of it; consecutive pairs show nearly the same.
+        frames: Number of images, evenly spaced because consecutive pairs show nearly the same; at most all pairs.
     """
     sequence = Sequence.of(draw(family, seed))
     length = len(sequence)

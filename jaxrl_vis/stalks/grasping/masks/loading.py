@@ -1,4 +1,4 @@
-"""Loading of the network of masks that a command names by a file of weights, or by its loss."""
+"""Loading of the mask network that a command selects by a file of weights, or by its loss."""
 
 import functools
 from pathlib import Path
@@ -9,14 +9,14 @@ from jaxrl_vis.stalks.grasping.masks.painter import SHIPPED, Loss, Painter, read
 
 
 def resolve_weights(weights: Path | None, loss: Loss) -> tuple[Path, str]:
-    """Return the file of the network's weights and a name of the network, which changes with the contents of the file.
+    """Return the network's weights file, and a name of the network that contains a digest of the file.
 
     Args:
-        weights: File from ``grasp train``; None for the shipped one, which is a segmentation.
-        loss: Loss of the network that is wanted where ``weights`` is None.
+        weights: File from ``grasp train``; None for the shipped one, a segmentation network.
+        loss: Loss of the network; used only if ``weights`` is None.
 
     Raises:
-        RequestError: The weights cannot be read, or do not ship.
+        RequestError: The weights cannot be read, or the package ships none for this loss.
     """
     if weights is None and loss == "gan":
         raise RequestError(
@@ -30,7 +30,7 @@ def resolve_weights(weights: Path | None, loss: Loss) -> tuple[Path, str]:
 
 @functools.cache
 def load_painter(weights: Path) -> Painter:
-    """Return the network with these weights; a process reads a file once.
+    """Return the network with these weights; cached, so that a process reads a file once.
 
     Raises:
         RequestError: The weights cannot be read.

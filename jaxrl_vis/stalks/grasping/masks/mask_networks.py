@@ -1,9 +1,9 @@
-"""The networks of pix2pix (Isola et al. 2017), small: a U-Net that paints, and a PatchGAN that judges what it painted.
+"""Small versions of the networks of pix2pix (Isola et al. 2017): a U-Net generator and a PatchGAN discriminator.
 
-The thesis's generator learns against a discriminator; the same generator with one output in place of three learns as a plain
-segmentation. Images are [N, H, W, C], float32 or bfloat16, around 0. Normalisation is by groups, so that an image is treated
-alike alone and in a batch, and no features are dropped: pix2pix does that to paint differently each time, but a robot needs one
-answer.
+The thesis's generator is trained against a discriminator; the same network with one output channel instead of three is trained
+as a plain segmentation. Images are [N, H, W, C], float32 or bfloat16, normalised to -1 to 1. Group normalisation makes the
+output for an image independent of the batch. There is no dropout, which pix2pix uses to randomise its output: a robot needs a
+deterministic one.
 """
 
 import flax.linen as nn
@@ -12,12 +12,12 @@ import jax.numpy as jnp
 
 
 class Generator(nn.Module):
-    """A U-Net: images [N, H, W, 3] to [N, H, W, outputs]. H and W: multiples of 2 to the number of its levels.
+    """U-Net from images [N, H, W, 3] to [N, H, W, outputs] float32. H and W must be multiples of 2^len(channels).
 
     Attributes:
-        channels: Channels of each level; all but the first are multiples of 8.
-        outputs: 3 to paint (then between -1 and 1), 1 for logits.
-        dtype: In which convolutions are computed.
+        channels: Channels of each level; all but the first must be multiples of 8.
+        outputs: Number of output channels: 3 for painted images in -1 to 1, 1 for logits of the mask.
+        dtype: Compute dtype of the convolutions.
     """
 
     channels: tuple[int, ...] = (16, 32, 64, 96, 128, 128)
@@ -26,7 +26,7 @@ class Generator(nn.Module):
 
     @nn.compact
     def __call__(self, images: jax.Array) -> jax.Array:
-        """Paints, or gives logits."""
+        """Return painted images, or logits of masks, depending on ``outputs``."""
         x = images.astype(self.dtype)
         levels = []
         for depth, channels in enumerate(self.channels):
@@ -43,11 +43,11 @@ class Generator(nn.Module):
 
 
 class Discriminator(nn.Module):
-    """PatchGAN: for each patch of 70 x 70 pixels, whether a painting belongs to its image. Logits [N, h, w].
+    """PatchGAN discriminator: scores for each patch of 70 x 70 pixels whether a painted image is a true one.
 
     Attributes:
-        channels: Channels of each layer; the last two keep the resolution.
-        dtype: In which convolutions are computed.
+        channels: Channels of the hidden layers; the last of these and the output layer keep the resolution.
+        dtype: Compute dtype of the convolutions in the hidden layers.
     """
 
     channels: tuple[int, ...] = (32, 64, 128, 128)
@@ -55,7 +55,7 @@ class Discriminator(nn.Module):
 
     @nn.compact
     def __call__(self, images: jax.Array, paintings: jax.Array) -> jax.Array:
-        """Logits, above 0 for paintings that look true."""
+        """Return logits [N, h, w] float32 of images and paintings, both [N, H, W, 3]; positive where paintings seem true."""
         x = jnp.concatenate([images, paintings], axis=-1).astype(self.dtype)
         for depth, channels in enumerate(self.channels):
             strides = (2, 2) if depth < len(self.channels) - 1 else (1, 1)

@@ -1,10 +1,10 @@
-"""Training the generator: against a discriminator, as pix2pix, or as a plain segmentation. Same network, same data.
+"""Training of the generator, against a discriminator as in pix2pix or as a plain segmentation, on the same data.
 
-gan             the discriminator tells true paintings from those of the generator; the generator deceives it, and stays near
-                the true painting (100 times the mean absolute difference)
+gan             the discriminator classifies paintings as true or generated; the generator minimises the adversarial loss plus
+                100 times the mean absolute difference from the true painting
 segmentation    cross entropy and Dice loss of the mask
 
-Examples are drawn by threads while the network already learns from those that are there.
+Threads render examples while the network is trained on those that already exist.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from jaxrl_vis.stalks.phenotyping.training.pool import Pool
 from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
 
 _NEAR_TRUTH = 100.0
-"""Weight of the mean absolute difference, pix2pix's own."""
+"""Weight of the mean absolute difference, as in pix2pix."""
 _RED = (1.0, -1.0, -1.0)
 
 
@@ -36,15 +36,15 @@ class Plan:
     """Schedule of the generator's training.
 
     Attributes:
-        steps: Most updates.
-        minutes: Most minutes, the drawing of the first images and compilation included; None for no limit.
-        images: Number of images to learn from.
-        first: With how many the updates begin.
-        batch: Crops per update.
+        steps: Maximum number of updates.
+        minutes: Maximum duration in minutes, including compilation and rendering of the first images; None for no limit.
+        images: Maximum number of images in the pool.
+        first: Number of images to render before the first update.
+        batch: Number of crops per update.
         crop: Height and width of a crop, pixels.
-        rate: Highest learning rate of the generator.
-        average: Average of the generator's weights over updates: the share of the old ones.
-        seed: Seed of everything random.
+        rate: Peak learning rate of the generator.
+        average: Decay rate of the exponential moving average of the generator's parameters; lower in the first updates.
+        seed: Seed of initialisation, crops and augmentation.
     """
 
     steps: int = 20_000
@@ -59,16 +59,16 @@ class Plan:
 
 
 def crops(examples: list[Example], rng: np.random.Generator, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """A batch of crops at random places.
+    """Sample a batch of crops at random positions.
 
     Args:
-        examples: To choose from.
-        rng: Random numbers.
-        count: Number of crops.
-        size: Their height and width, pixels; where an image is smaller, the rest is black.
+        examples: Examples to sample from, with replacement.
+        rng: Random number generator.
+        count: Number of crops N.
+        size: Height and width of the crops, pixels; smaller images are padded with black at the bottom and right.
 
     Returns:
-        [N, size, size, 3] uint8 and [N, size, size] bool.
+        Images [N, size, size, 3] uint8 and masks [N, size, size] bool.
     """
     images = np.zeros((count, size, size, 3), np.uint8)
     masks = np.zeros((count, size, size), bool)
@@ -83,7 +83,20 @@ def crops(examples: list[Example], rng: np.random.Generator, count: int, size: i
 
 @functools.partial(jax.jit, static_argnames=("settings", "dtype"), donate_argnums=0)
 def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.Array], settings: Settings, dtype: Any):
-    """One update: generator, its average, discriminator (None for segmentation), and the optimiser's states of both."""
+    """Perform one update, on an augmented batch.
+
+    Args:
+        state: Parameters of the generator, their average, parameters of the discriminator (None for segmentation), and the
+            optimiser states of both; donated.
+        batch: Crops and their masks, see `crops`.
+        key: Typed key of the augmentation.
+        rates: Learning rate and decay rate of the average.
+        settings: Settings of the generator.
+        dtype: Compute dtype of the networks.
+
+    Returns:
+        The new state, and the losses by name.
+    """
     generator, average, discriminator, moments = state
     rate, share = rates
     images, masks = vary(batch[0], batch[1], key)
@@ -125,12 +138,12 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
 
 
 def _optimiser() -> optax.GradientTransformation:
-    # The rate is applied outside, as it follows the clock.
+    # The learning rate is applied outside, because it depends on the elapsed time.
     return optax.chain(optax.clip_by_global_norm(5.0), optax.adam(1.0, b1=0.5))
 
 
 def _initial(settings: Settings, crop: int, key: jax.Array) -> Any:
-    """Generator, its average, discriminator and the states of their optimisers."""
+    """Return the initial state of `_update`."""
     painter, judge = jax.random.split(key)
     blank = jnp.zeros((1, crop, crop, 3))
     generator = settings.generator(jnp.float32).init(painter, blank)
@@ -147,18 +160,18 @@ def train(
     """Train a generator.
 
     Args:
-        sources: Iterators over examples; each is read by a thread of its own.
-        settings: Settings of the generator, loss included.
-        plan: Schedule.
-        report: See `Report`.
+        sources: Iterators over examples, each read by its own thread.
+        settings: Settings of the generator, including its loss.
+        plan: Schedule of the training.
+        report: Callback for reports, see `Report`.
         every: Interval of reports, s.
 
     Returns:
-        The generator's parameters, averaged, and the number of updates.
+        The averaged parameters of the generator, and the number of updates.
 
     Raises:
-        NonFiniteError: A loss is not finite any more.
-        RequestError: The time was over before the first update.
+        NonFiniteError: A loss is no longer finite.
+        RequestError: The time limit was reached before the first update.
     """
     started = time.monotonic()
     rng = np.random.default_rng(plan.seed)

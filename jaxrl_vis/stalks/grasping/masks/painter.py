@@ -1,4 +1,4 @@
-"""Images to masks by a trained generator, and its weights in a file."""
+"""Inference of masks by a trained generator, and files of its weights."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from jaxrl_vis.stalks.grasping.perception.cloud import RED, redness
 
 Loss = Literal["gan", "segmentation"]
 SHIPPED = Path(__file__).with_name("stalks_segmentation.safetensors")
-"""Weights that come with the package: a plain segmentation, trained on synthetic stalks."""
+"""File of weights shipped with the package: a plain segmentation, trained on synthetic stalks."""
 SCHEMA = 1
 _COMMAND = "jaxrl-vis grasp train"
 
@@ -28,8 +28,8 @@ class Settings:
     """Settings of a generator.
 
     Attributes:
-        loss: Loss that it learned by: it paints, or gives logits.
-        channels: Channels of its levels.
+        loss: Loss of the training; with ``gan`` the generator paints images, with ``segmentation`` it returns logits.
+        channels: Channels of each level.
     """
 
     loss: Loss = "segmentation"
@@ -37,37 +37,42 @@ class Settings:
 
     @property
     def multiple(self) -> int:
-        """Divisor of the height and width of an image."""
+        """Number of which height and width of an image must be multiples, pixels."""
         return 2 ** len(self.channels)
 
     def generator(self, dtype: Any) -> Generator:
-        """The network."""
+        """Return the network, with convolutions computed in ``dtype``."""
         return Generator(self.channels, 3 if self.loss == "gan" else 1, dtype)
 
 
 _HINTS = fields.hints(Settings)
-_MAX_LEVELS = 10  # each of them halves the image
+_MAX_LEVELS = 10  # each level halves height and width
 
 
 def normalise(images: jax.Array) -> jax.Array:
-    """Images uint8 as float32 from -1 to 1."""
+    """Convert images from uint8 to float32 in -1 to 1."""
     return images.astype(jnp.float32) / 127.5 - 1.0
 
 
 def compute_dtype() -> Any:
-    """In which convolutions are computed on what JAX runs on."""
+    """Return the compute dtype of convolutions on JAX's default backend: bfloat16 on GPU and TPU, else float32."""
     return jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
 
 
 class Painter:
-    """Finds the pixels of stalks.
+    """Trained generator that segments the stalks of the near row.
 
     Attributes:
-        settings: Settings of its generator.
+        settings: Settings of the generator.
     """
 
     def __init__(self, params: Any, settings: Settings) -> None:
-        """Args: the generator's parameters, and what it is."""
+        """Initialise the painter; an image size is compiled when it is first used.
+
+        Args:
+            params: Parameters of the generator.
+            settings: Settings of the generator.
+        """
         self._params, self.settings = params, settings
         network = settings.generator(compute_dtype())
 
@@ -81,7 +86,7 @@ class Painter:
         self._paint = jax.jit(paint)
 
     def paint(self, image: np.ndarray) -> np.ndarray:
-        """Paint an image [H, W, 3] uint8: [H, W, 3] uint8, the image with its stalks in red."""
+        """Return a copy of an image [H, W, 3] uint8 with the stalks of the near row in red."""
         result = self._run(image)
         if self.settings.loss == "gan":
             return result
@@ -90,7 +95,7 @@ class Painter:
         return painted
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return True for the pixels of an image [H, W, 3] uint8 that show a stalk of the near row: [H, W] bool."""
+        """Return the mask [H, W] bool of the stalks of the near row in an image [H, W, 3] uint8."""
         result = self._run(image)
         return redness(result) > RED if self.settings.loss == "gan" else result
 
@@ -103,7 +108,14 @@ class Painter:
 def write_weights(
     path: Path, params: Mapping[str, Any], settings: Settings, about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16
 ) -> None:
-    """Write a generator: its parameters, with so many bits each (`write_parameters`), its settings, and its origin.
+    """Write the parameters and settings of a generator to a file.
+
+    Args:
+        path: File to write.
+        params: Parameters of the generator.
+        settings: Settings of the generator.
+        about: Further metadata, such as the origin of the weights.
+        bits: Bits per parameter, see `write_parameters`.
 
     Raises:
         OSError: The file cannot be written.
@@ -112,10 +124,10 @@ def write_weights(
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
-    """Read what `write_weights` wrote: parameters, settings, and where they come from.
+    """Read a file of `write_weights`: parameters, settings, and further metadata.
 
     Raises:
-        RequestError: There is no such file, or it holds no generator, or not the one that it speaks of.
+        RequestError: The file cannot be read, holds no generator of this version, or its parameters do not fit its settings.
     """
 
     def declare(about: dict[str, Any]) -> tuple[Settings, Any]:
@@ -135,7 +147,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
 
 @functools.lru_cache(maxsize=4)
 def declared(settings: Settings) -> Any:
-    """Shapes of the parameters of a generator: nested dictionaries, nothing of which is computed."""
+    """Return the shapes and dtypes of a generator's parameters as nested dictionaries, without computing any."""
     image = jax.ShapeDtypeStruct((1, settings.multiple, settings.multiple, 3), jnp.float32)
     generator = settings.generator(jnp.float32)
     return jax.eval_shape(lambda key: generator.lazy_init(key, image), jax.random.key(0))

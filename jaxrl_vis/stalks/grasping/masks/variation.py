@@ -1,7 +1,7 @@
-"""The same crop under another light, of other colours and textures, leaning and larger: what a mask must not depend on.
+"""Augmentation of crops: light, colours, textures, lean and scale, which a mask must not depend on.
 
-A network that has only seen one family of plants takes its colours and its brightness for what makes a stalk; in a family with
-other ones it then misses half of the pixels. What is drawn here is general: no value is taken from a shifted family.
+A network trained on one family of plants relies on its colours and brightness; in a family with others it misses half of the
+pixels. The augmentation is generic: none of its values is taken from a shifted family.
 """
 
 import math
@@ -9,22 +9,22 @@ import math
 import jax
 import jax.numpy as jnp
 
-_AS_IT_IS = 0.2  # of all crops
-_TAPS = 4  # pixels, of the blur
+_AS_IT_IS = 0.2  # fraction of crops that are only mirrored
+_TAPS = 4  # radius of the blur's kernel, pixels
 
 
 def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Crops with other exposure, contrast, colours, textures, blur, noise, scale and lean, half of them mirrored.
+    """Augment crops in exposure, contrast, colour, texture, blur, noise, scale and lean, and mirror half of them.
 
-    How much is changed is drawn for each crop; a fifth is only mirrored.
+    The strength is sampled per crop; for a fifth of them, it is 0, except for mirroring and a negligible blur.
 
     Args:
         images: [N, H, W, 3] uint8.
         masks: [N, H, W] bool.
-        key: For the random numbers.
+        key: Typed key, [].
 
     Returns:
-        The same, varied: [N, H, W, 3] uint8 and [N, H, W] bool.
+        Augmented images [N, H, W, 3] uint8 and masks [N, H, W] bool.
     """
     keys = dict(zip(("strength", "kept", "place", "texture", "colour", "light", "blur", "noise"), jax.random.split(key, 8)))
     count = len(images)
@@ -43,7 +43,7 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
 
 
 def _moved(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Crops scaled, stretched, sheared and mirrored about their middles; what lies beyond their edges repeats these."""
+    """Scale, stretch, shear and mirror crops and masks about their centres, with edge pixels repeated beyond the edges."""
     count, height, width = masks.shape
     drawn = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
     size, wide, shear = jnp.exp(0.3 * strength * drawn[0]), jnp.exp(0.25 * strength * drawn[1]), 0.2 * strength * drawn[2]
@@ -66,13 +66,13 @@ def _moved(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Ar
 
 
 def _field(key: jax.Array, shape: tuple[int, ...], lines: int, columns: int, channels: int = 1) -> jax.Array:
-    """Smooth normal noise [N, H, W, channels] with so many lines and columns of independent values."""
+    """Sample smooth noise [N, H, W, channels]: normal values on a coarse grid of at least 2 x 2, upsampled linearly."""
     coarse = jax.random.normal(key, (shape[0], max(lines, 2), max(columns, 2), channels))
     return jax.image.resize(coarse, (*shape[:3], channels), "linear")
 
 
 def _textures(shape: tuple[int, ...], strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Brightness [N, H, W, 1] of blotches, fibres along stalks, bands across them, and dark speckles."""
+    """Sample brightness factors [N, H, W, 1]: blotches, fibres along stalks, bands across them, and dark speckles."""
     height, width = shape[1:3]
     names = ("blotches", "patches", "fibres", "bands", "speckles", "amounts")
     keys = dict(zip(names, jax.random.split(key, 6)))
@@ -86,13 +86,13 @@ def _textures(shape: tuple[int, ...], strength: jax.Array, key: jax.Array) -> ja
 
 
 def _coloured(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Other hues, saturation and casts, of the whole crop and of its parts."""
+    """Vary hue, saturation and colour cast of each crop, and the cast also within it."""
     count = len(values)
     keys = dict(zip(("hue", "grey", "cast", "parts"), jax.random.split(key, 4)))
     angle = 0.4 * strength * jax.random.normal(keys["hue"], (count, 1, 1, 1))
     grey = values.mean(axis=-1, keepdims=True)
     colour = values - grey
-    # A turn about the axis of greys: what is across it is the cross product with (1, 1, 1) / sqrt(3).
+    # Rotation about the grey axis (1, 1, 1) / sqrt(3), by the cross product with it.
     across = (jnp.roll(colour, 1, axis=-1) - jnp.roll(colour, -1, axis=-1)) / math.sqrt(3.0)
     colour = jnp.cos(angle) * colour + jnp.sin(angle) * across
     saturation = jnp.exp(strength * jax.random.uniform(keys["grey"], (count, 1, 1, 1), minval=-1.5, maxval=0.5))
@@ -101,7 +101,7 @@ def _coloured(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Arr
 
 
 def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Other gain, gamma, contrast and black level, and light that falls off towards some side or corner."""
+    """Vary gain, gamma, contrast and black level, and add an illumination gradient towards a side or corner."""
     count = len(values)
     gain, gamma, contrast, black, amount, ramp = jax.random.split(key, 6)
 
@@ -116,7 +116,7 @@ def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _blurred(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Blur by up to 1.3 pixels."""
+    """Apply a Gaussian blur with a standard deviation of up to 1.3 pixels."""
     deviation = jnp.maximum(1.3 * strength * jax.random.uniform(key, strength.shape), 0.05)
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation[:, None]) ** 2)
     taps = taps / taps.sum(axis=1, keepdims=True)

@@ -1,1 +1,1 @@
-"""Grasp points from stereo pairs and masks: point clouds, their stitching, and the stalks in them."""
+"""Grasp points from stereo pairs and masks: point clouds, their stitching, and detection of stalks in them."""

@@ -1,7 +1,7 @@
-"""A stereo pair and its mask as an organised point cloud.
+"""Organised point clouds from stereo pairs and masks.
 
 Robot frame: x along the row, 0 at the left camera; y away from the cameras, 0 at the left camera; z up, 0 at the ground. It
-follows from how the cameras are mounted, which is known but for the robot's own wobble.
+follows from the mount of the cameras, which is known up to the wobble of the robot.
 """
 
 import dataclasses
@@ -15,17 +15,17 @@ from jaxrl_vis_envs.plants.cameras import looking_along_y
 from jaxrl_vis_envs.plants.family import Rig
 
 RED = 0.5
-"""Redness from which a pixel counts as painted: red less the greater of green and blue, of 1."""
+"""Threshold of `redness` above which a pixel counts as painted."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mount:
-    """Mount of the pair of cameras, and the range of depths in which it is trusted.
+    """Mount of the stereo pair, and the range of depths in which it is trusted.
 
     Attributes:
         height: Height of the left camera above the ground, m.
-        pitch: By how much it looks down, degrees.
-        nearest, farthest: Planar depths, m. What lies farther away belongs to the next row.
+        pitch: Downward pitch of the cameras, degrees.
+        nearest, farthest: Minimum and maximum planar depth, m; points beyond belong to the next row.
     """
 
     height: float = 1.0
@@ -40,18 +40,18 @@ class Mount:
 
     @property
     def pose(self) -> Pose:
-        """The left camera in the robot frame."""
+        """Pose of the left camera in the robot frame."""
         return Pose(np.array([0.0, 0.0, self.height]), looking_along_y(math.radians(self.pitch)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Cloud:
-    """One organised cloud: every point has the pixel of the left image that it was seen in.
+    """Organised point cloud: one point for each pixel of the left image.
 
     Attributes:
-        points: [H, W, 3] float32, in the robot frame of its own pair, m; not a number where there is no depth.
-        depth: [H, W] float32, planar, m; not a number where there is none.
-        red: [H, W] bool, pixels that the mask says show a stalk.
+        points: [H, W, 3] float32, in the robot frame of its own pair, m; NaN where there is no depth.
+        depth: [H, W] float32, planar depth, m; NaN where there is none.
+        red: [H, W] bool, mask of stalks.
     """
 
     points: np.ndarray
@@ -59,22 +59,26 @@ class Cloud:
     red: np.ndarray
 
     def all_points(self) -> np.ndarray:
-        """[N, 3] float32, all points with a depth."""
+        """Return all points with a depth, [N, 3] float32, m."""
         return self.points[np.isfinite(self.depth)]
 
     def red_points(self) -> np.ndarray:
-        """[N, 3] float32, points of stalks."""
+        """Return the points of stalks with a depth, [N, 3] float32, m."""
         return self.points[self.red & np.isfinite(self.depth)]
 
 
 def redness(painted: np.ndarray) -> np.ndarray:
-    """Return the redness of pixels [..., 3] uint8: [...] float32, 1 for pure red, at most 0 for grey."""
+    """Return the redness of RGB pixels [..., 3] uint8: red minus the maximum of green and blue.
+
+    Returns:
+        [...] float32, 1 for pure red, 0 for grey, negative where green or blue exceed red.
+    """
     values = painted.astype(np.float32) / 255.0
     return values[..., 0] - np.maximum(values[..., 1], values[..., 2])
 
 
 def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: Mount) -> np.ndarray:
-    """Disparities of a whole pair, by semi-global matching.
+    """Compute the disparities of a whole pair by semi-global matching.
 
     Args:
         left, right: [H, W, 3] or [H, W] uint8, rectified.
@@ -82,13 +86,13 @@ def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: 
         mount: Mount of the pair, with the range of depths to search.
 
     Returns:
-        [H, W] float32, pixels; not a number where nothing matches.
+        [H, W] float32, pixels; NaN where nothing matches.
     """
     nearest, farthest = calibration.disparity(np.array([mount.nearest, mount.farthest]))
     low = math.floor(farthest)
     count = max(-(-(math.ceil(nearest) - low + 1) // 16) * 16, 16)
     grey = [image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
-    # Columns on the left that only the left camera sees would shorten the search of all others.
+    # Without padding, columns at the left edge could not be matched over the whole range of disparities.
     padded = [cv2.copyMakeBorder(image, 0, 0, low + count, 0, cv2.BORDER_CONSTANT) for image in grey]
     matcher = cv2.StereoSGBM_create(
         minDisparity=low,
@@ -107,15 +111,15 @@ def match(left: np.ndarray, right: np.ndarray, calibration: Calibration, mount: 
 
 _BLOCK = 5
 _SMALL_STEP, _LARGE_STEP = 4, 24
-"""Penalties for disparities that change by one pixel and by more, per pixel of a block."""
+"""Smoothness penalties for disparity changes of one pixel and of more, per pixel of a block."""
 
 
 def organised(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, mount: Mount) -> Cloud:
-    """The cloud of a pair.
+    """Build the organised cloud of a pair; depths outside the mount's range become NaN.
 
     Args:
-        disparity: [H, W] float32, pixels; not a number where there is none.
-        red: [H, W] bool, which pixels show stalks.
+        disparity: [H, W] float32, pixels; NaN where there is none.
+        red: [H, W] bool, mask of stalks.
         calibration: Calibration of the pair.
         mount: Mount of the pair.
     """
@@ -132,11 +136,14 @@ def organised(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, 
 
 
 def thinned(points: np.ndarray, size: float) -> np.ndarray:
-    """One point for each cube of a grid that holds any: the mean of those in it.
+    """Downsample points on a voxel grid: return the mean of the points in each occupied voxel.
 
     Args:
         points: [N, 3], m.
-        size: Size of a cube, m.
+        size: Edge of a voxel, m.
+
+    Returns:
+        [V, 3], m.
     """
     if not len(points):
         return points

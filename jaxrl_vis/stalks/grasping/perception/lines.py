@@ -1,8 +1,9 @@
-"""Grasp points from a line per stalk: what several pairs agree on.
+"""Grasp points from lines that are fitted to the stalk segments of several pairs.
 
-Pieces of stalks give lines; chords of all pairs that lie along a line belong to it, above and below what hides the rest; a
-stalk is a line that enough chords of enough pairs support. Its grasp point lies where most of it is seen, at a height at which
-the gripper works. Lines bend: half a metre below the grasp point a straight one is 12 mm beside the stalk, a bent one 2 mm.
+Lines are seeded by connected pieces of segments ("chords") and grown with the chords of all pairs that lie along them, above
+and below occlusions; a line is accepted as a stalk if enough chords of enough pairs support it. Its grasp point lies where most
+of it is visible, at a height at which the gripper works. Lines may be curved: half a metre below the grasp point, straight ones
+are 12 mm off the stalk, curved ones 2 mm.
 """
 
 import dataclasses
@@ -14,23 +15,23 @@ from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments
 from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 
 HEIGHTS = (0.45, 1.05)
-"""Heights at which stalks are grasped, m above the ground."""
+"""Minimum and maximum height of a grasp, m above the ground."""
 PREFERRED = 0.75
-"""The one that is taken if all are as good, m."""
+"""Preferred height of a grasp, m above the ground."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspPoint:
-    """One stalk that can be grasped.
+    """Grasp point on a detected stalk, with the line of the stalk.
 
     Attributes:
-        point: [3] float64, middle of the stalk where it is to be grasped, in the robot frame of the last pair, m.
-        direction: [3] float64, unit vector along the stalk there, upwards.
-        thickness: Diameter there, m; not a number where it was not measured.
-        frames: Number of pairs that show it.
-        spread: Standard deviation of what was seen around the line, horizontally, m; not a number where unknown.
-        bend: Curvature, x and y, per m.
-        taper: By how much its diameter grows for each m upwards, m.
+        point: [3] float64, centre of the stalk at the grasp, in the robot frame of the last pair, m.
+        direction: [3] float64, unit vector along the stalk at the grasp, upwards.
+        thickness: Diameter at the grasp, m; NaN if not measured.
+        frames: Number of pairs that show the stalk; 0 if unknown.
+        spread: RMS horizontal distance of the chords around the grasp from the line, m; NaN if unknown.
+        bend: Quadratic coefficients of x and y in the height above the grasp, 1/m: half the curvature.
+        taper: Change of the diameter per m of height, positive if it grows upwards.
     """
 
     point: np.ndarray
@@ -42,37 +43,37 @@ class GraspPoint:
     taper: float = 0.0
 
     def at_height(self, height: float | np.ndarray) -> np.ndarray:
-        """Return the positions of the stalk's line at heights [...] in m: [..., 3], m."""
+        """Return the points [..., 3] of the stalk's line at heights [...] above the ground, m."""
         up = np.asarray(height - self.point[2])[..., None]
         return self.point + self.direction * (up / self.direction[2]) + np.array([*self.bend, 0.0]) * up**2
 
     def thickness_at(self, height: float) -> float:
-        """Diameter at a height in m, m; no less than half of what it is at the grasp point."""
+        """Return the diameter at a height, m; at least half of that at the grasp point, NaN if not measured."""
         return max(self.thickness + self.taper * (height - self.point[2]), 0.5 * self.thickness)
 
 
-_LINE_RADIUS = 0.009  # m: chords so near a line belong to it
-_BENT_LENGTH = 0.3  # m: of a stalk that shows how it bends
-_USUAL_TAPER = -0.01  # m per m
-_OPENING = 0.03  # by how much more for each m beyond what is known of the line
-_MIN_PIECE = 0.03  # m
-_STEEPEST = 0.6  # m per m
-_BIN = 0.02  # m: heights that are counted as one
-_MIN_SUPPORT = 0.12  # m, over all pairs
-_WINDOW = 0.10  # m: above and below the grasp point
-_AROUND = 0.2  # m: above and below the grasp point pairs are asked what they show
-_MIN_SHOWN = 4  # places, of a pair that shows it
-_MIN_SHARE = 0.4  # of the pairs and places that show it or see through it
-_APART = 0.012  # m: lines that come nearer are one stalk
-_BEND = 0.04  # by how much more for each m between the heights at which they were seen
-_REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m
-_LEVEL = 0.002  # m: chords of one pair that differ less in height are of one line of its image
-_MIN_BESIDE, _SHARE_BESIDE = 20, 0.2  # chords that lie beside each other, of two stalks that do
-_APART_BESIDE = 0.008  # m
+_LINE_RADIUS = 0.009  # m: maximum distance of a chord from its line
+_BENT_LENGTH = 0.3  # m: minimum height range of chords for fitting curvature or taper
+_USUAL_TAPER = -0.01  # m per m: taper of stalks with a smaller height range
+_OPENING = 0.03  # growth of the maximum distance per m beyond the known part of a line
+_MIN_PIECE = 0.03  # m: minimum height range of a seed
+_STEEPEST = 0.6  # m per m: maximum slope of a line against the vertical
+_BIN = 0.02  # m: bin width of heights
+_MIN_SUPPORT = 0.12  # m: minimum visible length, summed over pairs
+_WINDOW = 0.10  # m: half height of the window around the grasp point for the local fit
+_AROUND = 0.2  # m: half height of the range around the grasp point in which visibility is queried
+_MIN_SHOWN = 4  # minimum number of places at which a pair must show a stalk
+_MIN_SHARE = 0.4  # minimum fraction of places that show the stalk among those that show it or see through it
+_APART = 0.012  # m: lines nearer than this are the same stalk
+_BEND = 0.04  # growth of that distance per m between the heights of their grasp points
+_REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m: nearer lines with a greater spread are leftovers of the other stalk
+_LEVEL = 0.002  # m: chords of one pair that differ less in height are in the same image row
+_MIN_BESIDE, _SHARE_BESIDE = 20, 0.2  # minimum number, and fraction, of chords of two distinct stalks that are side by side
+_APART_BESIDE = 0.008  # m: minimum median distance of such chords
 
 
 class _Line(NamedTuple):
-    """A line, the chords that it is made of, and how often pairs show it."""
+    """Grasp point of a line, indices of its chords, and number of places at which pairs show it."""
 
     point: GraspPoint
     members: np.ndarray
@@ -80,12 +81,12 @@ class _Line(NamedTuple):
 
 
 def grasp_points(chords: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
-    """Stalks and where to grasp them, from left to right.
+    """Detect stalks and return their grasp points, from left to right.
 
     Args:
-        chords: Segments of all pairs, in one robot frame.
-        visibility: Visibility of places in all pairs.
-        heights: Lowest and highest grasp, m above the ground.
+        chords: Segments of all pairs, in the robot frame of the last one.
+        visibility: Visibility of points in all pairs.
+        heights: Minimum and maximum height of a grasp, m above the ground.
     """
     free = np.ones(len(chords), bool)
     lines: list[_Line] = []
@@ -108,7 +109,7 @@ def grasp_points(chords: StalkSegments, visibility: Visibility, heights: tuple[f
 
 
 def _seeds(chords: StalkSegments) -> list[np.ndarray]:
-    """StalkSegments of each piece, tall pieces first."""
+    """Return the indices of the chords of each piece with at least 5, tall pieces first."""
     order = np.argsort(chords.piece, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(chords.piece[order])) + 1) if len(order) else []
     parts = [part for part in parts if len(part) >= 5]
@@ -116,18 +117,27 @@ def _seeds(chords: StalkSegments) -> list[np.ndarray]:
 
 
 def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
-    """Coefficients [K, 2] of x and y as polynomials of the height from the middle one, and that height."""
+    """Fit x and y as polynomials of the height relative to the mean height.
+
+    Args:
+        points: [N, 3], m.
+        weights: [N].
+        bent: Whether to fit a quadratic instead of a line.
+
+    Returns:
+        Coefficients [K, 2], constant term first, and the weighted mean height, m.
+    """
     middle = float(weights @ points[:, 2] / weights.sum())
     height = points[:, 2] - middle
     powers = np.stack([np.ones_like(height), height, height**2][: 3 if bent else 2], axis=1)
-    # Stalks are nearly straight: little is believed of a bend that a short piece shows.
+    # Stalks are nearly straight: regularise slope and curvature, which short pieces determine poorly.
     stiff = np.diag([0.0, 1e-4, 0.02][: powers.shape[1]]) * weights.sum() * 1e-2
     normal = powers.T @ (powers * weights[:, None]) + stiff
     return np.linalg.solve(normal, powers.T @ (points[:, :2] * weights[:, None])), middle
 
 
 def _offsets(points: np.ndarray, coefficients: np.ndarray, middle: float) -> np.ndarray:
-    """Horizontal distance [N] of points from a line."""
+    """Return the horizontal distances [N] of points [N, 3] from a line, m."""
     height = points[:, 2] - middle
     powers = np.stack([np.ones_like(height), height, height**2][: len(coefficients)], axis=1)
     return np.linalg.norm(points[:, :2] - powers @ coefficients, axis=1)
@@ -144,7 +154,7 @@ def _robust(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
 
 
 def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """All free chords along the line through some of them; none where that is no stalk."""
+    """Return the indices of all free chords along the line through ``members``; none if the line is too steep."""
     candidates = np.flatnonzero(free)
     points = chords.middle[candidates]
     for _ in range(6):
@@ -154,7 +164,7 @@ def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.nd
         if np.abs(coefficients[1]).max() > _STEEPEST:
             return members[:0]
         beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
-        # Further away than a stalk is long at the known bend, nothing is believed.
+        # Extrapolate by at most the known height range of the line, or 0.15 m.
         near = _offsets(points, coefficients, middle) < _LINE_RADIUS + _OPENING * beyond
         near &= beyond < max(0.15, 1.0 * (high - low))
         grown = candidates[near]
@@ -165,7 +175,7 @@ def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.nd
 
 
 def _support(chords: StalkSegments, members: np.ndarray) -> tuple[float, int]:
-    """Length that is seen, summed over pairs, in m, and the number of pairs that see at least two heights of it."""
+    """Return the visible length summed over pairs, m, and the number of pairs with chords in at least two height bins."""
     bins = np.floor(chords.middle[members, 2] / _BIN).astype(int)
     occupied = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
     frames, counts = np.unique(occupied[:, 0], return_counts=True)
@@ -189,7 +199,7 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
     x, y = local[0] + local[1] * (places[best] - middle)
     spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _LINE_RADIUS) ** 2)))
     thickness = float(np.median(chords.thickness[members[near]]))
-    # Where it goes from there, all of it says.
+    # Direction and curvature are fitted to the whole line.
     whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
     bend = whole[2] if len(whole) > 2 else np.zeros(2)
     direction = np.array([*(whole[1] + 2.0 * bend * (places[best] - middle)), 1.0])
@@ -205,7 +215,7 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
 
 
 def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
-    """By how much a diameter grows for each m upwards, m: from the lower half of what is seen to the upper one."""
+    """Estimate the change of the diameter per m of height from the medians of the lower and the upper half of the heights."""
     if np.ptp(heights) < _BENT_LENGTH:
         return _USUAL_TAPER
     upper = heights > 0.5 * (heights.min() + heights.max())
@@ -214,7 +224,10 @@ def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
 
 
 def _agreed(point: GraspPoint, visibility: Visibility) -> int:
-    """Count the places along a stalk's line at which pairs show it; 0 if fewer than two pairs do, or too many see through."""
+    """Count the places along a stalk's line at which pairs show it.
+
+    Return 0 unless at least two pairs (or the only one) show it, and few enough see through it.
+    """
     places = point.point[2] + np.arange(-_AROUND, _AROUND, 0.5 * _BIN)
     shown, through = visibility.query(point.at_height(places))
     count = int(shown.sum())
@@ -224,7 +237,7 @@ def _agreed(point: GraspPoint, visibility: Visibility) -> int:
 
 
 def _distinct(lines: list[_Line], chords: StalkSegments) -> list[_Line]:
-    """Without lines that are the same stalk as one before them."""
+    """Return the lines without those that are the same stalk as an earlier one."""
     distinct: list[_Line] = []
     for line in lines:
         if not any(_same(line.point, other.point) and not _beside(chords, line, other) for other in distinct):
@@ -233,15 +246,15 @@ def _distinct(lines: list[_Line], chords: StalkSegments) -> list[_Line]:
 
 
 def _same(point: GraspPoint, other: GraspPoint) -> bool:
-    """Return True if a line is probably the same stalk as another one that pairs show better."""
+    """Return True if a line is probably the same stalk as ``other``, which pairs show better."""
     up = point.point[2] - other.point[2]
     distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
-    # What is left of a stalk beside its line is near it, and scatters.
+    # Chords left over from a stalk form a second line nearby, with a large spread.
     return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
 
 
 def _beside(chords: StalkSegments, one: _Line, other: _Line) -> bool:
-    """Return True if pairs show two lines beside each other at the same heights: then they are two stalks, however near."""
+    """Return True if pairs show two lines side by side in the same image rows: these are distinct stalks, however near."""
     apart = [np.zeros(0)]
     for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
         mine, theirs = (chords.middle[line.members[chords.frame[line.members] == frame]] for line in (one, other))

@@ -1,7 +1,7 @@
-"""Five pairs to grasp points: match, paint, stitch, find.
+"""Perception of a run, from stereo pairs to grasp points: stereo matching, masks, stitching, and detection.
 
-pair -> disparity -> organised cloud, red where the mask says so
-     -> stitched to the last pair's frame, where the robot stands when it begins to grasp
+pair -> disparity -> organised cloud, red where the mask is True
+     -> stitched to the robot frame of the last pair, where the robot begins to grasp
      -> grasp points: a line per stalk, or the thesis's slices
 """
 
@@ -25,17 +25,17 @@ from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration
 
 Mask = Callable[[np.ndarray, int], np.ndarray]
-"""From a left image [H, W, 3] uint8 and the number of its pair to the mask of the stalks of the near row, [H, W] bool."""
+"""Function from a left image [H, W, 3] uint8 and the number of its pair to the mask of the near row's stalks, [H, W] bool."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """One pair that can be used.
+    """Images and odometry of one stereo pair.
 
     Attributes:
         number: Index of the pair in the run.
         left, right: [H, W, 3] uint8, rectified.
-        driven: Distance that the robot had driven, m; None if unknown.
+        driven: Distance driven so far, by odometry, m; None if unknown.
     """
 
     number: int
@@ -49,12 +49,12 @@ class Perception:
     """Perception of a run.
 
     Attributes:
-        clouds: One for each pair that was used, in its own robot frame.
-        stitches: One for each but the last: to the pair that follows.
-        to_last: One for each cloud: to the robot frame of the last one.
+        clouds: Cloud of each pair used, in its own robot frame.
+        stitches: Stitch of each pair but the last to the next one.
+        to_last: Motion of each cloud to the robot frame of the last pair.
         points: Grasp points, in the robot frame of the last pair, from left to right.
-        seconds: Time spent, by stage.
-        notes: Irregularities, a line each.
+        seconds: Time spent in each stage, over all pairs, s.
+        notes: Irregularities, one line each.
     """
 
     clouds: tuple[Cloud, ...]
@@ -65,17 +65,17 @@ class Perception:
     notes: tuple[str, ...]
 
     def red_points(self) -> np.ndarray:
-        """[N, 3] red points of all pairs, in the robot frame of the last one, m."""
+        """Return the points [N, 3] of stalks of all pairs, in the robot frame of the last one, m."""
         return np.concatenate([motion(cloud.red_points()) for motion, cloud in zip(self.to_last, self.clouds)])
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """Choice of the steps that follow the thesis in place of the default.
+    """Choice of the steps that follow the thesis instead of the default.
 
     Attributes:
-        stitch: The stitching of clouds.
-        points: The finding of grasp points.
+        stitch: Whether clouds are stitched as in the thesis.
+        points: Whether grasp points are detected as in the thesis.
     """
 
     stitch: bool = False
@@ -93,12 +93,14 @@ DEFAULT_VARIANT, THESIS_VARIANT = Variant(), Variant(True, True)
 def perceive(
     views: Iterable[View], mask: Mask, calibration: Calibration, mount: Mount, variant: Variant = DEFAULT_VARIANT
 ) -> Perception:
-    """Grasp points of a run.
+    """Detect the grasp points of a run.
+
+    If any pair lacks odometry, only the last one is used, unless clouds are stitched as in the thesis.
 
     Args:
-        views: The pairs in the order in which they were taken; at least one.
+        views: Pairs in the order in which they were taken; at least one.
         mask: Function that returns the mask of an image.
-        calibration: Calibration of the pair, as far as it is known.
+        calibration: Stated calibration of the pair.
         mount: Mount of the pair.
         variant: Steps that follow the thesis.
 
@@ -116,7 +118,7 @@ def perceive(
     with _threads(len(views)) as side_by_side:
         with clock("match"):
             matched = side_by_side(lambda view: match(view.left, view.right, calibration, mount), views)
-            # A network on an accelerator paints meanwhile.
+            # Matching runs in threads while the network computes masks, perhaps on an accelerator.
             with clock("mask"):
                 painted = [mask(view.left, view.number) for view in views]
             clouds = list(side_by_side(lambda disparity, red: organised(disparity, red, calibration, mount), matched, painted))
@@ -156,7 +158,10 @@ def _driven(here: View, there: View) -> float:
 
 @contextlib.contextmanager
 def _threads(pairs: int) -> Iterator[Callable[..., Iterator[Any]]]:
-    """`map` for so many pairs, in threads that begin at once: as many as OpenCV may use, or none where that is one."""
+    """Yield a `map` over pairs that runs in as many threads as OpenCV may use, or the built-in one if that is one.
+
+    The threaded one submits its calls immediately.
+    """
     threads = min(cv2.getNumThreads(), pairs)
     if threads < 2:
         yield map
@@ -166,7 +171,7 @@ def _threads(pairs: int) -> Iterator[Callable[..., Iterator[Any]]]:
 
 
 class _Clock:
-    """Adds up the time that is spent under its names; what is spent under an inner one does not count for the outer one."""
+    """Timer that accumulates the time spent in named stages; time in an inner stage does not count for the outer one."""
 
     def __init__(self, seconds: dict[str, float]) -> None:
         self._seconds, self._last = seconds, 0.0

@@ -1,8 +1,8 @@
-"""Grasp points as in the thesis: slices of the stitched cloud seen from above, dense spots grown into regions, their middles.
+"""Grasp points as in the thesis: centres of dense regions in slices of the stitched cloud, seen from above.
 
-The thesis states the height of a slice, 0.2 m, but nothing of the heat map's cells, smoothing and thresholds. Here a cell is
-1 cm, and a dense cell holds at least a quarter of what the densest tenth of the occupied cells hold. Points lie on the front of
-a stalk, and a region's middle is taken for the stalk's.
+The thesis states the height of a slice, 0.2 m, but not the heat map's cell size, smoothing and threshold. Here a cell is 1 cm,
+and a cell is dense if its smoothed count is at least a quarter of the 90th percentile over occupied cells. Points lie on the
+front of a stalk; the centre of a region is taken for that of the stalk.
 """
 
 import dataclasses
@@ -17,21 +17,21 @@ THICKNESS = 0.2
 """Thickness of a slice, m."""
 CELL = 0.01
 """Edge of a cell of the heat map, m."""
-_VOXEL = 0.005  # m: near stalks have more pixels, not more points
+_VOXEL = 0.005  # m: downsampling, so that the density of points does not depend on the distance
 _SHARE = 0.25
 _MIN_CELLS = 2
 
 
 @dataclasses.dataclass(frozen=True)
 class Slice:
-    """One slice, seen from above.
+    """Horizontal slice of a cloud, seen from above.
 
     Attributes:
         low: Height of its lower side, m.
-        corner: [2] x and y of the first cell's corner, m.
+        corner: [2], x and y of the first cell's corner, m.
         heat: [X, Y] float64, smoothed number of points in each cell.
-        regions: [X, Y] int, 0 where it is not dense, else the number of the region.
-        middles: [R, 3] float64, middle of each region, m.
+        regions: [X, Y] int, number of the region from 1; 0 for cells that are not dense.
+        middles: [R, 3] float64, centre of each region that is large enough, m.
     """
 
     low: float
@@ -42,7 +42,7 @@ class Slice:
 
 
 def slice_at(points: np.ndarray, low: float) -> Slice:
-    """The slice from ``low`` to 0.2 m above it of points [N, 3], m."""
+    """Return the slice of points [N, 3] (m) from the height ``low`` to `THICKNESS` above it."""
     inside = points[(points[:, 2] >= low) & (points[:, 2] < low + THICKNESS)]
     inside = thinned(inside, _VOXEL)
     if not len(inside):
@@ -65,10 +65,12 @@ def slice_at(points: np.ndarray, low: float) -> Slice:
 
 
 def slice_points(points: np.ndarray) -> list[GraspPoint]:
-    """Grasp points in the slice around the preferred height, from left to right.
+    """Detect grasp points in the slice around the preferred height, from left to right.
+
+    Directions are vertical; thickness and spread are NaN, and the number of pairs is 0.
 
     Args:
-        points: [N, 3] red points of all pairs, in the robot frame of the last one, m.
+        points: [N, 3], points of stalks of all pairs, in the robot frame of the last one, m.
     """
     middles = slice_at(points, PREFERRED - 0.5 * THICKNESS).middles
     upwards = np.array([0.0, 0.0, 1.0])

@@ -1,8 +1,8 @@
-"""Segments of image lines on stalks: the middle of each stalk in space, line by line.
+"""Segments of image rows on stalks ("chords"), and the 3D centre of the stalk at each.
 
-Line by line, painted pixels that are next to each other and about equally far away are one chord of a stalk. Its middle column
-says in which direction the stalk is, its depth how far its front is, and its length how thick it is, so that the middle of the
-stalk lies half a diameter behind its front.
+In each row, adjacent masked pixels of similar depth are one chord of a stalk. Its middle column gives the direction to the
+stalk, its depth the distance to the front, and its length the diameter, so that the centre of the stalk lies about half a
+diameter behind the front.
 """
 
 import dataclasses
@@ -15,24 +15,24 @@ from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount
 from jaxrl_vis_envs.plants import Calibration
 
 STEP = 3
-"""Each so-many-th line of the image is looked at."""
+"""Stride of the image rows that are processed."""
 
-_JUMP = 0.02  # m: pixels that differ more in depth are not one stalk
-_MIN_PIXELS = 3  # pixels
-_BEHIND_FRONT = 0.9  # of a radius: how far the middle lies behind what matching sees of the front
-_THICK = 0.035  # m: no stalk is
-_SIDEWAYS = 3.0  # pixels: by how much a stalk moves from one line to the next
+_JUMP = 0.02  # m: adjacent pixels whose depths differ by more are on different stalks
+_MIN_PIXELS = 3  # minimum length of a chord
+_BEHIND_FRONT = 0.9  # distance of the centre behind the matched front, relative to the radius
+_THICK = 0.035  # m: chords at least this long are not stalks
+_SIDEWAYS = 3.0  # pixels: maximum shift of a stalk from one processed row to the next
 
 
 @dataclasses.dataclass(frozen=True)
 class StalkSegments:
-    """StalkSegments of one image or of several.
+    """Chords of stalks in one pair or in several.
 
     Attributes:
-        middle: [N, 3] float64, middle of the stalk, m.
-        thickness: [N] float64, m.
-        frame: [N] int, which pair shows it.
-        piece: [N] int, chords with the same number follow each other without a gap in one pair.
+        middle: [N, 3] float64, centre of the stalk at each chord, m.
+        thickness: [N] float64, diameter of the stalk, m.
+        frame: [N] int, index of the pair.
+        piece: [N] int, number of the piece: chords of one pair that are connected from row to row.
     """
 
     middle: np.ndarray
@@ -45,7 +45,7 @@ class StalkSegments:
 
 
 def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> StalkSegments:
-    """The chords of one pair, in its own robot frame."""
+    """Return the chords of one pair, in its own robot frame; ``frame`` is the index of the pair."""
     red, depth = cloud.red[::STEP], cloud.depth[::STEP]
     with np.errstate(invalid="ignore"):
         jump = np.abs(np.diff(depth, axis=1)) > _JUMP
@@ -78,7 +78,7 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
 
 
 def joined(parts: list[StalkSegments]) -> StalkSegments:
-    """StalkSegments of several pairs, in one frame; pieces stay apart."""
+    """Concatenate the chords of several pairs, all in one robot frame; pieces are renumbered to stay distinct."""
     if not parts:
         return _nothing()
     counts = np.cumsum([0, *(int(part.piece.max(initial=-1)) + 1 for part in parts)])
@@ -95,21 +95,21 @@ def _nothing() -> StalkSegments:
 
 
 def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Median depth of the inner half of each chord; not a number where less than half of it has a depth."""
+    """Return the median depth of the inner half of each chord; NaN where less than half of it has a depth."""
     count = last - first + 1
     inner = np.maximum(count // 4, 0)
     begin, end = first + inner, last - inner + 1
     owner = np.repeat(np.arange(len(first)), end - begin)
     start = np.cumsum(end - begin) - (end - begin)
     values = depth[np.arange(len(owner)) + np.repeat(begin - start, end - begin)]
-    order = np.lexsort((values, owner))  # what is not a number comes last
+    order = np.lexsort((values, owner))  # NaN comes last
     valid = np.bincount(owner, np.isfinite(values), len(first)).astype(int)
     middle = values[order][np.minimum(start + valid // 2, len(values) - 1)]
     return np.where(2 * valid >= end - begin, middle, np.nan).astype(np.float64)
 
 
 def _pieces(line: np.ndarray, across: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Numbers the pieces that chords [N] make with those of the next line."""
+    """Return the number of the piece of each chord [N]: connected components over neighbouring rows."""
     count = len(line)
     ends = np.searchsorted(line, np.arange(line.max() + 3))
     one, other = [], []

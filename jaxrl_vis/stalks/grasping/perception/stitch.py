@@ -1,8 +1,9 @@
-"""Clouds of several pairs put together by iterative closest points (ICP).
+"""Registration of the clouds of successive pairs by iterative closest points (ICP).
 
-The thesis: from where the cloud lies, correspondences up to 0.15 m, on a grid of 3 cm. Vertical stalks some centimetres apart
-look alike, so that this settles a stalk or two aside. The default starts where odometry says, on a grid of 5 mm, and narrows
-correspondences from 0.15 to 0.05, 0.02 and 0.01 m; a result further from the odometry than its error allows is refused.
+The thesis starts from the identity, with correspondences up to 0.15 m, on a grid of 3 cm. Vertical stalks a few centimetres
+apart look alike, so that this converges one or two stalks off. The default starts from the odometry, on a grid of 5 mm, and
+narrows correspondences from 0.15 to 0.05, 0.02 and 0.01 m; results that differ more from the odometry than its error allows are
+refused.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, thinned
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """A rigid motion: p -> rotation p + shift.
+    """Rigid motion p -> ``rotation`` @ p + ``shift``.
 
     Attributes:
         rotation: [3, 3] float64.
@@ -29,15 +30,15 @@ class Motion:
 
     @classmethod
     def along(cls, distance: float) -> "Motion":
-        """A shift along the row, m."""
+        """Return a translation along the row by ``distance``, m."""
         return cls(np.eye(3), np.array([distance, 0.0, 0.0]))
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Points [..., 3], moved."""
+        """Apply the motion to points [..., 3], m."""
         return points @ self.rotation.T + self.shift
 
     def after(self, first: "Motion") -> "Motion":
-        """First ``first``, then this."""
+        """Return the composition: ``first``, then this motion."""
         return Motion(self.rotation @ first.rotation, self.rotation @ first.shift + self.shift)
 
     def inverse(self) -> "Motion":
@@ -46,7 +47,7 @@ class Motion:
 
     @property
     def angle(self) -> float:
-        """By how much it turns, rad."""
+        """Angle of the rotation, rad."""
         return math.acos(min(max(0.5 * (float(np.trace(self.rotation)) - 1.0), -1.0), 1.0))
 
 
@@ -55,12 +56,13 @@ class Method:
     """Method of stitching clouds.
 
     Attributes:
-        voxel: Edge of the cubes of the grid, m.
-        gates: Greatest distance of corresponding points, m: one after the other.
-        steps: Most iterations with each gate.
-        most: About how many points of the moved cloud are used with each gate: evenly chosen.
-        from_odometry: Start where odometry says, and refuse what moves too far from there; else start where the cloud lies.
-        pixels: About how many pixels of a larger image are looked at: evenly chosen.
+        voxel: Edge of a voxel of the grid, m.
+        gates: Maximum distances of corresponding points, m, applied in this order.
+        steps: Maximum number of iterations with each gate.
+        most: Approximate number of points of the source cloud with each gate, evenly subsampled.
+        from_odometry: Whether to start from the odometry and refuse results that differ too much from it, and to weight
+            correspondences robustly; if not, start from the identity.
+        pixels: Approximate number of pixels of an image to use, evenly subsampled.
     """
 
     voxel: float
@@ -71,12 +73,12 @@ class Method:
     pixels: int = 1_000_000_000
 
     def after_first_gate(self) -> "Method":
-        """The same without its widest gate."""
+        """Return the method without its first, widest gate."""
         return dataclasses.replace(self, gates=self.gates[1:], most=self.most[1:])
 
 
 THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, most=(1_000_000,), from_odometry=False)
-# Wide gates only bring the clouds near enough for the next one: few points do.
+# Wide gates only bring the clouds near enough for the next one, for which few points suffice.
 DEFAULT = Method(
     voxel=0.005,
     gates=(0.15, 0.05, 0.02, 0.01),
@@ -90,7 +92,7 @@ _ODOMETRY_SHARE = 0.05
 _WOBBLE = 0.03  # m
 _TURN = math.radians(3.0)
 _MIN_OVERLAP = 0.2
-_STILL = 0.01  # of the gate, m, and the same in rad: what moves less has arrived
+_STILL = 0.01  # tolerance of convergence relative to the gate, for translation in m and rotation in rad
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,9 +101,9 @@ class Stitch:
 
     Attributes:
         motion: From the robot frame of one pair to that of the next one.
-        residual: Root mean square distance of corresponding points, m; not a number where there are none.
-        overlap: Share of points that have a correspondence within the last gate.
-        refused: Why the result was not used; empty where it was. The motion is then what odometry says.
+        residual: Root mean square distance of corresponding points, m; NaN if there are too few.
+        overlap: Fraction of points with a correspondence within the last gate.
+        refused: Reason why the result was refused and `motion` is that of the odometry; empty if it was not.
     """
 
     motion: Motion
@@ -111,34 +113,39 @@ class Stitch:
 
 
 class Thinned:
-    """A cloud on the grid of a method.
+    """Cloud downsampled on the grid of a method.
 
     Attributes:
         points: [N, 3], m.
     """
 
     def __init__(self, points: np.ndarray, method: Method = DEFAULT) -> None:
-        """Args: points [N, 3], m, and how they are to be stitched."""
+        """Downsample points.
+
+        Args:
+            points: [N, 3], m.
+            method: Method of stitching, which determines the grid.
+        """
         self.points = thinned(points, method.voxel)
 
     @classmethod
     def of(cls, cloud: Cloud, method: Method = DEFAULT) -> "Thinned":
-        """That of an organised cloud."""
+        """Downsample an organised cloud, from about ``method.pixels`` of its pixels."""
         part = slice(None, None, max(math.isqrt(cloud.depth.size // method.pixels), 1))
         return cls(cloud.points[part, part][np.isfinite(cloud.depth[part, part])], method)
 
     @functools.cached_property
     def tree(self) -> cKDTree:
-        """For the nearest neighbours. Points on a grid need no balance, which takes longer than it saves."""
+        """Search tree for nearest neighbours; not balanced, because on a grid that takes longer than it saves."""
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
 def stitch(source: Thinned, target: Thinned, driven: float, method: Method = DEFAULT) -> Stitch:
-    """Lays the cloud of one pair on the cloud of the next.
+    """Register the cloud of one pair with that of the next.
 
     Args:
-        source, target: Points in the robot frame of their own pair.
-        driven: Distance that the robot moved along the row in between, m, by its odometry.
+        source, target: Clouds of the pair and the next one, each in its own robot frame.
+        driven: Distance that the robot drove along the row between the pairs by its odometry, m.
         method: Method of stitching.
     """
     prior = Motion.along(-driven)
@@ -148,15 +155,15 @@ def stitch(source: Thinned, target: Thinned, driven: float, method: Method = DEF
     motion, residual, overlap = closest_points(source.points, target, start, method)
     refused = _why_refused(motion, prior, driven, overlap) if method.from_odometry else ""
     if refused and len(method.gates) > 1:
-        # Where little overlaps, what one pair alone sees drags a wide gate aside; odometry may be near enough for the next one.
+        # With little overlap, points of one pair alone bias the widest gate; the odometry may be good enough for the next one.
         motion, residual, overlap = closest_points(source.points, target, start, method.after_first_gate())
         refused = _why_refused(motion, prior, driven, overlap)
     return Stitch(prior if refused else motion, residual, overlap, refused)
 
 
 def _why_refused(motion: Motion, prior: Motion, driven: float, overlap: float) -> str:
-    """Why odometry rules the result out; empty where it does not."""
-    # At the row, which is about as far from the cameras as they are high: turning moves what is there.
+    """Return the reason to refuse a result, by overlap and odometry; empty to accept it."""
+    # Compare displacements at a point of the row, so that rotations count as well.
     place = np.array([0.0, 0.6, 0.8])
     moved = float(np.linalg.norm(motion(place) - prior(place)))
     allowed = _ODOMETRY_SHARE * abs(driven) + _WOBBLE
@@ -170,16 +177,17 @@ def _why_refused(motion: Motion, prior: Motion, driven: float, overlap: float) -
 
 
 def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: Method) -> tuple[Motion, float, float]:
-    """Iterative closest points.
+    """Register points with a cloud by iterative closest points.
 
     Args:
-        source: [N, 3], m.
-        target: Cloud that they are laid on.
-        start: Motion to begin with.
+        source: [N, 3], points to move, m.
+        target: Cloud to register with.
+        start: Initial motion.
         method: Gates and steps.
 
     Returns:
-        The motion, the root mean square distance of corresponding points in m, and the share of points that have one.
+        The motion, the root mean square distance of corresponding points (m; NaN for fewer than 6), and the fraction of points
+        with a correspondence.
     """
     motion, residual, overlap = start, math.nan, 0.0
     for gate, most in zip(method.gates, method.most):
@@ -193,7 +201,7 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
             if close.sum() < 6:
                 return motion, math.nan, overlap
             residual = math.sqrt(float(np.mean(distance[close] ** 2)))
-            # What lies farther away than most weighs less: it is seen in one of the two pairs only.
+            # Distant correspondences weigh less: their points are probably visible in one of the two pairs only.
             weight = 1.0 / (1.0 + (distance[close] / (0.3 * gate)) ** 2) if method.from_odometry else np.ones(close.sum())
             step = rigid(moved[close], target.points[place[close]], weight)
             motion = step.after(motion)
@@ -203,7 +211,7 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
 
 
 def rigid(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> Motion:
-    """The rigid motion that brings points [N, 3] nearest to others [N, 3], by weighted least squares."""
+    """Return the rigid motion from points [N, 3] to corresponding ones [N, 3], by least squares with weights [N]."""
     share = weight / weight.sum()
     here, there = share @ source, share @ target
     left, _, right = np.linalg.svd(((source - here) * share[:, None]).T @ (target - there))

@@ -1,4 +1,4 @@
-"""Visibility of a place in all pairs: they show a stalk there, or see through it to something farther away."""
+"""Visibility of points in all pairs: pairs show a stalk at a point, or see through it to something farther away."""
 
 import dataclasses
 
@@ -8,17 +8,17 @@ from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount
 from jaxrl_vis.stalks.grasping.perception.stitch import Motion
 from jaxrl_vis_envs.plants import Calibration
 
-_SAME = 0.02  # m: a depth that differs less is that of the place
-_THROUGH = 0.035  # m: a depth that is greater by more lies behind it
+_SAME = 0.02  # m: a pixel whose depth differs by less shows the point
+_THROUGH = 0.035  # m: a pixel whose depth is greater by more sees through the point
 
 
 @dataclasses.dataclass(frozen=True)
 class Visibility:
-    """The clouds of a run, stitched.
+    """Visibility of points in the stitched clouds of a run.
 
     Attributes:
-        clouds: One for each pair, in its own robot frame.
-        to_last: One for each cloud: to the robot frame of the last one.
+        clouds: Cloud of each pair, in its own robot frame.
+        to_last: Motion of each cloud to the robot frame of the last pair.
         calibration: Calibration of the pair.
         mount: Mount of the pair.
     """
@@ -29,15 +29,15 @@ class Visibility:
     mount: Mount
 
     def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return True where a pair shows a stalk at a point, and True where it sees through the point.
+        """Return where pairs show a stalk at points, and where they see through them.
 
-        Neither is so where a point is outside the image, hidden by something nearer, or without a depth.
+        Both are False for points that are outside the image, occluded, or at pixels without depth.
 
         Args:
             points: [K, 3] in the robot frame of the last pair, m.
 
         Returns:
-            Two [F, K] bool.
+            Two [F, K] bool: shown, and seen through.
         """
         shown, through = np.zeros((2, len(self.clouds), len(points)), bool)
         for frame, (cloud, motion) in enumerate(zip(self.clouds, self.to_last)):

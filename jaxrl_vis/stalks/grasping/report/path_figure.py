@@ -1,4 +1,4 @@
-"""Figure 4.5: the way that the grip should have taken to a stalk, and the way that it took; in the plane and in height."""
+"""Figure 4.5: planned and actual path of the grip to a stalk, seen from above and as height and error over time."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from jaxrl_vis.stalks.grasping.arm.reach import ReachResult
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
 
-_HALF_WIDTH = 0.45  # m, of what is shown of the row
+_HALF_WIDTH = 0.45  # m, half the length of the row that is shown
 _PLANNED, _TAKEN, _HELD, _STALK = "#2b6cb0", "#dd6b20", "#2f855a", "#a0aec0"
 
 
@@ -23,9 +23,12 @@ def draw_path(path: Path, stands: Stands, targets: np.ndarray, result: ReachResu
     Args:
         path: A .png, or any other format that matplotlib can write.
         stands: Stands of the reaches.
-        targets: [B, 3], m in the plot's frame.
-        result: Their results.
-        index: Index of the reach.
+        targets: [B, 3], targets of the reaches, m in the plot's frame.
+        result: Results of the reaches.
+        index: Index of the reach to draw.
+
+    Raises:
+        OSError: The file cannot be written.
     """
     figure = Figure(figsize=(9.0, 5.4), dpi=150, facecolor="white")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.2, 1), hspace=0.35, wspace=0.25)
@@ -60,7 +63,7 @@ def draw_path(path: Path, stands: Stands, targets: np.ndarray, result: ReachResu
 
 
 def _draw_plane(axes: Axes, stands: Stands, result: ReachResult, index: int, target: np.ndarray) -> None:
-    """The plane of the target, seen from above: stalks at its height, the arm as it closes, and the two ways."""
+    """Draw the view from above at the target's height: stalks, the arm at the end of the reach, and both paths."""
     origin = stands.origin[index]
     knee, top = stands.knee[index], stands.top[index]
     share = (target[2] - knee[:, 2]) / (top[:, 2] - knee[:, 2])

@@ -1,4 +1,4 @@
-"""Figure 4.4 of the thesis, of a synthetic run: painted image, cloud, heat map of a slice, and grasp points."""
+"""Figure 4.4 of the thesis for a synthetic run: painted image, point cloud, heat map of a slice, and grasp points."""
 
 from pathlib import Path
 from typing import Any
@@ -12,20 +12,23 @@ from jaxrl_vis.stalks.grasping.perception.perceive import Mask, Perception, perc
 from jaxrl_vis.stalks.grasping.perception.slices import CELL, THICKNESS, slice_at
 from jaxrl_vis_envs.plants import Family
 
-_MAX_POINTS = 20_000  # points that are drawn
-_LOW, _HIGH = (-0.95, 0.3, 0.2), (0.55, 0.95, 1.4)  # m: corners of what is drawn
+_MAX_POINTS = 20_000  # points plotted per cloud
+_LOW, _HIGH = (-0.95, 0.3, 0.2), (0.55, 0.95, 1.4)  # m: corners of the plotted box
 _INK = "#333333"
 
 
 def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: str) -> Perception:
-    """Draw the figure.
+    """Render and perceive a synthetic run, and write the figure.
 
     Args:
-        out: The file, .png, .pdf or .svg.
-        family: Family that the row is drawn from.
+        out: Path of the figure, .png, .pdf or .svg.
+        family: Family that the row is sampled from.
         seed: Seed of the row.
         mask: Function that returns the mask of an image; None for true masks.
         name: Name of the masks, for the title.
+
+    Returns:
+        The perception of the run.
 
     Raises:
         OSError: The file cannot be written.
@@ -35,7 +38,7 @@ def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: s
     perception = perceive(scene.views, find, scene.drive.stated, scene.mount)
     figure = Figure(figsize=(13.0, 8.6), facecolor="white", layout="constrained")
     figure.suptitle(f"From a stereo pair to grasp points (simulated; family {family.name}, seed {seed}, masks: {name})")
-    # The layout does not know the labels of axes in three dimensions, so it leaves room for them.
+    # The constrained layout ignores the labels of 3D axes, so ``wspace`` leaves room for them.
     grid = figure.add_gridspec(2, 3, width_ratios=(1.0, 1.0, 1.25), wspace=0.1)
     _image(figure.add_subplot(grid[0, 0]), scene, perception)
     whole = np.concatenate([motion(cloud.all_points()) for motion, cloud in zip(perception.to_last, perception.clouds)])
@@ -78,12 +81,12 @@ def _cloud(axes: Any, whole: np.ndarray | None, red: np.ndarray, title: str, per
 
 
 def _shown(points: np.ndarray) -> np.ndarray:
-    """Points within the limits of the axes."""
+    """Return the points [N, 3] within the limits of the axes."""
     return points[((points > _LOW) & (points < _HIGH)).all(axis=1)]
 
 
 def _slice(above: Any, below: Any, red: np.ndarray, scene: Scene, perception: Perception) -> None:
-    """Heat map of a slice, its regions, their middles and those of the true stalks."""
+    """Draw the heat map of a slice ``above``, and its regions with their centres and those of the true stalks ``below``."""
     slice_ = slice_at(red, PREFERRED - 0.5 * THICKNESS)
     size = np.array(slice_.heat.shape) * CELL
     low, high = slice_.corner, slice_.corner + size

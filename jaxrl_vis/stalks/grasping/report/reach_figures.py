@@ -1,4 +1,4 @@
-"""Figures 4.5 and 4.6 of the thesis, of simulated runs: a planned path and the one taken; attempts and grasps of 16 runs."""
+"""Figures 4.5 and 4.6 of the thesis for simulated runs: planned and actual path; attempts and grasps of 16 runs."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,23 +24,23 @@ from jaxrl_vis_envs.plants import Family
 
 THESIS_RATIO, CORNBOT_SHARE = 0.7413, 43 / 48
 RUNS = 16
-"""Number of runs of figure 4.6, as many as the thesis has."""
+"""Number of runs in figure 4.6, as in the thesis."""
 _HELD, _OTHER, _LOST = "#2f855a", "#dd6b20", "#cbd5e0"
 
 
 def draw_reach(
     out: Path, family: Family, seed: int, mask: Mask | None, wind_mm: float, video: Path | None = None, size: int = 320
 ) -> None:
-    """Figure 4.5: the first attempt of a run that the arm is sent to; with ``video`` all of them, as the camera sees them.
+    """Draw figure 4.5 of the middle one of a run's attempts that are sent; with ``video``, also render all of these.
 
     Args:
-        out: The file of the figure.
-        family: Family that the row is drawn from.
-        seed: Seed of the row.
+        out: Path of the figure.
+        family: Family that the row is sampled from.
+        seed: Seed of the row and of the wind.
         mask: Function that returns the mask of an image; None for true masks.
         wind_mm: Amplitude of the stalks' sway, mm.
-        video: A .gif, .mp4 or .html file.
-        size: Height and width of its images, px.
+        video: Path of the video, .gif, .mp4 or .html; None for no video.
+        size: Height and width of the video's images without their header, px.
 
     Raises:
         RequestError: The video cannot be written, or the arm is not sent anywhere.
@@ -61,16 +61,16 @@ def draw_reach(
 
 
 def draw_evaluation(out: Path, evaluation: Path, seed: int, wind_mm: float) -> None:
-    """Figure 4.6, from a file that ``grasp eval --reach --json`` wrote; the arm finds stalks again on the way.
+    """Draw figure 4.6 from a file written by ``grasp eval --reach --json``, for reaches that detect stalks again on the way.
 
     Args:
-        out: The file of the figure.
-        evaluation: The file of records.
-        seed: Number of the first run.
+        out: Path of the figure.
+        evaluation: Path of the file of records.
+        seed: Seed of the first run; up to `RUNS` runs from it are shown.
         wind_mm: Amplitude of the stalks' sway in the wind, mm.
 
     Raises:
-        RequestError: The file is not such a file, or holds no such reaches.
+        RequestError: The file cannot be read, has another format, or holds no such runs or reaches.
         OSError: The figure cannot be written.
     """
     try:
@@ -92,14 +92,17 @@ def draw_evaluation(out: Path, evaluation: Path, seed: int, wind_mm: float) -> N
 
 
 def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, title: str) -> None:
-    """Figure 4.6: for each run how many stalks there were, how many were attempted, and how many grasped alone.
+    """Draw figure 4.6: numbers of stalks, attempts, and single grasps of each run.
 
     Args:
-        out: The file.
+        out: Path of the figure.
         records: Records of the runs.
-        name: Kind of reaches, as their records name it.
-        score: Their score.
-        title: Description of the simulation.
+        name: Kind of reaches, as named in the records.
+        score: Score of these reaches.
+        title: Description of the simulation, below the heading.
+
+    Raises:
+        OSError: The file cannot be written.
     """
     figure = Figure(figsize=(11.0, 5.6), dpi=150, facecolor="white")
     axes = figure.add_axes((0.07, 0.13, 0.58, 0.7))
@@ -123,14 +126,14 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
 
 
 def _counts(record: Record, name: str) -> tuple[int, int, int, int]:
-    """Stalks of a run, attempts sent, those that hold exactly their target, and stalks held in the other ones."""
+    """Count the stalks of a run, attempts sent, those that hold exactly their target, and stalks held in the others."""
     attempts = [attempt for attempt in attempts_in(record, name) if attempt.sent]
     alone = sum(attempt.outcome == "success" for attempt in attempts)
     return int(record["stalks"]), len(attempts), alone, sum(len(attempt.held) for attempt in attempts) - alone
 
 
 def _beside(figure: Figure, score: Score) -> None:
-    """The shares, with their intervals, and what the thesis and Cornbot report from fields."""
+    """Draw the success rates with their intervals, beside those that the thesis and Cornbot report from fields."""
     axes = figure.add_axes((0.76, 0.13, 0.21, 0.7))
     rows = [
         ("attempts:\ntarget held", score.of_sent),

@@ -1,4 +1,4 @@
-"""The arm at work, through a camera beside its mast, as a video of reaches one after the other."""
+"""Videos of reaches, one after the other, rendered from a camera beside the arm's mast."""
 
 import functools
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from jaxrl_vis_envs.plants.bending import Shape
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.render import Scene, render_planes
 
-_EVERY = 2  # points of a path to a frame
+_EVERY = 2  # points of a path per frame
 _HEADER = 34  # px
 
 
@@ -31,13 +31,13 @@ def write_reaches(
     Args:
         path: A .gif, .mp4 or .html file.
         stands: Stands of all reaches.
-        result: Their results.
-        targets: [B], index of the stalk that each was for.
+        result: Results of all reaches.
+        targets: [B], index of the stalk that each reach is for.
         chosen: Indices of the reaches to show.
-        size: Height and width of the image, px.
+        size: Height and width of the rendered image, without its header, px.
 
     Raises:
-        RequestError: The file cannot be written, or not in that format.
+        RequestError: The file cannot be written, or its format is not supported.
     """
     check_output(path)
     images, seconds = [], []
@@ -92,7 +92,7 @@ def _deed(time: float, held: set[int], is_alone: bool) -> str:
 
 
 def _captioned(frame: np.ndarray, left: str, right: str, colour: tuple[int, int, int]) -> Image.Image:
-    """A frame below a line of text; what is held has a colour."""
+    """Return the frame below a header with two captions; the right one has ``colour`` if it says what is held."""
     canvas = Image.new("RGB", (frame.shape[1], frame.shape[0] + _HEADER), BACKGROUND)
     canvas.paste(Image.fromarray(frame), (0, _HEADER))
     draw = ImageDraw.Draw(canvas)
