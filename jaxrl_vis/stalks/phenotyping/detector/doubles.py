@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 MAX_SHARED = 0.6
-"""Maximum overlap of the masks of two stalks, as a fraction of the smaller one: duplicates exceed it, touching stalks do not."""
+"""Maximum overlap of two stalks' masks, as a fraction of the smaller one: duplicates exceed it, touching stalks do not."""
 
 Piece = tuple[np.ndarray, tuple[int, int]]
 """Mask [h, w] of a part of the image, and the image row and column of its first pixel."""
