@@ -55,8 +55,8 @@ from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, float | None, PlotFolder, PairFiles], list[Detection]]
-"""Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row (None if unknown), and the folder and
-files it is from."""
+"""Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row (None if unknown), and its folder
+and files."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")

@@ -50,7 +50,10 @@ def find_frame(image: np.ndarray) -> Frame:
 
 
 def _extent(image: np.ndarray, lit: Any, axis: int) -> tuple[int, int]:
-    """Return the half-open range of rows (axis 0) or columns (axis 1) between the borders, from which of them are ``lit``."""
+    """Return the half-open range of rows (axis 0) or columns (axis 1) without the borders at both ends.
+
+    ``lit`` is True for rows or columns with any pixel that is not dark.
+    """
     size = lit.size
     if not lit.any():
         return 0, size

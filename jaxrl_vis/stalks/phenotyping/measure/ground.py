@@ -14,7 +14,7 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
 from jaxrl_vis_envs.plants import Calibration
 
-_FOCAL = 1084.0  # pixels, to which images are downscaled: the grain of the ground remains visible
+_FOCAL = 1084.0  # pixels: focal length of the downscaled images, in which the grain of the ground remains visible
 _WINDOW = (5, 41)  # height and width in the downscaled image: flat, as the depth of the ground changes from row to row
 _COLUMNS, _LINES = 32, 32  # numbers of windows horizontally and vertically
 _MIN_SCORE = 0.7

@@ -168,7 +168,7 @@ def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     """
     count, height, width = snips.shape[:3]
     keys = jax.random.split(key, 5)
-    # Internodes: index of each row's, out of four.
+    # Index of the internode, out of four, that each row belongs to.
     nodes = jnp.sort(jax.random.uniform(keys[0], (3, count)), axis=0) * height
     internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, lines]
     stripes = jnp.zeros(masks.shape)
