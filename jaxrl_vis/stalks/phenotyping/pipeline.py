@@ -1,14 +1,14 @@
-"""Folders of pairs to tables: `run` reads, finds, measures, follows and writes, and continues where it was stopped.
+"""Pipeline from folders of pairs to tables: `run` reads, detects, measures, tracks and writes, and resumes after interruption.
 
-    OUT/run.json                 what was asked for: a folder holds the results of one request
-        pairs/PLOT/PAIR.json     sightings, or why the pair was skipped, and of which files; not computed again while these are
-                                 the same, unless the pair was skipped
-        overlays/PLOT/PAIR.png   drawn again where they show something else; drawn.json says what they show
+    OUT/run.json                 the request; a folder holds the results of one request only
+        pairs/PLOT/PAIR.json     sightings, or why the pair was skipped, and the state of its source files; reused while these
+                                 are unchanged, unless the pair was skipped
+        overlays/PLOT/PAIR.png   rendered again if their contents change; drawn.json holds digests of the contents
         stalks.csv  plots.csv  skipped.csv
-        qc.html                  the same with pictures, and what was rejected
+        qc.html                  the same with images, and what was rejected
 
-Tables are always made from the files under pairs/, so they do not depend on when the command was stopped, nor on how many
-processes look at pairs. Each of them has one pair in memory at a time.
+Tables are always derived from the files under pairs/, so they depend neither on interruptions nor on the number of processes.
+Each process has one pair in memory at a time.
 """
 
 import dataclasses
@@ -55,7 +55,8 @@ from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, float | None, PlotFolder, PairFiles], list[Detection]]
-"""Finds the stalks in a left image [H, W, 3] uint8 with so many pixels per metre at the row; None if nobody knows."""
+"""Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row (None if unknown), and its folder
+and files."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")
@@ -63,17 +64,17 @@ SKIPPED_COLUMNS = ("plot", "pair", "why")
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """Request for the results of plots.
+    """Options of a run of the pipeline.
 
     Attributes:
-        out: Folder of the results.
-        method: Method of widths.
-        finder: Name of the detector; results of another one are not mixed with it.
-        calibrations: Calibration of each plot by its name; None where there is none.
-        speed: Speed of the robot, m/s, where only times are known.
+        out: Output folder.
+        method: Method of measuring widths.
+        finder: Name of the detector; results of different detectors are not mixed in one folder.
+        calibrations: Calibration of each plot by its name; None if it has none.
+        speed: Speed of the robot, m/s, for odometry with times only; None if unknown.
         disparity_scale: Divisor of disparities in 16-bit images.
-        tried: Range of lenses that the detector was tried on; None if any will do.
-        most_doubt: Doubt of the gate above which an image is unlike those that the networks know; None if there is no gate.
+        tried: Range of lenses on which the detector was validated; None to accept any.
+        most_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
     """
 
     out: Path
@@ -94,18 +95,18 @@ def run(
     workers: int = 1,
     say: Callable[[str, str], None] = lambda plot, why: None,
 ) -> tuple[list[Row], list[Row]]:
-    """Write the results of plots.
+    """Process plots and write their results, resuming from those that are already there.
 
     Args:
         plots: Folders of pairs.
-        find: Detector of stalks; with more than one worker it is pickled.
-        request: The request.
-        done: Called after each pair with the plot's name, how many of its pairs are done, and how many it has.
-        workers: Number of processes that look at pairs and draw overlays; 1 for this one.
-        say: Called for each plot without a count with its name and why it has none.
+        find: Stalk detector; must be picklable if there is more than one worker.
+        request: Options of the run.
+        done: Progress callback, called after each pair with the plot's name, and the numbers of finished and of all its pairs.
+        workers: Number of processes that measure pairs and render overlays; 1 to use the calling process.
+        say: Callback for each plot without a count, with its name and the reason.
 
     Returns:
-        The rows of plots.csv and of skipped.csv.
+        Rows of plots.csv, and rows of skipped.csv.
 
     Raises:
         RequestError: The folder holds other results, or a plot's odometry cannot be read.
@@ -149,7 +150,7 @@ def _run(
     say: Callable[[str, str], None],
     run_all: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
-    """Plot by plot; see `run`."""
+    """Process plots one by one; see `run`."""
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []
@@ -184,7 +185,7 @@ def _run(
 
 
 def _why_no_count(flag: str, frames: list[list[Sighting]], plot: PlotFolder, driven: dict[str, float] | None) -> str:
-    """Return more words than a plot's flag has on why it has no count; empty where there is no more to say."""
+    """Return an explanation beyond the flag of why a plot has no count; empty if there is none."""
     if flag == NO_ODOMETRY:
         return why_no_odometry(plot, driven, plot.pairs) or ""
     if PARTLY_SEEN in flag:
@@ -201,7 +202,7 @@ def _why_no_count(flag: str, frames: list[list[Sighting]], plot: PlotFolder, dri
 
 
 def _lens_fault(request: Request, frames: list[list[Sighting]], records: list[dict[str, Any]], name: str) -> str | None:
-    """Say in words why the lens of a plot is outside the range that was tried; None if it is within, or nothing is known."""
+    """Return a message on why the lens of a plot is outside the validated range; None if it is within, or if unknown."""
     calibration = request.calibrations[name]
     if request.tried is None or calibration is None or not records:
         return None
@@ -211,7 +212,10 @@ def _lens_fault(request: Request, frames: list[list[Sighting]], records: list[di
 
 
 def _is_whole(record: dict[str, Any]) -> bool:
-    """Return True for a record of sightings; a pair that was skipped is tried again."""
+    """Return True if a record is complete and valid.
+
+    Raises KeyError, TypeError or ValueError for others, including those of skipped pairs, which are tried again.
+    """
     lines, columns = record["size"]
     for values in record["sightings"]:
         Sighting.read(values)
@@ -219,25 +223,25 @@ def _is_whole(record: dict[str, Any]) -> bool:
 
 
 def _span(values: Any) -> tuple[Any, Any]:
-    """Return the first line or column of a record that shows anything, and one past the last."""
+    """Unpack the half-open range of visible rows or columns of a record."""
     first, last = values
     return first, last
 
 
 def _sources(pair: PairFiles, calibration: Calibration | None) -> dict[str, Any]:
-    """Return the state of everything that the record of a pair depends on, beside the request."""
+    """Return the state of everything besides the request that the record of a pair depends on."""
     return {**pair_state(pair), "calibration": None if calibration is None else value_digest(dataclasses.asdict(calibration))}
 
 
 def _record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Return the name of a pair, its record, and the state of the record's sources."""
     calibration = request.calibrations[plot.name]
-    sources = _sources(pair, calibration)  # before the files are read: they may be replaced meanwhile
+    sources = _sources(pair, calibration)  # before the files are read, as they may be replaced meanwhile
     return pair.name, _sightings_record(plot, find, request, pair), sources
 
 
 def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: PairFiles) -> dict[str, Any]:
-    """Return the record of a pair: its sightings, or why it was skipped."""
+    """Compute the record of a pair: its sightings, or the reason why it was skipped."""
     calibration = request.calibrations[plot.name]
     try:
         left, right = read_pair(pair, calibration, pair.disparity is None)
@@ -266,7 +270,7 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
 def _finish(
     plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, run_all: UnorderedMap
 ) -> PlotResult:
-    """Follow the stalks of a plot, and draw its overlays."""
+    """Track the stalks of a plot, compute its table rows, and render its overlays."""
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
     skipped = len(records) - len(usable)
     frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
@@ -301,7 +305,7 @@ def _finish(
 
 
 def _strange(request: Request, records: list[dict[str, Any]]) -> str:
-    """Say how many pairs of a plot are unlike what the networks know, where that is more than half; else an empty text."""
+    """Return a warning if more than half of the pairs of a plot are unfamiliar to the networks; else an empty string."""
     doubts = [record["doubt"] for record in records if record.get("doubt") is not None]
     if request.most_doubt is None or not doubts:
         return ""
@@ -321,7 +325,7 @@ def _draw_overlays(
     labels: list[list[str | None]],
     run_all: UnorderedMap,
 ) -> None:
-    """Write the overlays of a plot that are missing or show something else."""
+    """Write the overlays of a plot that are missing or outdated, and delete those of pairs that are no longer usable."""
     folder.mkdir(parents=True, exist_ok=True)
     index = folder / "drawn.json"
     shown = {pair.name: value_digest([record, names]) for (pair, record), names in zip(usable, labels)}
@@ -330,14 +334,14 @@ def _draw_overlays(
     except (FileNotFoundError, ValueError, TypeError):
         drawn = {}
     for name in drawn.keys() - shown.keys():
-        (folder / file_name(f"{name}.png")).unlink(missing_ok=True)  # of a pair that cannot be used any more
+        (folder / file_name(f"{name}.png")).unlink(missing_ok=True)  # of a pair that is no longer usable
     missing = [
         (folder / file_name(f"{pair.name}.png"), pair, [Sighting.read(values) for values in record["sightings"]], names)
         for (pair, record), names in zip(usable, labels)
         if drawn.get(pair.name) != shown[pair.name] or not (folder / file_name(f"{pair.name}.png")).exists()
     ]
     if drawn != shown:
-        # Before anything is drawn: what is drawn anew must not be taken for the old one, if this is stopped.
+        # Drop outdated digests before rendering, so that an interruption leaves no overlay with a wrong digest.
         current = {name: digest for name, digest in drawn.items() if digest == shown.get(name)}
         write_atomically(index, json.dumps(current) + "\n")
     for _ in run_all(functools.partial(_draw_overlay, plot), missing):
@@ -347,13 +351,13 @@ def _draw_overlays(
 
 
 def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
-    """Write the overlay of one pair."""
+    """Render and write the overlay of one pair."""
     target, pair, frame, names = asked
     write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
 
 
 def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
-    """Why the pairs of a plot cannot be put together."""
+    """Return a flag on why the stalks of a plot cannot be tracked."""
     if pairs == 0:
         return "no usable pairs"
     if calibration is None:
@@ -362,7 +366,7 @@ def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
 
 
 def sighting_labels(frames: list[list[Sighting]], tracks: list[Track]) -> list[list[str | None]]:
-    """The number of the stalk that each sighting shows, as in the table; None for those of stalks that do not count."""
+    """Return the number of the stalk of each sighting, as in the table; None for stalks that are not counted."""
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     for number, track in enumerate((track for track in tracks if track.counted), start=1):
         for frame, place in track.sightings:

@@ -1,8 +1,9 @@
-"""Finding stalks in an image and outlining them: a small Faster R-CNN on a reduced image, a U-Net on each find at full size.
+"""Detection and segmentation of stalks: a small Faster R-CNN on a downscaled image, a U-Net on full-resolution stalk crops.
 
-boxes       overlap, non-maximum suppression, RoIAlign: pure functions
-networks    backbone, proposals, heads, segmentation in flax        anchors    where stalks are looked for, and codes of boxes
-detect      an image -> stalks in the band around 12 inches         snips      strips along a stalk, cut out and put back
-losses      what the networks learn from                            weights    parameters in a file without pickle
-finder      all of it: image -> boxes and masks
+boxes               overlap, non-maximum suppression, RoIAlign: pure functions
+detector_networks   backbone, proposals, heads, segmentation in Flax    anchors   anchor boxes, and encoding of box offsets
+detect              image -> stalks in the band around 12 inches        weights   parameters in a file without pickle
+stalk_crops         crops along a stalk, cut out and pasted back        losses    training losses of the networks
+doubles             removal of duplicate detections by their masks      loading   detector from a weights file
+gate                probability that an image is misread                finder    whole pipeline: image -> boxes and masks
 """

@@ -1,8 +1,8 @@
-"""Anchors at which stalks are looked for, and codes of boxes relative to them.
+"""Anchor boxes, and encoding of stalks as box offsets (regression targets) relative to them.
 
-A stalk in the band is a box and an axis: six numbers, left, top, right, bottom, and the columns of its middle at the box's top
-and bottom. Coded relative to a box: offset of the middle (of its size), logarithm of both sizes, offsets of the axis (of its
-width).
+A stalk in the band is a box and an axis, six numbers: left, top, right, bottom, and the x coordinates of its centre line at the
+top and bottom of the box. Its offsets from a reference box are those of the centre (relative to the reference's size), the
+logarithms of the width and height ratios, and those of the axis (relative to the reference's width).
 """
 
 import jax
@@ -11,17 +11,17 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import ANCHOR_STRIDE
 
-_MAX_LOG_SIZE = 2.0  # of a logarithm of a size, so that nothing overflows
-_UNIT = np.array([0.2, 0.1, 0.3, 0.1, 0.3, 0.3], np.float32)  # about the spread of each code, so that all count alike
+_MAX_LOG_SIZE = 2.0  # clip of the log size ratio, against overflow
+_UNIT = np.array([0.2, 0.1, 0.3, 0.1, 0.3, 0.3], np.float32)  # approximate standard deviations of the offsets
 
 
 def make_anchors(shape: tuple[int, int], heights: float, widths: tuple[float, ...]) -> np.ndarray:
-    """Anchors [K, 6] float32 of an image of ``shape`` (lines, columns), in the order of `Detector.propose`.
+    """Return the anchors [K, 6] float32 of an image, in the order of `Detector.propose`.
 
     Args:
-        shape: Multiples of the networks' padding.
-        heights: Height of all anchors, pixels: the band's.
-        widths: Widths of the anchors of a place, pixels.
+        shape: Height and width of the image, multiples of `PADDING`.
+        heights: Height of all anchors (that of the band), pixels.
+        widths: Widths of the anchors at each location, pixels.
     """
     lines, columns = (-(-length // stride) for length, stride in zip(shape, ANCHOR_STRIDE))
     y = (np.arange(lines) + 0.5) * ANCHOR_STRIDE[0]
@@ -32,7 +32,7 @@ def make_anchors(shape: tuple[int, int], heights: float, widths: tuple[float, ..
 
 
 def encode(stalks: jax.Array, others: jax.Array) -> jax.Array:
-    """Codes [..., 6] of stalks [..., 6] relative to others [..., 6]."""
+    """Encode stalks [..., 6] as box offsets [..., 6] relative to the reference boxes ``others`` [..., 6]."""
     middle, size = _middle_and_size(others)
     own_middle, own_size = _middle_and_size(stalks)
     axis = (stalks[..., 4:] - others[..., 4:]) / size[..., :1]
@@ -40,7 +40,7 @@ def encode(stalks: jax.Array, others: jax.Array) -> jax.Array:
 
 
 def decode(codes: jax.Array, others: jax.Array) -> jax.Array:
-    """The inverse of `encode`."""
+    """Decode box offsets [..., 6] to stalks [..., 6]; inverse of `encode`, up to the clipping of sizes."""
     codes = codes * _UNIT
     middle, size = _middle_and_size(others)
     half = 0.5 * size * jnp.exp(jnp.clip(codes[..., 2:4], -_MAX_LOG_SIZE, _MAX_LOG_SIZE))
@@ -50,5 +50,5 @@ def decode(codes: jax.Array, others: jax.Array) -> jax.Array:
 
 
 def _middle_and_size(stalks: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the middles and sizes of the boxes of stalks [..., 6]: both [..., 2], across and down."""
+    """Return the centres (x, y) and sizes (width, height) of the boxes of stalks [..., 6], both [..., 2]."""
     return 0.5 * (stalks[..., :2] + stalks[..., 2:4]), jnp.maximum(stalks[..., 2:4] - stalks[..., :2], 1e-3)

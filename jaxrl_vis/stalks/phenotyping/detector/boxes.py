@@ -1,7 +1,7 @@
-"""Boxes: overlap, non-maximum suppression and RoIAlign as pure functions of arrays with static shapes.
+"""Box overlap, non-maximum suppression and RoIAlign as pure functions of arrays with static shapes.
 
-A box is (left, top, right, bottom) in continuous coordinates: the first pixel spans 0 to 1. Both operators return the numbers
-of torchvision.ops, recorded in tests/stalks/data/torchvision_boxes.npz by tests/stalks/make_torchvision_boxes.py.
+A box is (left, top, right, bottom) in continuous coordinates: the first pixel spans 0 to 1. NMS and RoIAlign are tested against
+outputs of torchvision.ops, recorded in tests/stalks/data/torchvision_boxes.npz by tests/stalks/make_torchvision_boxes.py.
 """
 
 import jax
@@ -9,12 +9,12 @@ import jax.numpy as jnp
 
 
 def area(boxes: jax.Array) -> jax.Array:
-    """Areas [...] of boxes [..., 4]; 0 for those that are turned inside out."""
+    """Compute the areas [...] of boxes [..., 4]; 0 for inverted boxes."""
     return jnp.prod(jnp.maximum(boxes[..., 2:] - boxes[..., :2], 0.0), axis=-1)
 
 
 def overlap(first: jax.Array, second: jax.Array) -> jax.Array:
-    """Intersection over union [N, M] of boxes [N, 4] and [M, 4]; 0 where both are empty."""
+    """Compute the intersection over union [N, M] of boxes [N, 4] and [M, 4]; 0 if both are empty."""
     low = jnp.maximum(first[:, None, :2], second[None, :, :2])
     high = jnp.minimum(first[:, None, 2:], second[None, :, 2:])
     common = jnp.prod(jnp.maximum(high - low, 0.0), axis=-1)
@@ -23,24 +23,27 @@ def overlap(first: jax.Array, second: jax.Array) -> jax.Array:
 
 
 def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: jax.Array | None = None) -> jax.Array:
-    """Greedy non-maximum suppression: the best goes first, and removes what overlaps it by more than a threshold.
+    """Apply greedy non-maximum suppression.
+
+    In descending order of score, each kept box removes those that overlap it by more than the threshold.
 
     Args:
         overlaps: [N, N] float32, symmetric.
-        scores: [N] float32; of equal ones, the first goes first.
-        threshold: Greatest overlap of two that are both kept.
-        valid: [N] bool, which of them there are; all if not given.
+        scores: [N] float32; ties are broken by the lower index.
+        threshold: Maximum overlap of two boxes that are both kept.
+        valid: [N] bool, False for padding; None if all are valid.
 
     Returns:
-        [N] bool: which are kept.
+        [N] bool, True for the boxes that are kept.
     """
     order = jnp.argsort(-scores, stable=True)
     there = jnp.ones(scores.shape, bool) if valid is None else valid[order]
     places = jnp.arange(scores.shape[0])
     better = (overlaps[order][:, order] > threshold) & (places[:, None] < places[None, :])  # [i, j]: i may remove j
 
-    # All at once, again and again: who is removed by those that are kept. What is right stays right, and each round makes at
-    # least the next one right; a few rounds do where one at a time takes as many steps as there are boxes.
+    # Fixed-point iteration over all boxes at once: a box is kept unless a kept box of higher score suppresses it. Each round
+    # settles at least the next box in order and never changes a settled one, so it converges to the sequential result, usually
+    # in a few rounds instead of N steps.
     def unsettled(state: tuple[jax.Array, jax.Array]) -> jax.Array:
         selected, before = state
         return (selected != before).any()
@@ -54,14 +57,15 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
 
 
 def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Array:
-    """Return the overlap of stalks, [N, M]: intersection over union of the strips that they are, not of their boxes.
+    """Compute the overlap [N, M] of stalks: intersection over union of their slanted strips instead of their boxes.
 
-    Boxes of two parallel stalks that lean overlap by half, though the stalks stand apart; strips do not. Both are compared at
-    the same heights of the band.
+    The boxes of two parallel leaning stalks can overlap by half although the stalks are apart; their strips do not. Strips are
+    compared at equal fractions of the height of each box, and the result is scaled by the vertical overlap of the boxes as a
+    fraction of the shorter one.
 
     Args:
-        first, second: [N, 6] and [M, 6] stalks: boxes, and columns of a stalk's middle at the top and at the bottom of its box.
-        lines: At how many heights.
+        first, second: Stalks [N, 6] and [M, 6]: boxes, and x coordinates of the axis at the top and bottom of the box.
+        lines: Number of heights at which strips are compared.
     """
     (low, high), (other_low, other_high) = _edges(first, lines), _edges(second, lines)
     common = jnp.minimum(high[:, None], other_high[None]) - jnp.maximum(low[:, None], other_low[None])
@@ -74,14 +78,14 @@ def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Arr
 
 
 def _edges(stalks: jax.Array, lines: int) -> tuple[jax.Array, jax.Array]:
-    """Columns of both edges of the strips of stalks [N, 6] at some heights, both [N, lines]."""
+    """Return the x coordinates of the left and right edges of the strips of stalks [N, 6], both [N, lines]."""
     middle = stalks[:, 4:5] + (stalks[:, 5:] - stalks[:, 4:5]) * (jnp.arange(lines) + 0.5) / lines
     half = strip_half_width(stalks)[:, None]
     return middle - half, middle + half
 
 
 def strip_half_width(stalks: jax.Array) -> jax.Array:
-    """Half the width [N] of the strips of stalks [N, 6]: a box is wider by what its stalk leans."""
+    """Return half the horizontal width [N] of the strips of stalks [N, 6]: that of the box without the shift of the axis."""
     wide = stalks[:, 2] - stalks[:, 0]
     return 0.5 * jnp.maximum(wide - jnp.abs(stalks[:, 5] - stalks[:, 4]), 0.1 * wide)
 
@@ -95,21 +99,21 @@ def roi_align(
     aligned: bool = False,
     lean: jax.Array | None = None,
 ) -> jax.Array:
-    """Features of each box on a grid of its own, by bilinear interpolation.
+    """Pool the features of each box to a grid of fixed size, by bilinear interpolation (RoIAlign).
 
     Args:
-        features: [H, W, C].
+        features: Feature map [H, W, C].
         boxes: [N, 4].
-        size: Lines and columns of the grid.
-        scale: From the boxes' coordinates to those of the features; (vertical, horizontal) where they differ.
-        samples: Points in each direction of a cell of the grid, of which the mean is taken.
-        aligned: The middle of the first feature lies at 0.5, as of the first pixel. If not, a box is at least one
-            feature wide and tall.
-        lean: [N], by how much more a box's bottom is moved to the right than its top, about its middle: a box that leans, of
-            which each line of the grid stays level. None for upright boxes.
+        size: Height and width of the grid.
+        scale: Factor from box coordinates to feature coordinates; (vertical, horizontal) if they differ.
+        samples: Sampling points per grid cell and direction, which are averaged.
+        aligned: Shift boxes by half a feature, so that the centre of the first feature lies at 0.5. If False, boxes are
+            enlarged to at least one feature in width and height.
+        lean: [N], horizontal shift of the bottom of a box relative to its top, in box coordinates: the box is sheared about its
+            centre, and the rows of the grid stay level. None for upright boxes.
 
     Returns:
-        [N, size[0], size[1], C].
+        Pooled features [N, size[0], size[1], C].
     """
     height, width = features.shape[:2]
     vertical, horizontal = scale if isinstance(scale, tuple) else (scale, scale)
@@ -117,7 +121,7 @@ def roi_align(
     scaled = boxes * jnp.array([horizontal, vertical, horizontal, vertical], boxes.dtype) - shift
 
     def weights(low: jax.Array, high: jax.Array, cells: int, length: int) -> jax.Array:
-        """Return the weights of ``length`` features in each cell: [..., cells, length] for low and high [...]."""
+        """Return interpolation weights [..., cells, length] of features in the cells between ``low`` and ``high`` [...]."""
         extent = high - low if aligned else jnp.maximum(high - low, 1.0)
         share = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
         place = low[..., None] + extent[..., None] * share
@@ -127,7 +131,7 @@ def roi_align(
         return weight.reshape(*low.shape, cells, samples, length).mean(axis=-2)
 
     lines = weights(scaled[:, 1], scaled[:, 3], size[0], height)
-    # Interpolation is separable. The lines go first: a stalk is taller than it is wide, so that leaves less to do.
+    # Interpolation is separable. Rows go first, as stalks are taller than wide: this reduces the work most.
     tall = jnp.einsum("nih,hwc->niwc", lines, features)
     if lean is None:
         return jnp.einsum("njw,niwc->nijc", weights(scaled[:, 0], scaled[:, 2], size[1], width), tall)

@@ -1,4 +1,4 @@
-"""From a reduced image to stalks: proposals, their features, and the head's judgement, all of static shape."""
+"""Detection of stalks in a downscaled image: proposals, region features and classification, all of static shape."""
 
 import dataclasses
 import functools
@@ -13,32 +13,32 @@ from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, roi_align,
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import PADDING, STRIDE, Detector
 
 GRID = (14, 7)
-"""Lines and columns of a region's features."""
+"""Height and width of the pooled features of a region."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Settings that are fixed with the weights, and stored beside them.
+    """Settings of the networks, stored with their weights.
 
     Attributes:
-        density: Pixels per metre at the row that an image is resized to before stalks are looked for; 0 for networks that
-            learned from images of unknown cameras, which are reduced to `width`.
-        width, lines: Size of such an image of the cameras of `density`, pixels. Images of unknown cameras are reduced to the
-            width; narrower ones stay as they are.
-        full_width: Width in pixels of the images in which snips have `snip_lines` and `snip_columns`; in images with fewer
-            pixels per metre they are smaller in proportion.
-        snip_lines, snip_columns: Size of a snip.
-        band_lines: Height of the band in an image that was reduced, pixels.
-        anchor_widths: Widths of the boxes that are proposed, pixels there.
-        channels, hidden: Sizes of the detector; see `networks.Detector`.
-        segmenter: Channels of the segmentation.
-        candidates: Number of the boxes with the best scores that are looked through for proposals. Most are copies of easy
-            stalks: among 480, two thirds of the stalks that were missed on crowded images had none.
-        proposals: Number of proposals that are judged.
-        most: Greatest number of stalks in an image.
-        proposal_threshold: Overlap of strips above which only one is proposed.
-        threshold: Overlap of strips above which two detections are one stalk.
-        least_score: Lowest score of a detection.
+        density: Resolution at the row to which images are resized before detection, pixels per metre; 0 for networks trained on
+            images of unknown cameras, which are resized to `width`.
+        width, lines: Width and height of a resized image of the training cameras, pixels. Images of unknown cameras are
+            downscaled to the width; narrower ones are not enlarged unless `density` is 0.
+        full_width: Image width in pixels at which stalk crops measure `snip_lines` x `snip_columns`; at fewer pixels per metre
+            they shrink in proportion.
+        snip_lines, snip_columns: Height and width of a stalk crop, pixels.
+        band_lines: Height of the band in the resized image, pixels.
+        anchor_widths: Widths of the anchors in the resized image, pixels.
+        channels, hidden: Sizes of the detector; see `detector_networks.Detector`.
+        segmenter: Channels of each level of the segmentation network.
+        candidates: Number of top-scoring boxes that enter the suppression of proposals. Most are duplicates of easy stalks:
+            with 480, two thirds of the stalks missed in crowded images had no candidate.
+        proposals: Number of proposals passed to the box head.
+        most: Maximum number of stalks in an image.
+        proposal_threshold: Strip overlap above which proposals are suppressed as duplicates.
+        threshold: Strip overlap above which detections are suppressed as duplicates.
+        least_score: Minimum score of a detection.
     """
 
     density: float = 677.5
@@ -60,29 +60,29 @@ class Settings:
     least_score: float = 0.05
 
     def resizing(self, width: int, density: float | None) -> float:
-        """Factor by which an image is resized before stalks are looked for.
+        """Return the factor by which an image is resized before detection.
 
         Args:
             width: Width of the image, pixels.
-            density: Pixels per metre at the row; None if nothing is known of the camera, which then is taken to see as wide a
-                part of the row as those that the networks learned from.
+            density: Pixels per metre at the row; None if the camera is unknown, which is then assumed to cover the same width
+                of the row as the training cameras.
         """
         return self.density / density if density and self.density else self.width / width
 
     def detector(self, dtype: Any = jnp.float32) -> Detector:
-        """The network that these settings describe."""
+        """Return the detector of these settings, with convolutions in ``dtype``."""
         return Detector(self.channels, self.hidden, len(self.anchor_widths), dtype)
 
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """Stalks in a reduced image, the best first; padded. Registered as a pytree.
+    """Stalks detected in a resized image, in descending order of score and padded. Registered as a pytree.
 
     Attributes:
-        stalks: [..., K, 6] float32, box and columns of the axis at its top and bottom, pixels.
+        stalks: [..., K, 6] float32, boxes, and x coordinates of the axis at the top and bottom of the box, pixels.
         scores: [..., K] float32, 0 to 1.
-        valid: [..., K] bool.
-        pooled: [2 C] float32, mean and standard deviation over the image of the backbone's C features; None where nobody asked.
+        valid: [..., K] bool, False for padding.
+        pooled: [2 C] float32, mean and standard deviation over the image of the C backbone channels; None if not computed.
     """
 
     stalks: jax.Array
@@ -95,21 +95,21 @@ jax.tree_util.register_dataclass(Found, ["stalks", "scores", "valid", "pooled"],
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
-    """Lines and columns, each up to the next multiple that the networks take."""
+    """Round a height and width up to multiples of `PADDING`."""
     lines, columns = (-(-length // PADDING) * PADDING for length in shape)
     return lines, columns
 
 
 def normalise(images: jax.Array) -> jax.Array:
-    """Images [..., 3] uint8 around 0, with dark parts spread: flash light falls off quickly."""
+    """Map images [..., 3] uint8 to float32 in [-1, 1]; a square root expands dark tones, as flash light falls off quickly."""
     return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
 
 
 def region_features(features: jax.Array, stalks: jax.Array) -> jax.Array:
-    """Features [R, *GRID, C] along stalks [R, 6] of an image whose features are [H, W, C].
+    """Pool features [H, W, C] of an image along stalks [R, 6] to [R, *GRID, C].
 
-    A region follows the axis, so that a stalk that leans stands upright in it: in a clump, two that lean differently have about
-    the same box. It holds some of what is beside the stalk, too, as a head judges by that.
+    A region follows the axis, so that a leaning stalk stands upright in it: in a clump, two stalks that lean differently have
+    nearly the same box. It includes some context on all sides, which the box head needs.
     """
     tall = jnp.maximum(stalks[:, 3] - stalks[:, 1], 1e-3)
     more = 0.08 * tall
@@ -124,17 +124,18 @@ def region_features(features: jax.Array, stalks: jax.Array) -> jax.Array:
 def best_proposals(
     logits: jax.Array, codes: jax.Array, anchors: jax.Array, settings: Settings, shape: tuple[int, int]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The best proposals of one image that are no copies of each other.
+    """Select the best proposals of one image after non-maximum suppression.
 
     Args:
-        logits: [K] of the anchors.
-        codes: [K, 6].
+        logits: Objectness logits [K] of the anchors.
+        codes: Box offsets [K, 6].
         anchors: [K, 6].
-        settings: Number of proposals, and the overlap of copies.
-        shape: Lines and columns of the image; what reaches beyond it is cut off.
+        settings: Number of proposals and the suppression threshold.
+        shape: Height and width of the image, to which proposals are clipped.
 
     Returns:
-        Stalks [P, 6], scores [P] float32 and which there are [P] bool, P = settings.proposals.
+        Proposals [P, 6], their logits [P] float32 (-inf for padding) and whether each is valid [P] bool, where P is
+        ``settings.proposals``, or less if there are fewer candidates.
     """
     count = min(settings.candidates, logits.shape[0])
     scores, places = jax.lax.top_k(logits, count)
@@ -148,7 +149,7 @@ def best_proposals(
 
 
 def within(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
-    """Stalks [N, 6] with their boxes cut off where an image of ``shape`` ends, and the axis where the box does."""
+    """Clip the boxes of stalks [N, 6] to an image of ``shape`` (height, width), and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = jnp.moveaxis(stalks, -1, 0)
     slope = (below - above) / jnp.maximum(bottom - top, 1e-3)
     first, last = jnp.clip(top, 0.0, shape[0]), jnp.clip(bottom, 0.0, shape[0])
@@ -159,7 +160,7 @@ def within(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
 def heads(
     network: Detector, params: Any, features: jax.Array, method: Literal["propose", "classify"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Logits and codes from one of the detector's heads."""
+    """Apply one of the heads of the detector and return its logits and box offsets."""
     logits, codes = network.apply(params, features, method=method)
     assert isinstance(logits, jax.Array) and isinstance(codes, jax.Array)
     return logits, codes
@@ -168,7 +169,7 @@ def heads(
 def judge(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
-    """Judge proposals [P, 6] of one image with features [H, W, C]: stalks, without duplicates."""
+    """Score and refine proposals [P, 6] of one image with features [H, W, C], and remove duplicates."""
     logits, codes = heads(network, params, region_features(features, proposals), "classify")
     stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
     valid = valid & (scores >= settings.least_score)
@@ -179,13 +180,13 @@ def judge(
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.float32) -> Found:
-    """Stalks in one image.
+    """Detect the stalks in one image.
 
     Args:
         params: Parameters of the detector.
-        image: [H, W, 3] uint8, reduced, padded to multiples of the networks' padding.
-        settings: Beside the weights.
-        dtype: In which convolutions are computed.
+        image: [H, W, 3] uint8, resized, and padded to multiples of `PADDING`.
+        settings: Settings of the networks; static under jit.
+        dtype: Compute dtype of the convolutions; static under jit.
     """
     network = settings.detector(dtype)
     shape = (image.shape[0], image.shape[1])
@@ -199,7 +200,7 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
 
 
 def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:
-    """Mean and standard deviation [2 C] float32 of features [h, w, C] where an image [H, W, 3] shows anything."""
+    """Compute mean and standard deviation [2 C] float32 of features [h, w, C] where the image [H, W, 3] is not black."""
     values = features.astype(jnp.float32)
     lit = image.any(axis=-1).reshape(values.shape[0], STRIDE[0], values.shape[1], STRIDE[1]).any(axis=(1, 3))
     weights = (lit / jnp.maximum(lit.sum(), 1))[..., None]
@@ -208,14 +209,14 @@ def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:
 
 
 def initial(settings: Settings, key: jax.Array) -> Any:
-    """Parameters of a detector that has learned nothing."""
+    """Initialise the parameters of a detector at random."""
     images = jax.ShapeDtypeStruct((1, 2 * PADDING, 2 * PADDING, 3), jnp.float32)
     regions = jax.ShapeDtypeStruct((1, *GRID, settings.channels[2]), jnp.float32)
-    # Lazily: parameters are drawn, and the network itself is not run, of which each operation would be compiled by itself.
+    # Lazily: this avoids running the network, whose operations would be compiled one by one.
     return settings.detector().lazy_init(key, images, regions)
 
 
 def pad(image: np.ndarray) -> np.ndarray:
-    """An image [h, w, 3] with lines and columns added below and on the right, in which there is nothing."""
+    """Pad an image [h, w, 3] with zeros at the bottom and on the right, to multiples of `PADDING`."""
     lines, columns = padded_shape(image.shape[:2])
     return np.pad(image, ((0, lines - image.shape[0]), (0, columns - image.shape[1]), (0, 0)))

@@ -1,7 +1,7 @@
-"""The networks: backbone, proposals, box head and segmentation. Images are [N, H, W, C], float32 or bfloat16.
+"""Flax networks: backbone, region proposals, box head and segmentation. Images are [N, H, W, C], float32 or bfloat16.
 
-Stalks are tall and thin, and stand side by side. So the features that boxes are found in are finer across the row than up and
-down, and kernels are taller than wide.
+Stalks are tall, thin, and side by side. So the feature map is finer horizontally than vertically, and kernels are taller than
+wide.
 """
 
 import flax.linen as nn
@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 
 STRIDE = (8, 4)
-"""Lines and columns of the image per feature of the backbone."""
+"""Vertical and horizontal stride of the backbone's feature map, pixels."""
 ANCHOR_STRIDE = (16, 4)
-"""The same per place at which boxes are proposed."""
+"""Vertical and horizontal stride of the anchors, pixels."""
 PADDING = 32
-"""Divisor of the height and width of an image."""
+"""Number of which the height and width of an image must be multiples."""
 
 
 class Block(nn.Module):
-    """Two convolutions beside a short cut."""
+    """Residual block of two convolutions with group normalisation."""
 
     channels: int
     kernel: tuple[int, int] = (3, 3)
@@ -26,7 +26,7 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Features [N, H, W, C]."""
+        """Apply the block to features [N, H, W, C]."""
         y = nn.Conv(self.channels, self.kernel, self.strides, dtype=self.dtype, use_bias=False)(x)
         y = nn.relu(nn.GroupNorm(num_groups=None, group_size=8, dtype=self.dtype)(y))
         y = nn.Conv(self.channels, self.kernel, dtype=self.dtype, use_bias=False)(y)
@@ -37,13 +37,13 @@ class Block(nn.Module):
 
 
 class Detector(nn.Module):
-    """Backbone and proposals, and the head that judges them.
+    """Two-stage detector: backbone, region proposals, and the box head that classifies and refines them.
 
     Attributes:
-        channels: Channels of the finest to the coarsest level; multiples of 8.
+        channels: Channels from the finest to the coarsest level; multiples of 8.
         hidden: Units of the box head.
-        anchors: Boxes that are proposed in each place.
-        dtype: In which convolutions are computed.
+        anchors: Number of anchors at each location.
+        dtype: Compute dtype of the convolutions.
     """
 
     channels: tuple[int, int, int, int] = (24, 48, 64, 64)
@@ -52,7 +52,7 @@ class Detector(nn.Module):
     dtype: jnp.dtype = jnp.float32
 
     def setup(self) -> None:
-        """Names the layers."""
+        """Define the layers."""
         first, second, third, fourth = self.channels
         self.stem = nn.Conv(first, (7, 7), (2, 2), dtype=self.dtype)
         self.fine = [Block(second, (3, 3), (2, 2), self.dtype), Block(second, dtype=self.dtype)]
@@ -70,7 +70,7 @@ class Detector(nn.Module):
         self.refine = nn.Dense(6, kernel_init=nn.initializers.normal(0.01), dtype=jnp.float32)
 
     def features(self, images: jax.Array) -> jax.Array:
-        """Images [N, H, W, 3], around 0, as features [N, H / 8, W / 4, C]."""
+        """Compute features [N, H / 8, W / 4, C] of images [N, H, W, 3], see `detect.normalise`."""
         x = nn.relu(self.stem(images.astype(self.dtype)))
         for block in (*self.fine, *self.middle):
             x = block(x)
@@ -84,13 +84,13 @@ class Detector(nn.Module):
         return self.merge(middle + _twice(up))
 
     def propose(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Objectness logits [N, K] and codes [N, K, 6] of all anchors, line by line."""
+        """Return objectness logits [N, K] and box offsets [N, K, 6] of all anchors, in row-major order."""
         x = nn.relu(self.tall(features))
         count = x.shape[0]
         return self.objectness(x).reshape(count, -1), self.offsets(x).reshape(count, -1, 6)
 
     def classify(self, regions: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Logits [R] and codes [R, 6] of regions [R, h, w, C]."""
+        """Return logits [R] and box offsets [R, 6] of pooled regions [R, h, w, C]."""
         x = regions.astype(self.dtype)
         for look in self.looks:
             x = nn.relu(look(x))
@@ -98,23 +98,26 @@ class Detector(nn.Module):
         return self.judge(x)[:, 0], self.refine(x)
 
     def __call__(self, images: jax.Array, regions: jax.Array) -> tuple[jax.Array, ...]:
-        """Everything once, to make parameters."""
+        """Run all parts once, for initialisation."""
         features = self.features(images)
         return (features, *self.propose(features), *self.classify(regions))
 
 
 class Segmenter(nn.Module):
-    """A small U-Net: snips [N, H, W, 3], around 0, to logits [N, H, W] of the stalk in the middle. H and W: multiples of 8."""
+    """Small U-Net from stalk crops [N, H, W, 3] (see `stalk_crops.smoothed`) to logits [N, H, W] of the stalk in the centre.
+
+    H and W must be multiples of 8.
+    """
 
     channels: tuple[int, ...] = (16, 32, 48, 64)
     dtype: jnp.dtype = jnp.float32
 
     @nn.compact
     def __call__(self, snips: jax.Array) -> jax.Array:
-        """Logits [N, H, W]."""
+        """Return mask logits [N, H, W] of stalk crops [N, H, W, 3]."""
         x = snips.astype(self.dtype)
         across = jnp.linspace(-1.0, 1.0, x.shape[2], dtype=self.dtype)
-        # Which stalk is meant is known from where it is: in the middle.
+        # The horizontal distance from the centre tells the network which stalk is meant.
         x = jnp.concatenate([x, jnp.broadcast_to(jnp.abs(across)[None, None, :, None], (*x.shape[:3], 1))], axis=-1)
         levels = []
         for depth, channels in enumerate(self.channels):
@@ -132,5 +135,5 @@ class Segmenter(nn.Module):
 
 
 def _twice(x: jax.Array) -> jax.Array:
-    """Each line and column twice."""
+    """Upsample by a factor of 2, by repeating each row and column."""
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)

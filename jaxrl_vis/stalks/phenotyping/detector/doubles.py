@@ -1,8 +1,7 @@
-"""Duplicate detections of a stalk, recognised by their masks.
+"""Removal of duplicate detections of a stalk by the overlap of their masks.
 
-In a clump the boxes of two detections of one stalk can be as different as those of two stalks that cross, so the detector keeps
-both. The masks of duplicates agree, as both show the one stalk that is there; those of two stalks share little, as a mask holds
-only the visible part.
+In a clump, the boxes of two detections of one stalk can differ as much as those of two crossing stalks, so the detector keeps
+both. Masks of duplicates agree, while those of different stalks overlap little, as a mask holds only the visible part.
 """
 
 from collections.abc import Sequence
@@ -10,22 +9,22 @@ from collections.abc import Sequence
 import numpy as np
 
 MAX_SHARED = 0.6
-"""Greatest share of the smaller mask's pixels in two stalks: duplicates share more, and stalks that touch share less."""
+"""Maximum overlap of two stalks' masks, as a fraction of the smaller one: duplicates exceed it, touching stalks do not."""
 
 Piece = tuple[np.ndarray, tuple[int, int]]
-"""A mask [h, w] in a part of the image, and line and column of its first pixel there."""
+"""Mask [h, w] of a part of the image, and the image row and column of its first pixel."""
 
 
 def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float = MAX_SHARED) -> np.ndarray:
-    """Return the detections to keep: the best goes first, and removes those whose masks it shares.
+    """Apply greedy non-maximum suppression by mask overlap.
 
     Args:
-        pieces: N masks, float32 from 0 to 1 or bool, and where they are.
-        scores: [N] of the detections; of equal ones, the first goes first.
-        most_shared: Share of the smaller of two masks above which they show the same stalk.
+        pieces: N masks, float32 from 0 to 1 (thresholded at 0.5) or bool, with their positions.
+        scores: Scores [N] of the detections; ties are broken by the lower index.
+        most_shared: Overlap as a fraction of the smaller mask above which two detections are duplicates.
 
     Returns:
-        [N] bool.
+        [N] bool, True for the detections to keep.
     """
     inside = [np.asarray(mask) >= 0.5 for mask, _ in pieces]
     sizes = [int(np.count_nonzero(mask)) for mask in inside]
@@ -40,7 +39,7 @@ def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared:
 
 
 def _shared(first: np.ndarray, corner: tuple[int, int], second: np.ndarray, other: tuple[int, int]) -> int:
-    """Pixels that are in both of two masks."""
+    """Count the pixels that two masks have in common."""
     low = np.maximum(corner, other)
     high = np.minimum(np.add(corner, first.shape), np.add(other, second.shape))
     if (high <= low).any():

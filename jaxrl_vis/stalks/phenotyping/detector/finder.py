@@ -1,4 +1,4 @@
-"""Stalks of an image with their masks: what the rest of phenotyping asks for."""
+"""Detection and segmentation of the stalks of an image: the interface of the detector to the rest of phenotyping."""
 
 import dataclasses
 import functools
@@ -19,24 +19,25 @@ from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, fi
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 
-_BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # snips that go through the network together
-_SHOWN = 0.5  # of a stalk's axis that must not lie on a border of the image
-_MAX_ENLARGED = 3.0  # beyond that, a stalk is three pixels wide and nothing tells it from others
-_STRETCH = 1.12  # by which images were stretched in training: so much taller or lower ones are nothing new to the networks
+_BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # stalk crops per batch
+_SHOWN = 0.5  # minimum fraction of a stalk's axis outside black borders
+_MAX_ENLARGED = 3.0  # at more, a stalk is only three pixels wide and cannot be recognised
+_STRETCH = 1.12  # range of stretching in training: the networks accept image heights within this factor
 
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """A stalk in the band.
+    """Stalk detected in the band.
 
     Attributes:
-        box: Left, top, right, bottom of its part in the band, pixels of the whole image; (0, 0) is the middle of the first one.
-        axis: Columns of its middle at the box's top and bottom.
-        score: 0 to 1.
-        mask: [h, w] float32 from 0 to 1, or bool: what shows it, in a part of the image.
-        corner: Line and column of the mask's first pixel.
-        upper: Mask and corner of a piece of it around 24 inches above the ground; None where the image does not show that.
-        strip: The edges of the mask; None where they are not known yet.
+        box: Left, top, right and bottom of its part in the band, pixels of the whole image; (0, 0) is the centre of the first
+            pixel.
+        axis: x coordinates of its centre line at the top and bottom of the box, pixels.
+        score: Score of the detector, 0 to 1.
+        mask: Mask [h, w] of its visible pixels in a part of the image, float32 from 0 to 1, or bool.
+        corner: Image row and column of the first pixel of the mask.
+        upper: Mask and corner of its segment around 24 inches above the ground; None if that is not in the image.
+        strip: Straight edges fitted to the mask; None if not fitted.
     """
 
     box: tuple[float, float, float, float]
@@ -49,11 +50,11 @@ class Detection:
 
 
 class Detections(list[Detection]):
-    """The stalks of an image.
+    """Stalks detected in an image.
 
     Args:
-        detections: The stalks.
-        doubt: See `Gate.doubt`; None where nobody knows.
+        detections: Detected stalks.
+        doubt: Estimated probability that the image is misread, see `Gate.doubt`; None if unknown.
     """
 
     def __init__(self, detections: Iterable[Detection] = (), doubt: float | None = None) -> None:
@@ -62,11 +63,11 @@ class Detections(list[Detection]):
 
 
 UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
-"""Distance of the upper height above the middle of the band, in heights of the band."""
+"""Distance from the middle of the band up to the upper height, as a multiple of the height of the band."""
 
 
 def higher_up(stalk: np.ndarray) -> np.ndarray:
-    """Box and axis [6] of a stalk's piece around the upper height, half as tall as its band [6], where the axis goes on."""
+    """Extrapolate a stalk [6] in the band along its axis to its segment [6] around the upper height, of half its height."""
     left, top, right, bottom, above, below = stalk
     tall = bottom - top
     middle = 0.5 * (top + bottom) - UPPER * tall
@@ -78,20 +79,23 @@ def higher_up(stalk: np.ndarray) -> np.ndarray:
 
 
 def resize_factor(width: int, settings: Settings, density: float | None) -> float:
-    """Factor by which `resize` resizes an image ``width`` pixels wide.
+    """Return the factor by which `resize` resizes an image ``width`` pixels wide.
 
-    It is enlarged only where its density is known, or where the networks learned from images that were.
+    An image is enlarged only if its ``density`` is known, or if the networks were trained on images of unknown cameras.
     """
     return min(settings.resizing(width, density), _MAX_ENLARGED if density or not settings.density else 1.0)
 
 
 def resize(image: np.ndarray, settings: Settings, density: float | None) -> tuple[np.ndarray, tuple[float, float]]:
-    """Resize an image [H, W, 3] uint8 as stalks are looked for in it; also return its lines and columns for each new one.
+    """Resize an image for detection.
 
     Args:
-        image: The image.
+        image: [H, W, 3] uint8.
         settings: Settings of the networks.
         density: Pixels per metre at the row; None if unknown.
+
+    Returns:
+        Resized image, and the vertical and horizontal scale factors from its coordinates to those of the original.
     """
     height, across = image.shape[:2]
     factor = resize_factor(across, settings, density)
@@ -103,14 +107,18 @@ def resize(image: np.ndarray, settings: Settings, density: float | None) -> tupl
 
 
 def usual_lines(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
-    """Cut or fill an image to the lines that the networks know; also return the number of lines added above, negative if cut.
+    """Crop or pad an image to the height of the training images.
 
-    Where stalks are looked for, they know the band by its place in the image, too. Through a lens of another field of view the
-    middle of the image is what the cameras of `Settings.width` show, so lines go or come above and below in equal parts.
+    The networks also recognise the band by its position in the image. With another field of view, the centre of the image is
+    what the training cameras show, so rows are removed or added (as zeros) equally at the top and bottom. Images whose height
+    is within the range of training are returned unchanged.
 
     Args:
-        image: [H, W, 3] uint8 with the pixels per metre of the settings.
+        image: [H, W, 3] uint8 at the ``density`` of the settings.
         settings: Settings of the networks.
+
+    Returns:
+        Image, and the number of rows added at the top, negative if cropped.
     """
     beyond = settings.lines - image.shape[0]
     if 1.0 / _STRETCH <= image.shape[0] / settings.lines <= _STRETCH:
@@ -122,15 +130,16 @@ def usual_lines(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]
 
 
 def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
-    """Stalks [N, 6] of a reduced image in the coordinates of the whole one."""
+    """Convert stalks [N, 6] from coordinates of the resized image to those of the original; ``scale`` as from `resize`."""
     return stalks * np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
 def segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
-    """Chances [N, h, w] float32 that pixels of snips [N, h, w, 3] uint8 show the stalk in the middle.
+    """Compute probabilities [N, h, w] float32 that pixels of stalk crops [N, h, w, 3] uint8 show the stalk in the centre.
 
-    Snips of another resolution are resized to the ``full`` size: the network knows stalks that are as many pixels wide there.
+    Crops are resized to the ``full`` size (height, width) for the network, and probabilities back to the size of the crops: the
+    network was trained on stalks of that width in pixels.
     """
     count, *shape = snips.shape[:3]
     enlarged = jax.image.resize(snips.astype(jnp.float32), (count, *full, 3), "linear")
@@ -140,17 +149,17 @@ def segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full:
 
 
 class Finder:
-    """Finds stalks with trained networks; compiled once for each size of image.
+    """Stalk detector with trained networks; compiled once per image size.
 
     Args:
-        params: With ``detector`` and ``segmenter``.
-        settings: Beside the weights.
-        least_score: Lowest score of a detection; 0.5 balances misses against false detections.
-        gate: Gate that says of each image how likely it is read wrongly; None where there is none for these weights.
+        params: Parameters with keys ``detector`` and ``segmenter``.
+        settings: Settings stored with the weights.
+        least_score: Minimum score of a detection; 0.5 balances misses against false detections.
+        gate: Gate that estimates how likely each image is misread; None if there is none for these weights.
 
     Attributes:
-        dtype: In which convolutions are computed.
-        gate: As given.
+        dtype: Compute dtype of the convolutions.
+        gate: Gate as passed to the constructor.
     """
 
     def __init__(self, params: Any, settings: Settings, least_score: float = 0.5, gate: Gate | None = None) -> None:
@@ -160,11 +169,11 @@ class Finder:
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
 
     def __call__(self, image: np.ndarray, density: float | None = None) -> Detections:
-        """Stalks of an image, from left to right, each of them once.
+        """Detect and segment the stalks of an image, sorted from left to right, without duplicates.
 
         Args:
             image: [H, W, 3] uint8.
-            density: Pixels per metre at the row; None if nothing is known of the camera.
+            density: Pixels per metre at the row; None if the camera is unknown.
         """
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), density, frame)
@@ -172,12 +181,15 @@ class Finder:
         return Detections((_moved(detection, frame) for detection in ordered), doubt=detections.doubt)
 
     def look(self, image: np.ndarray, density: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Look for stalks without outlining them: boxes and axes [N, 6] of all that have any score, scores [N], and the pooled
-        features [2 C] of the backbone.
+        """Detect stalks without segmenting them.
 
         Args:
-            image: [h, w, 3] uint8, without borders.
-            density: Pixels per metre at the row; None if nothing is known of the camera.
+            image: [h, w, 3] uint8, without black borders.
+            density: Pixels per metre at the row; None if the camera is unknown.
+
+        Returns:
+            Boxes and axes [N, 6] of all detections down to `Settings.least_score`, in continuous image coordinates, their
+            scores [N], and the pooled features [2 C] of the backbone.
         """
         settings = self._settings
         reduced, scale = resize(image, settings, density)
@@ -190,7 +202,7 @@ class Finder:
         return in_image(moved, scale), found.scores[found.valid], np.asarray(found.pooled)
 
     def _find(self, image: np.ndarray, density: float | None, frame: Frame) -> Detections:
-        """Stalks of an image [h, w, 3] uint8, in which a frame shows a scene."""
+        """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
         settings = self._settings
         share = settings.width / settings.full_width / settings.resizing(image.shape[1], density)
         stalks, scores, pooled = self.look(image, density)
@@ -222,12 +234,12 @@ class Finder:
     def _pieces(
         self, image: jax.Array, stalks: np.ndarray, lines: int, share: float
     ) -> list[tuple[np.ndarray, tuple[int, int]]]:
-        """Masks and their corners of the snips of stalks [N, 6], which have ``lines`` lines at full resolution."""
+        """Segment stalks [N, 6] in crops of ``lines`` rows at full resolution; return masks and their corners in the image."""
         snips = self._segment(image, stalks, lines, share)
         return [put_back(snip, stalk, (image.shape[0], image.shape[1])) for snip, stalk in zip(snips, stalks)]
 
     def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, share: float) -> np.ndarray:
-        """Masks [N, h, w] float32 of the snips of stalks [N, 6] in an image of a ``share`` of full resolution."""
+        """Compute masks [N, h, w] float32 of the crops of stalks [N, 6]; ``share`` is the resolution relative to full."""
         settings = self._settings
         full = (lines, settings.snip_columns)
         shape = snip_shape(full, share)
@@ -243,7 +255,7 @@ class Finder:
 
 
 def _is_shown(stalk: np.ndarray, frame: Frame) -> bool:
-    """Return True unless most of a stalk's axis [6] lies on a border."""
+    """Return whether more than half of the axis of a stalk [6] lies outside the black borders."""
     if frame.shown is None:
         return True
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
@@ -253,7 +265,7 @@ def _is_shown(stalk: np.ndarray, frame: Frame) -> bool:
 
 
 def _without_border(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
-    """Return a mask without the lines in which it reaches a border: the stalk may go on there."""
+    """Return a mask with the rows cleared in which it reaches a black border: the stalk may continue there."""
     if frame.shown is None or not mask.size:
         return mask
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
@@ -264,7 +276,7 @@ def _without_border(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> 
 
 
 def _moved(detection: Detection, frame: Frame) -> Detection:
-    """Return a detection in a frame at its place in the whole image."""
+    """Convert a detection from the coordinates of a frame to those of the whole image."""
     down, over = frame.lines[0], frame.columns[0]
     if not down and not over:
         return detection
@@ -280,10 +292,10 @@ def _moved(detection: Detection, frame: Frame) -> Detection:
 
 
 def _follow(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:
-    """Return a stalk's upper piece [6], by the edges of its mask in the band; None if it is not in the image."""
+    """Extrapolate a stalk to its upper segment [6] by the edges of its mask; None if outside the image or without edges."""
     if strip is None:
         return None
-    # Half a pixel: stalks are in continuous coordinates.
+    # Half a pixel from pixel centres to the continuous coordinates of stalks.
     axis = [0.5 * sum(strip.edges(line - 0.5 - corner[0])) + corner[1] + 0.5 for line in (stalk[1], stalk[3])]
     upper = higher_up(np.array([*stalk[:4], *axis], np.float32))
     return upper if upper[1] > 0 else None

@@ -1,8 +1,8 @@
-"""A gate that says of an image how likely the networks read it wrongly: what they do not know, and what they are not sure of.
+"""Gate: estimated probability that the networks misread an image, from novelty and uncertainty.
 
-Three numbers of an image decide: how far the pooled features of the backbone lie from those of images that were read rightly
-(Mahalanobis' distance along their principal axes, and what is left beside these axes), and the share of the scores that says
-neither yes nor no. A logistic regression weighs them; all of it is fitted on synthetic images (`benchmarks.stalks.gate`).
+Three measures of an image enter: the distance of the backbone's pooled features from those of images that were read correctly
+(Mahalanobis distance within the principal subspace, and the residual outside it), and the fraction of uncertain scores. A
+logistic regression combines them; everything is fitted on synthetic images (`benchmarks.stalks.gate`).
 """
 
 import dataclasses
@@ -17,23 +17,23 @@ from jaxrl_vis.host.weights_file import read_parameters, write_parameters
 from jaxrl_vis.stalks.digests import file_digest
 
 MEASURES = 3
-"""Numbers of an image that decide."""
+"""Number of measures of an image."""
 _COMMAND = "python -m benchmarks.stalks.gate"
 _PARTS = 5
-_UNSURE = 0.1  # scores below are of what is no stalk
+_UNSURE = 0.1  # lower scores are those of background
 
 
 @dataclasses.dataclass(frozen=True)
 class Gate:
-    """Statistics of images that were read rightly, and what follows from them.
+    """Statistics of correctly read images, and the logistic regression on the measures.
 
     Attributes:
-        mean: [D] float32, of pooled features; D is twice the number of the backbone's channels.
-        scale: [D] float32, standard deviation of each.
-        axes: [D, K] float32, principal axes, divided by the standard deviation along each.
-        beside: Standard deviation of what is left beside these axes.
-        weights: [1 + MEASURES] float32, offset and weights of the measures.
-        threshold: Doubt above which an image is told to be unlike those that the networks know.
+        mean: [D] float32, mean of the pooled features; D is twice the number of backbone channels.
+        scale: [D] float32, standard deviation of each feature.
+        axes: [D, K] float32, principal axes of the standardised features, divided by the standard deviation along each.
+        beside: Root mean square of the residual outside the principal subspace.
+        weights: [1 + MEASURES] float32, intercept and weights of the regression.
+        threshold: Doubt above which an image is reported as unfamiliar.
     """
 
     mean: np.ndarray
@@ -44,15 +44,15 @@ class Gate:
     threshold: float
 
     def measures(self, pooled: np.ndarray, scores: np.ndarray) -> np.ndarray:
-        """Return the measures [MEASURES] of an image.
+        """Compute the measures [MEASURES] of an image: log distance, log residual, and uncertain fraction of the scores.
 
         Args:
             pooled: [D] float32, see `detect.Found`.
-            scores: [N] of all that may be stalks.
+            scores: [N] of all detections, including those with low scores.
         """
         offset = (np.asarray(pooled, np.float64) - self.mean) / self.scale
         along = offset @ self.axes
-        # Axes are orthogonal but for their lengths.
+        # Axes are orthogonal, but not of unit norm.
         lengths = np.linalg.norm(self.axes, axis=0)
         left = offset - (self.axes / lengths) @ (along / lengths)
         unsure = np.minimum(scores, 1.0 - scores)[scores >= _UNSURE].sum()
@@ -66,26 +66,26 @@ class Gate:
         )
 
     def doubt(self, pooled: np.ndarray, scores: np.ndarray) -> float:
-        """Return how likely an image is read wrongly, 0 to 1, as far as synthetic images tell; see `measures`."""
+        """Estimate the probability, 0 to 1, that an image is misread, as fitted on synthetic images; see `measures`."""
         logit = self.weights[0] + self.weights[1:] @ self.measures(pooled, scores)
         return float(1.0 / (1.0 + np.exp(-np.clip(logit, -30.0, 30.0))))
 
 
 def gate_path(weights: Path) -> Path:
-    """Return the file of the gate of a file of weights, which lies beside it."""
+    """Return the path of the gate file that belongs to a weights file, in the same folder."""
     return weights.with_suffix(".gate.safetensors")
 
 
 def write_gate(weights: Path, gate: Gate, about: dict[str, Any]) -> None:
-    """Write the gate of a file of weights.
+    """Write the gate of a weights file.
 
     Args:
-        weights: The file, which the gate is for alone.
-        gate: The gate.
-        about: Where it comes from; anything that JSON holds.
+        weights: Weights file, whose digest is stored: the gate is valid for these weights only.
+        gate: Gate to write.
+        about: JSON-serialisable metadata on its origin.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The gate cannot be written.
     """
     arrays = {name: np.asarray(value, np.float32) for name, value in dataclasses.asdict(gate).items()}
     sizes = {"size": len(gate.mean), "axes": gate.axes.shape[1]}
@@ -93,10 +93,10 @@ def write_gate(weights: Path, gate: Gate, about: dict[str, Any]) -> None:
 
 
 def read_gate(weights: Path) -> Gate | None:
-    """Read the gate of a file of weights; None where there is none, or it is for other weights.
+    """Read the gate of a weights file; return None if there is none, or it belongs to other weights.
 
     Raises:
-        RequestError: The file of the gate cannot be read.
+        RequestError: The gate file cannot be read.
     """
     path = gate_path(weights)
     if not path.is_file():
@@ -122,19 +122,19 @@ def fit_gate(
 ) -> Gate:
     """Fit a gate.
 
-    Images lie nearer to statistics that they are part of. So weights and threshold come from measures by the statistics of
-    other plots: of five parts, each is measured by the four others.
+    Distances to statistics that include the image itself are biased low. So the regression and the threshold are fitted on
+    measures from five-fold cross-validation by plot.
 
     Args:
-        pooled: [N, D] of synthetic images.
-        scores: Scores of each.
-        wrong: [N] bool, True for those that were read wrongly.
-        plots: [N] int, the plot of each.
+        pooled: Pooled features [N, D] of synthetic images.
+        scores: Scores of the detections in each image.
+        wrong: [N] bool, True for images that were misread.
+        plots: [N] int, plot of each image.
         axes: Number of principal axes.
-        most_flagged: Greatest share of the images that were read rightly and are told to be unlike what the networks know.
+        most_flagged: Fraction of the correctly read images above the threshold (false positive rate).
 
     Raises:
-        ValueError: There are too few images of a kind.
+        ValueError: There are too few correctly read images, or no misread ones.
     """
     if (~wrong).sum() < 3 * axes or not wrong.any():
         raise ValueError(f"a gate needs {3 * axes} images that are read rightly, and one that is not")
@@ -151,9 +151,9 @@ def fit_gate(
 
 
 def _statistics(right: np.ndarray, axes: int) -> Gate:
-    """Return a gate with the statistics of pooled features [N, D], and no weights yet."""
+    """Return a gate with the statistics of pooled features [N, D] of correctly read images, and zero weights."""
     mean, scale = right.mean(axis=0), right.std(axis=0)
-    scale = scale + 0.1 * scale.mean() + 1e-6  # what hardly varies among a few images may vary more among others
+    scale = scale + 0.1 * scale.mean() + 1e-6  # regularised: few images may understate the variance
     offset = (right - mean) / scale
     _, lengths, directions = np.linalg.svd(offset, full_matrices=False)
     spread = lengths[:axes] / np.sqrt(len(right))
@@ -163,7 +163,11 @@ def _statistics(right: np.ndarray, axes: int) -> Gate:
 
 
 def logistic(measures: np.ndarray, wrong: np.ndarray) -> np.ndarray:
-    """Fit a logistic regression by Newton's method, a little shrunk; both classes count alike: [1 + M]."""
+    """Fit a class-balanced, L2-regularised logistic regression to measures [N, M] by Newton's method.
+
+    Returns:
+        Intercept and weights [1 + M].
+    """
     inputs = np.concatenate([np.ones((len(measures), 1)), measures], axis=1)
     share = np.where(wrong, 0.5 / wrong.sum(), 0.5 / (~wrong).sum())
     shrink = np.diag([0.0, *[1e-3] * measures.shape[1]])

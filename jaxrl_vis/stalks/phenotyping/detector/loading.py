@@ -1,4 +1,4 @@
-"""Loading of the detector that a command names by a file of weights, or by none."""
+"""Loading of the detector from a weights file, by default the one shipped with the package."""
 
 import functools
 from pathlib import Path
@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 
 
 def resolve_weights(weights: Path | None) -> Path:
-    """Return the file of the networks' weights: ``weights``, or the shipped one if that is None.
+    """Return the path of the weights: ``weights``, or the shipped file if None.
 
     Raises:
         RequestError: There is no such file.
@@ -29,7 +29,7 @@ def resolve_weights(weights: Path | None) -> Path:
 
 
 def detector_name(weights: Path) -> str:
-    """Return a name of the networks with these weights, which changes with the contents of the file."""
+    """Return a name of the networks that is derived from the contents of the weights file."""
     return f"networks {file_digest(weights)}"
 
 
@@ -40,11 +40,11 @@ def _load(weights: Path, digest: str, least_score: float) -> Finder:
 
 
 def load_finder(weights: Path, least_score: float) -> Finder:
-    """Return the networks with these weights; a process reads the same file once.
+    """Load the networks; cached by the path and contents of the file within a process.
 
     Args:
-        weights: File of the weights.
-        least_score: Lowest score of a detection, 0 to 1.
+        weights: Weights file.
+        least_score: Minimum score of a detection, 0 to 1.
 
     Raises:
         RequestError: The weights cannot be read.
@@ -60,13 +60,13 @@ def _shared_finder(weights: Path, least_score: float) -> Finder:
 def find_stalks(
     weights: Path, least_score: float, image: np.ndarray, density: float | None, plot: Any, pair: Any
 ) -> list[Detection]:
-    """Find the stalks of an image [H, W, 3] uint8 in any process: `functools.partial` of this can be pickled.
+    """Detect the stalks of an image in any process: a `functools.partial` of this function can be pickled.
 
     Args:
-        weights: File of the weights, which must stay the same while the process lives.
-        least_score: Lowest score of a detection, 0 to 1.
-        image: Left image.
-        density: Pixels per metre at the row; None if nothing is known of the camera.
-        plot, pair: Folder and files of the image, which networks do not need.
+        weights: Weights file, which must not change during the lifetime of the process.
+        least_score: Minimum score of a detection, 0 to 1.
+        image: Left image [H, W, 3] uint8.
+        density: Pixels per metre at the row; None if the camera is unknown.
+        plot, pair: Folder and files of the image; unused.
     """
     return _shared_finder(weights, least_score)(image, density)

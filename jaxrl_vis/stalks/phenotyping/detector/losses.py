@@ -1,4 +1,4 @@
-"""Losses of the networks: the boxes that are stalks, their positions, and their pixels."""
+"""Training losses of the networks: classification and regression of boxes, and segmentation of stalk crops."""
 
 from typing import Any
 
@@ -12,27 +12,27 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposal
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import smoothed
 
-# Truth of an image is padded: what there is not has the weight NOTHING, what is too hidden to count either way UNCLEAR.
+# Kinds of true stalks: NOTHING is padding, UNCLEAR is too occluded to count as positive or negative.
 NOTHING, UNCLEAR, STALK = 0, 1, 2
 
 
 def assign(overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float) -> tuple[jax.Array, ...]:
-    """Assign boxes to stalks.
+    """Assign boxes to true stalks.
 
     Args:
-        overlaps: [K, T] of boxes and true stalks.
+        overlaps: [K, T] overlaps of boxes and true stalks.
         kinds: [T] int32: NOTHING, UNCLEAR or STALK.
-        positive: Overlap from which on a box shows a stalk.
-        negative: Overlap below which it shows none.
+        positive: Minimum overlap of a positive box.
+        negative: Overlap below which a box is negative.
 
     Returns:
-        Index of the stalk [K] int32; whether the box shows it [K] bool; whether it shows none [K] bool. Boxes between the two,
-        and those on unclear stalks, are neither.
+        Index of the assigned stalk [K] int32, positives [K] bool and negatives [K] bool. Boxes between both thresholds, and
+        those on unclear stalks that are not positive, are ignored. The best box of a stalk is positive from an overlap of 0.2.
     """
     unclear = jnp.where((kinds == UNCLEAR)[None, :], overlaps, 0.0).max(axis=1) >= negative
     overlaps = jnp.where((kinds == STALK)[None, :], overlaps, 0.0)
     best = overlaps.max(axis=1)
-    # The best box of each stalk shows it even where none overlaps it enough.
+    # The best box of each stalk is positive even below the threshold.
     best_of_stalk = overlaps.max(axis=0)
     forced = (overlaps >= best_of_stalk[None, :] - 1e-6) & (best_of_stalk > 0.2)[None, :]
     which = jnp.where(forced.any(axis=1), jnp.argmax(jnp.where(forced, overlaps, -1.0), axis=1), jnp.argmax(overlaps, axis=1))
@@ -43,16 +43,19 @@ def assign(overlaps: jax.Array, kinds: jax.Array, positive: float, negative: flo
 def detector_loss(
     params: Any, images: jax.Array, truth: jax.Array, kinds: jax.Array, settings: Settings, dtype: Any, key: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Loss of proposals and of the head, mean over images.
+    """Compute the loss of the proposals and the box head, averaged over images.
 
     Args:
         params: Parameters of the detector.
-        images: [N, H, W, 3] uint8, reduced and padded.
-        truth: [N, T, 6] stalks.
-        kinds: [N, T] int32.
+        images: [N, H, W, 3] uint8, resized and padded.
+        truth: True stalks [N, T, 6].
+        kinds: [N, T] int32, see `assign`.
         settings: Settings of the networks.
-        dtype: In which convolutions are computed.
-        key: Key of the boxes around true ones that the head sees beside the proposals.
+        dtype: Compute dtype of the convolutions.
+        key: PRNG key of the jittered true boxes that the head is trained on besides the proposals.
+
+    Returns:
+        Total loss, and its terms by name: ``objectness``, ``offsets``, ``head`` and ``boxes``.
     """
     network = settings.detector(dtype)
     shape = (images.shape[1], images.shape[2])
@@ -71,7 +74,7 @@ def detector_loss(
         near = truth + 0.15 * jax.random.normal(key, truth.shape) * size
         proposals = jnp.concatenate([proposals, near])
         valid = jnp.concatenate([valid, kinds == STALK])
-        # In a clump, the box of what stands between two stalks overlaps both by half, and its strip neither.
+        # In a clump, a box between two stalks overlaps both by half, but its strip overlaps neither.
         alike = 0.5 * (overlap(proposals[:, :4], truth[:, :4]) + band_overlap(proposals, truth))
         which, shows, none = assign(alike, kinds, 0.5, 0.45)
         shows, none = shows & valid, none & valid
@@ -89,26 +92,26 @@ def detector_loss(
 
 
 def _focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
-    """Cross entropy of the anchors that say something, less for those that are easy; their sum."""
+    """Sum the focal loss over the positive and negative anchors."""
     loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
     return (loss * (shows | none)).sum()
 
 
 def _distance(codes: jax.Array, wanted: jax.Array, shows: jax.Array) -> jax.Array:
-    """Mean Huber loss of codes [K, 6] of the boxes that show a stalk."""
+    """Compute the Huber loss of box offsets [K, 6], averaged over the positive boxes."""
     loss = optax.huber_loss(codes, jnp.clip(wanted, -20.0, 20.0), delta=1.0).sum(axis=-1)
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 
 
 def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
-    """Cross entropy and Dice loss of the masks of snips.
+    """Compute the cross-entropy and Dice loss of the segmentation of stalk crops.
 
     Args:
-        params: Parameters of the segmentation.
-        snips: [N, h, w, 3] uint8.
-        masks: [N, h, w] bool.
+        params: Parameters of the segmentation network.
+        snips: Stalk crops [N, h, w, 3] uint8.
+        masks: True masks [N, h, w] bool.
         settings: Settings of the networks.
-        dtype: In which convolutions are computed.
+        dtype: Compute dtype of the convolutions.
     """
     logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(snips))
     assert isinstance(logits, jax.Array)
@@ -116,7 +119,7 @@ def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Se
 
 
 def mask_loss(logits: jax.Array, masks: jax.Array) -> jax.Array:
-    """Cross entropy of logits [N, h, w], and 0.3 times their Dice loss, against masks [N, h, w] bool: []."""
+    """Compute the scalar cross-entropy plus 0.3 times Dice loss of logits [N, h, w] against masks [N, h, w] bool."""
     wanted = masks.astype(jnp.float32)
     entropy = optax.sigmoid_binary_cross_entropy(logits, wanted).mean()
     chances = jax.nn.sigmoid(logits)

@@ -1,7 +1,7 @@
-"""Snips: strips of an image that follow a stalk, so that it stands upright in the middle, at full resolution.
+"""Stalk crops ("snips"): full-resolution crops of an image, sheared so that the stalk stands upright in the centre.
 
-Each line of a snip is a line of the image, moved by a whole number of pixels: nothing is interpolated, edges stay where they
-are, and a mask of the snip is put back exactly.
+Each row of a crop is a part of an image row, shifted by a whole number of pixels: there is no interpolation, edges stay where
+they are, and a mask of the crop can be pasted back exactly.
 """
 
 import functools
@@ -11,30 +11,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_ALONG = 15  # lines of a snip of full size
+_ALONG = 15  # rows of a full-size stalk crop that are averaged
 _EXPONENT = 0.35
 
 
 def snip_shape(full: tuple[int, int], share: float) -> tuple[int, int]:
-    """Lines and columns of snips: multiples of 8.
+    """Return the height and width of stalk crops, multiples of 8 and at least 16.
 
     Args:
-        full: Shape of the snips of an image of full resolution.
-        share: Resolution of the image, of the full one.
+        full: Height and width of crops of a full-resolution image.
+        share: Resolution of the image relative to full resolution.
     """
     lines, columns = (max(round(length * share / 8), 2) * 8 for length in full)
     return lines, columns
 
 
 def crop_places(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels of the image that crops hold. Computed on the host, once for cutting out and for putting back.
+    """Return the positions of stalk crops in the image, computed on the host for both cutting out and pasting back.
 
     Args:
-        stalks: [N, 6], box and columns of the axis at its top and bottom, continuous coordinates of the image.
-        shape: Lines and columns of a snip.
+        stalks: [N, 6], boxes, and x coordinates of the axis at the top and bottom of the box, in continuous image coordinates.
+        shape: Height and width of a crop.
 
     Returns:
-        First line of each snip [N] int32, and the first column of each of its lines [N, lines] int32; also beyond the image.
+        First image row of each crop [N] int32, and first image column of each of its rows [N, height] int32. Both may lie
+        outside the image.
     """
     stalks = np.asarray(stalks, np.float64)
     middle = 0.5 * (stalks[:, 1] + stalks[:, 3])
@@ -47,12 +48,12 @@ def crop_places(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray,
 
 
 def cut(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Array:
-    """Snips [N, lines, columns, ...] of an image [H, W, ...]; 0 beyond the image.
+    """Cut stalk crops [N, height, width, ...] out of an image [H, W, ...]; 0 outside the image.
 
     Args:
-        image: Image of any type.
+        image: Image of any dtype.
         stalks: [N, 6]; see `crop_places`.
-        shape: Lines and columns of a snip.
+        shape: Height and width of a crop.
     """
     return _cut(image, *crop_places(stalks, shape), shape[1])
 
@@ -67,10 +68,13 @@ def _cut(image: jax.Array, top: jax.Array, left: jax.Array, across: int) -> jax.
 
 
 def smoothed(snips: jax.Array) -> jax.Array:
-    """Snips [N, h, w, 3] uint8 as the segmentation sees them: float32 around 0, with less of their texture.
+    """Preprocess stalk crops [N, h, w, 3] for segmentation: float32 in [-1, 1], smoothed along the stalk.
 
-    Edges run along a stalk and its texture mostly does not, so each line is the mean of 15; and the contrast of what is bright
-    is lowered. On textures that the networks never saw, that takes away most of what makes masks too narrow.
+    Values are averaged over 15 rows, as edges run along a stalk and texture mostly does not, and bright tones are compressed.
+    On textures not seen in training, this removes most of the bias towards narrow masks.
+
+    Args:
+        snips: Stalk crops, uint8 or float from 0 to 255.
     """
     beside = _ALONG // 2
     values = jnp.pad(snips.astype(jnp.float32) / 255.0, ((0, 0), (beside, beside), (0, 0), (0, 0)), mode="edge")
@@ -79,15 +83,16 @@ def smoothed(snips: jax.Array) -> jax.Array:
 
 
 def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
-    """A snip's values where they are in the image.
+    """Paste a stalk crop back to its position in the image.
 
     Args:
-        snip: [lines, columns] float32.
-        stalk: [6] of its stalk.
+        snip: Values [height, width] float32 of the crop, such as a mask.
+        stalk: [6], stalk that the crop was cut along; see `crop_places`.
         size: Height and width of the image.
 
     Returns:
-        [h, w] float32, 0 where the snip holds nothing, and line and column of its first pixel in the image.
+        Part of the image [h, w] float32, 0 outside the crop, and the image row and column of its first pixel; empty if the crop
+        lies outside the image.
     """
     top, left = (edge[0] for edge in crop_places(stalk[None], (snip.shape[0], snip.shape[1])))
     columns = snip.shape[1]
@@ -96,7 +101,7 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
     if not used.size or end <= begin:
         return np.zeros((0, 0), np.float32), (0, 0)
     whole = np.zeros((used.size, end - begin), np.float32)
-    # Lines that lie equally far to the right go together.
+    # Rows with the same horizontal shift are copied together.
     places = left[used] - begin
     breaks = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), used.size]
     for first, last in itertools.pairwise(breaks):

@@ -1,4 +1,4 @@
-"""Weights of the networks that find stalks, with their settings and their origin."""
+"""Weights files of the stalk detection networks, with their settings and origin."""
 
 import dataclasses
 import functools
@@ -16,12 +16,13 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 
 SHIPPED = Path(__file__).with_name("stalks.safetensors")
-"""Weights that come with the package, trained on synthetic stalks."""
+"""Path of the weights shipped with the package, trained on synthetic stalks."""
 SCHEMA = 2
-"""Raised where the same numbers mean something else: since 2, boxes and axes are in codes relative to the proposal's axis."""
+"""File format version, increased when parameters change their meaning: since 2, box offsets are relative to the axis of
+the proposal."""
 _COMMAND = "jaxrl-vis phenotype train"
 _HINTS = fields.hints(Settings)
-# Least, most, and what it is a multiple of: a file must not ask for a network that no memory holds.
+# Minimum, maximum and divisor of each setting: a file must not request a network that does not fit in memory.
 _SANE: dict[str, tuple[float, float, int]] = {
     "density": (0, 100_000, 1),
     **dict.fromkeys(("width", "full_width"), (32, 16384, 1)),
@@ -37,14 +38,14 @@ _SANE: dict[str, tuple[float, float, int]] = {
 def write_weights(
     path: Path, params: Mapping[str, Any], settings: Settings, about: Mapping[str, Any], bits: Literal[10, 16, 32] = 16
 ) -> None:
-    """Write parameters to a file, which is complete whenever it can be read.
+    """Write parameters to a file atomically.
 
     Args:
-        path: The file, .safetensors.
+        path: Path of the .safetensors file.
         params: Nested dictionaries of arrays.
         settings: Settings of the networks.
-        about: Their origin; anything that JSON holds.
-        bits: Bits of a number, see `write_parameters`.
+        about: JSON-serialisable metadata on their origin.
+        bits: Bits per number; see `write_parameters`.
 
     Raises:
         OSError: The file cannot be written.
@@ -53,10 +54,13 @@ def write_weights(
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
-    """Read what `write_weights` wrote: parameters, settings, and where they come from.
+    """Read a file written by `write_weights`.
+
+    Returns:
+        Parameters, settings, and the metadata on their origin.
 
     Raises:
-        RequestError: There is no such file, or it holds no weights, or not those of its settings.
+        RequestError: The file does not exist, is not a weights file, or its parameters do not match its settings.
     """
 
     def declare(about: dict[str, Any]) -> tuple[Settings, Any]:
@@ -72,10 +76,10 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
 
 
 def _checked(path: Path, values: dict[str, Any]) -> Settings:
-    """Settings of the kinds and sizes that networks can have.
+    """Return the settings with these ``values``, after checking their types and ranges.
 
     Raises:
-        RequestError: They are not.
+        RequestError: A type or range is invalid.
     """
     settings = Settings(**{name: fields.check(f"{path}: {name}", _HINTS[name], value) for name, value in values.items()})
     for name, (low, high, step) in _SANE.items():
@@ -88,7 +92,7 @@ def _checked(path: Path, values: dict[str, Any]) -> Settings:
 
 @functools.lru_cache(maxsize=4)
 def declared(settings: Settings) -> dict[str, Any]:
-    """Shapes of the parameters that the networks of these settings have: nested dictionaries, nothing of which is computed."""
+    """Return the shapes and dtypes of the networks' parameters as nested dictionaries, without computing any of them."""
     snips = jax.ShapeDtypeStruct((1, settings.snip_lines, settings.snip_columns, 3), jnp.float32)
 
     def draw(key: jax.Array) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""Measurement of one stalk in one pair: edges, disparity, ground, and the diameter in millimetres."""
+"""Measurement of one stalk in one stereo pair: edges, disparity, ground plane, and diameter in millimetres."""

@@ -1,7 +1,7 @@
-"""Black borders around images, as rectification leaves them and letterboxes add them: they are no part of the scene.
+"""Detection of black borders around images, as left by rectification or added as letterboxes.
 
-A camera's noise makes even a night sky uneven; what was filled in is one value, up to a side that is straight or evenly bent.
-Only that is a border, so dark parts of an image stay what they are.
+Sensor noise makes even a night sky uneven, while a border is filled with one value and ends at a straight or evenly curved
+side. Only such regions count as borders, so dark parts of the scene are kept.
 """
 
 import dataclasses
@@ -10,23 +10,23 @@ from typing import Any
 import cv2
 import numpy as np
 
-_DARK = 12  # values up to here may be of a border: JPEG lets edges ring
-_FILLED = 1.0  # mean of a border a little way inside it
-_RINGING = 16  # pixels: how far from its side JPEG changes a border
-_MIN_LINES = 0.08  # of the image's lines: a shorter side is none
-_BEND = 2.5  # pixels: how far a border's side lies from an even curve
-_MIN_AGREEING = 0.9  # of a side's lines
-_THINNEST = 8.0  # pixels: width of a border where it begins within the image
-_INSIDE = 2  # pixels by which an image ends before its border begins
+_DARK = 12  # maximum value in a border: JPEG edges ring
+_FILLED = 1.0  # maximum mean value of a border, away from its side
+_RINGING = 16  # pixels: reach of JPEG ringing into a border
+_MIN_LINES = 0.08  # minimum length of a border's side, as a fraction of the image's
+_BEND = 2.5  # pixels: maximum distance of a border's side from a smooth curve
+_MIN_AGREEING = 0.9  # minimum fraction of a side's rows that lie on the curve
+_THINNEST = 8.0  # pixels: maximum width of a border at an end within the image
+_INSIDE = 2  # pixels by which a detected border is widened
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """The part of an image that shows a scene.
+    """Part of an image that shows the scene, without black borders.
 
     Attributes:
-        lines, columns: First of each that shows anything, and one past the last.
-        shown: [H, W] bool, True inside it; None where that is all of these lines and columns.
+        lines, columns: Half-open ranges of the rows and columns of its bounding box.
+        shown: [H, W] bool, True for pixels of the scene; None if these are the whole bounding box.
     """
 
     lines: tuple[int, int]
@@ -50,7 +50,10 @@ def find_frame(image: np.ndarray) -> Frame:
 
 
 def _extent(image: np.ndarray, lit: Any, axis: int) -> tuple[int, int]:
-    """Return the first line or column of an image that is lit, and one past the last; all of them where no border is beside."""
+    """Return the half-open range of rows (axis 0) or columns (axis 1) without the borders at both ends.
+
+    ``lit`` is True for rows or columns with any pixel that is not dark.
+    """
     size = lit.size
     if not lit.any():
         return 0, size
@@ -67,7 +70,7 @@ def _is_filled(part: np.ndarray) -> bool:
 
 
 def _wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
-    """Return True for the pixels [H, W] of borders that are not as long as the image's sides."""
+    """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image."""
     outside = np.zeros(dark.shape, bool)
     for turns in range(4):
         seen, filled = np.rot90(dark, turns), np.rot90(image, turns)
@@ -79,14 +82,14 @@ def _wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
 
 
 def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
-    """Columns [H] that a border takes from the left of each line; None where there is no border."""
+    """Return the width [H] of a border at the left of each row, pixels; None if there is no border."""
     if np.count_nonzero(dark[:, 0]) < _MIN_LINES * dark.shape[0]:
         return None
     depth = np.where(dark.all(axis=1), 0, np.argmin(dark, axis=1))
     there = np.flatnonzero(depth > _INSIDE)
     if there.size < max(_MIN_LINES * dark.shape[0], _RINGING):
         return None
-    # Of the lines between its ends: a border is one piece.
+    # Consider all rows between its ends, as a border is contiguous.
     first, last = int(there[0]), int(there[-1]) + 1
     place = np.linspace(-1.0, 1.0, last - first)
     reach = depth[first:last].astype(float)
@@ -96,9 +99,9 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
         if heavy.sum() < _RINGING:
             return None
         curve = np.polyval(np.polyfit(place[heavy], reach[heavy], 2), place)
-        # A dark thing beside the border makes it look wider, and nothing makes it look narrower.
+        # Dark objects next to the border make it look wider; nothing makes it look narrower.
         heavy = np.abs(reach - curve) <= max(_BEND, float(np.quantile(np.abs(reach - curve), 0.5)))
-    # A border goes on to the image's other sides, or grows from nothing.
+    # A border extends to the adjacent sides of the image, or tapers off.
     ends = [curve[end] for end, whole in ((0, first == 0), (-1, last == dark.shape[0])) if not whole]
     if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _THINNEST:
         return None
@@ -111,12 +114,12 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
 
 
 def fill_borders(image: np.ndarray, frame: Frame) -> np.ndarray:
-    """Return the lines and columns of an image [H, W, 3] that show a scene, with borders beside it as bright as its sides."""
+    """Crop an image [H, W, 3] to the bounding box of its frame, and fill remaining borders with the nearest scene pixels."""
     part = image[slice(*frame.lines), slice(*frame.columns)]
     if frame.shown is None:
         return part
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]
-    # Every pixel of a border gets the value of the nearest one that shows something.
+    # Each border pixel gets the value of the nearest pixel of the scene.
     _, labels = cv2.distanceTransformWithLabels((~shown).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     labels = labels.astype(np.int64)
     line, column = np.nonzero(shown)

@@ -1,11 +1,12 @@
-"""From edges in pixels and a disparity to a diameter in millimetres.
+"""Diameter of a stalk in millimetres from its edges in pixels and its depth.
 
-The two edges of a round stalk are where rays from the camera touch it. With half the angle between them a, and the distance D
-of its middle from the camera, its radius is D sin a. Stereo measures the distance of the front surface, D less the radius, so
+The edges of a round stalk are where rays from the camera are tangent to it. If a is half the angle between these rays and D the
+distance from the camera to the stalk's axis, its radius is D sin a. Stereo measures the distance of the front surface, D less
+the radius, so
 
     r = (distance of the front) * sin a / (1 - sin a)
 
-Taking the front's distance for the middle's understates a diameter of 14 mm at 0.8 m by 0.9 %.
+Using the distance of the front as that of the axis would underestimate a diameter of 14 mm at 0.8 m by 0.9 %.
 """
 
 import math
@@ -23,19 +24,16 @@ def diameter_mm(
     lean: float = 0.0,
     tilt: float = 0.0,
 ) -> float:
-    """Diameter of a stalk across its axis.
+    """Compute the diameter of a stalk perpendicular to its axis, mm.
 
     Args:
         calibration: Calibration of the cameras.
-        left, right: Column and line of a point of each edge in the left image, pixels; they need not be opposite each other.
-        front_depth: Planar depth of the stalk's front between them, m.
-        lean: Angle between the stalk and the image's vertical, rad; positive to the right.
+        left, right: A point (x, y) on each edge in the left image, pixels; they need not be opposite each other.
+        front_depth: Planar depth of the stalk's front surface between the points, m.
+        lean: Angle between the stalk and the vertical of the image, rad; positive to the right.
         tilt: Angle by which the stalk leans away from the camera, rad.
-
-    Returns:
-        Millimetres.
     """
-    # The axis in the camera's frame, up along the image: columns to the right, lines down, depth forwards.
+    # Upward axis of the stalk in the camera's frame: x to the right, y down, z forwards.
     axis = np.array([math.tan(lean), -1.0, math.tan(tilt)])
     axis /= np.linalg.norm(axis)
     rays = []
@@ -52,13 +50,13 @@ def diameter_mm(
 
 
 def edge_tilt(slope: float, disparity: float, calibration: Calibration) -> float:
-    """Angle in rad by which a stalk leans away from the camera.
+    """Compute the angle by which a stalk leans away from the camera, rad; 0 if the disparity is not positive.
 
     Args:
-        slope: Change of its disparity per line of the left image, pixels.
-        disparity: In the same place, pixels.
-        calibration: Calibration of the cameras.
+        slope: Change of its disparity per row of the left image, pixels.
+        disparity: Disparity at the same place, pixels.
+        calibration: Calibration of the cameras, whose offset is subtracted from the disparity.
     """
     beyond = disparity - calibration.offset
-    # Depth is f B / d and height Z / f per line, so that dZ / dheight = f slope / d, and lines count downwards.
+    # Depth is Z = f B / d, and a row spans a height of Z / f, so dZ / dheight = f slope / d as rows count downwards.
     return math.atan(calibration.focal * slope / beyond) if beyond > 0 else 0.0

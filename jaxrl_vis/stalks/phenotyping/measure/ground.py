@@ -1,8 +1,8 @@
-"""The ground in a pair of images, found by stereo: what heights of stalks are counted from.
+"""Ground plane of a stereo pair, the reference for heights of stalks.
 
-Windows all over the image are matched in the right one. The disparities of a plane change linearly over the image, so the plane
-on which most windows agree, of those that could be ground, is the ground. Where too few agree there is none to be seen, and
-nothing says how high something is.
+Windows on a grid over the left image are matched in the right one. Disparity is linear in image coordinates on a plane, so the
+ground is the plausible plane with the most inliers (RANSAC). If there are too few inliers, no ground is visible and heights are
+unknown.
 """
 
 import dataclasses
@@ -14,36 +14,36 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
 from jaxrl_vis_envs.plants import Calibration
 
-_FOCAL = 1084.0  # pixels, to which images are reduced: grains of the ground are still seen
-_WINDOW = (5, 41)  # lines and columns there: flat, as the ground comes nearer from line to line
-_COLUMNS, _LINES = 32, 32  # windows side by side and above each other
+_FOCAL = 1084.0  # pixels: focal length of the downscaled images, in which the grain of the ground remains visible
+_WINDOW = (5, 41)  # height and width in the downscaled image: flat, as the depth of the ground changes from row to row
+_COLUMNS, _LINES = 32, 32  # numbers of windows horizontally and vertically
 _MIN_SCORE = 0.7
-_TOLERANCE = 0.7  # pixels there
+_TOLERANCE = 0.7  # pixels of the downscaled image
 _TRIES = 600
 _CAMERA_HEIGHTS = (0.1, 2.0)  # m
 _MAX_PITCH, _MAX_ROLL = math.radians(30.0), math.radians(12.0)
 _MIN_WINDOWS = 30
-_MIN_SPAN = 0.3  # of the image's width
-_MAX_BELOW = 0.1  # share of windows that may lie under the ground: they are matched wrongly
+_MIN_SPAN = 0.3  # minimum horizontal span of the inliers, as a fraction of the image's width
+_MAX_BELOW = 0.1  # maximum fraction of windows below the ground, which are mismatches
 
 
 @dataclasses.dataclass(frozen=True)
 class Ground:
-    """The ground as a plane in the left camera's frame: x to the right, y down, z forwards.
+    """Ground plane in the left camera's frame: x to the right, y down, z forwards.
 
     Attributes:
-        normal: [3], 1/m; the points of the plane are those whose product with it is 1.
+        normal: [3], 1/m; a point lies on the plane if its dot product with ``normal`` is 1.
     """
 
     normal: tuple[float, float, float]
 
     @property
     def camera_height(self) -> float:
-        """Height of the left camera above it, m."""
+        """Height of the left camera above the ground, m."""
         return 1.0 / math.hypot(*self.normal)
 
     def height(self, column: float, line: float, depth: float, calibration: Calibration) -> float:
-        """Height above the ground of what a pixel of the left image shows at a planar depth in m; m."""
+        """Return the height above the ground, m, of a point at a pixel of the left image and a planar ``depth`` in m."""
         x = (column - calibration.centre[0]) / calibration.focal
         y = (line - calibration.centre[1]) / calibration.focal
         across, down, forwards = self.normal
@@ -57,14 +57,13 @@ def find_ground(
     disparity: np.ndarray | None = None,
     depths: tuple[float, float] = (0.45, 3.0),
 ) -> Ground | None:
-    """The ground that a pair shows; None where it shows none, or too little.
+    """Find the ground plane of a pair; return None if it is not visible, or too little of it.
 
     Args:
-        left, right: [H, W] grey, uint8 or float32, rectified.
+        left, right: Rectified greyscale images [H, W], uint8 or float32.
         calibration: Calibration of the cameras, for images of this size.
-        disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
-            there is none.
-        depths: Least and greatest depth at which it is looked for, m.
+        disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
+        depths: Minimum and maximum depth of matched windows, m.
     """
     frame = find_frame(left)
     part = (slice(*frame.lines), slice(*frame.columns))
@@ -84,7 +83,7 @@ def find_ground(
     focal = calibration.focal * scale
     corner = np.array([frame.columns[0], frame.lines[0]])
     centre = (np.array(calibration.centre) - corner + 0.5) * scale - 0.5
-    # Inverse depth, which is linear in the rays of a plane's points; one pixel of disparity is `unit` of it.
+    # Inverse depth, which is linear in the rays to points of a plane; `unit` is the change per pixel of disparity.
     unit = 1.0 / (focal * calibration.baseline)
     rays = np.concatenate([(places - centre) / focal, np.ones((len(places), 1))], axis=1)
     inverse = (values - calibration.offset * scale) * unit
@@ -102,7 +101,7 @@ def find_ground(
 
 
 def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Middles (column, line) [N, 2] and disparities [N] of windows that are found in the right image, and clearly."""
+    """Match windows in the right image; return the centres (x, y) [N, 2] and disparities [N] of those with a clear match."""
     tall, wide = _WINDOW
     height, width = left.shape
     low, high = math.floor(bounds[0]), math.ceil(bounds[1])
@@ -128,7 +127,7 @@ def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -
 
 
 def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Places and values as of `_windows`, out of an image of disparities."""
+    """Sample positions and disparities, as returned by `_windows`, from a disparity image."""
     lines, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
     values = disparity[np.ix_(lines, columns)]
     line, column = np.nonzero(np.isfinite(values))
@@ -137,9 +136,9 @@ def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarra
 
 
 def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """The plane [3] that could be ground and that most points agree with; None if there is none."""
+    """Fit the plausible ground plane [3] with the most inliers, by RANSAC; None if there is none."""
     rng = np.random.default_rng(0)
-    # Most of what an image shows is no ground; most of what its lower third shows is.
+    # Most of an image is not ground, but most of its lower third is: half of the samples come from there.
     low = np.flatnonzero(rays[:, 1] >= np.quantile(rays[:, 1], 2 / 3))
     triples = np.concatenate([rng.integers(len(rays), size=(_TRIES // 2, 3)), rng.choice(low, (_TRIES // 2, 3))])
     corners = rays[triples]
@@ -159,7 +158,7 @@ def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarra
 
 
 def _could_be_ground(planes: np.ndarray) -> np.ndarray:
-    """Return True for the planes [N, 3] that lie below the camera, about level: [N] bool."""
+    """Return [N] bool, True for planes [N, 3] that lie below the camera and are roughly level."""
     length = np.linalg.norm(planes, axis=1)
     height = 1.0 / np.maximum(length, 1e-9)
     roll = np.abs(np.arcsin(np.clip(planes[:, 0] / np.maximum(length, 1e-9), -1.0, 1.0)))

@@ -1,11 +1,11 @@
-"""Lenses with which counting and measuring was tried, by what their images show of a row: pixels per metre, and its height."""
+"""Range of lenses validated for counting and measuring: resolution and vertical field of view at the row."""
 
 import dataclasses
 
 from jaxrl_vis_envs.plants import Calibration
 
 UNTRIED = "untried lens"
-"""Flag of a plot whose images show less of the row, or fewer pixels of it, than those that the networks were tried on."""
+"""Flag of a plot whose images have a smaller field of view or a lower resolution at the row than the validated range."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -13,8 +13,8 @@ class LensRange:
     """Range of lenses.
 
     Attributes:
-        density: Least number of pixels per metre at the row.
-        view: Least height of what an image shows at the row, m.
+        density: Minimum resolution at the row, pixels per metre.
+        view: Minimum vertical field of view at the row, m.
     """
 
     density: float
@@ -22,18 +22,18 @@ class LensRange:
 
 
 TRIED = LensRange(density=640.0, view=0.68)
-"""Range in which stalks are counted and measured as with the usual lens: 5 % beyond the last lenses of
-`benchmarks.stalks.lenses` that were, as rows do not stand at 0.8 m exactly."""
+"""Range in which counts and widths are as good as with the standard lens: 5 % beyond the last such lenses of
+`benchmarks.stalks.lenses`, as rows are not exactly 0.8 m away."""
 
 
 def lens_fault(calibration: Calibration, distance: float, lines: int, tried: LensRange = TRIED) -> str | None:
-    """Say in words why a lens is outside a range; None if it is within.
+    """Return a message on why a lens is outside a range; None if it is within.
 
     Args:
         calibration: Calibration of the cameras.
         distance: Distance from the cameras to the row, m.
-        lines: Number of lines of an image that show anything.
-        tried: The range.
+        lines: Height of the images without black borders, pixels.
+        tried: Range of validated lenses.
     """
     density = calibration.focal / distance
     view = lines / density

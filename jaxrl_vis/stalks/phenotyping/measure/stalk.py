@@ -1,4 +1,4 @@
-"""One stalk of one pair: from its mask and both images to its diameter in millimetres, with what speaks for and against it."""
+"""Measurement of one stalk in one stereo pair: from its mask and both images to its diameter, with error and confidence."""
 
 import dataclasses
 import math
@@ -15,9 +15,9 @@ from jaxrl_vis_envs.plants import Calibration
 
 Method = Literal["strip", "ellipse"]
 DEPTHS = (0.5, 1.3)
-"""Least and greatest depth at which the stalks of a row stand, m."""
+"""Minimum and maximum depth of the stalks of a row, m."""
 _WINDOWS = 16
-_REACH = 0.025  # m along a stalk: sheaths and nodes further away do not matter
+_REACH = 0.025  # m along a stalk, within which edges are measured: sheaths and nodes beyond have no effect
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,19 +25,19 @@ class Measurement:
     """Measurement of one stalk in one pair.
 
     Attributes:
-        diameter_mm: Across its axis; None where it could not be measured, and `reason` says why.
-        deviation_mm: Its standard error, as far as edges and disparity tell; hidden parts and sheaths are not in it.
-        line: Line of the left image where the stalk was measured, pixels.
-        column: Column of its middle there, pixels.
-        width: Across its axis, pixels.
-        disparity: There, pixels.
-        depth: Planar depth of its front, m.
-        height: Height of the place above the ground, m; not a number where no ground is known.
-        lean, tilt: Against the image's vertical and away from the camera, rad.
-        confidence: 0 to 1.
-        here: Both edges are visible around that line; if not, they are those of the rest of the stalk, which
-            is mostly partly hidden then.
-        reason: Empty where the stalk was measured.
+        diameter_mm: Diameter perpendicular to the axis; None if it could not be measured, see ``reason``.
+        deviation_mm: Standard error of the diameter from edges and disparity, without the effects of occlusion and sheaths.
+        line: Row of the left image at which the stalk was measured, pixels.
+        column: Column of the stalk's centre line in that row, pixels.
+        width: Width perpendicular to the axis, pixels.
+        disparity: Disparity in that row, pixels.
+        depth: Planar depth of the front surface, m.
+        height: Height of the measurement above the ground, m; NaN if no ground is known.
+        lean, tilt: Angles of the stalk against the vertical of the image (positive to the right) and away from the camera, rad.
+        confidence: Confidence of the measurement, 0 to 1.
+        here: True if both edges are visible around the row. If False, the edges are extrapolated from the rest of the stalk,
+            which is usually partially occluded.
+        reason: Reason why the stalk could not be measured; empty if it was.
     """
 
     diameter_mm: float | None = None
@@ -69,22 +69,21 @@ def measure(
     disparity: np.ndarray | None = None,
     strip: Strip | None = None,
 ) -> Measurement:
-    """Measure a stalk.
+    """Measure a stalk; failures are returned as a `Measurement` with a ``reason``.
 
     Args:
-        mask: [h, w] bool, or float32 from 0 to 1: of the stalk, in a part of the left image.
-        corner: Line and column of the mask's first pixel in the image.
-        left, right: [H, W] grey, uint8 or float32, rectified.
+        mask: Mask [h, w] of the stalk in a part of the left image, bool, or float32 from 0 to 1.
+        corner: Image row and column of the first pixel of the mask.
+        left, right: Rectified greyscale images [H, W], uint8 or float32.
         calibration: Calibration of the cameras, for images of this size.
-        line: Line of the image at which to measure; the middle of the visible part if not given.
-        depths: Least and greatest depth at which a stalk may stand, m.
-        method: ``strip``, or ``ellipse`` as in the thesis, which measures the mask as a whole and not at a line.
-        ground: Origin of heights.
-        height: Height at which to measure, m above the ground, if it is known: there, or as near to it as both edges are
-            visible; ``line`` does not matter then.
-        disparity: [H, W] float32, disparities that are known, in place of those that are matched; pixels, not a number where
-            there is none.
-        strip: The mask's edges, if they are known.
+        line: Image row at which to measure; None for the middle of the visible part.
+        depths: Minimum and maximum depth of a stalk, m.
+        method: ``strip``, or ``ellipse`` as in the thesis, which measures the width of the mask as a whole instead of at a row.
+        ground: Ground plane, the reference for heights; None if unknown.
+        height: Height above the ground at which to measure, m, or as near to it as both edges are visible. With both ``ground``
+            and ``height``, ``line`` is ignored.
+        disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
+        strip: Edges of the mask; None to fit them.
     """
     strip = strip_width(mask) if strip is None else strip
     if strip is None:
@@ -112,7 +111,7 @@ def measure(
     edges = tuple((middle + corner[1] + side * half, place + corner[0]) for side in (-1.0, 1.0))
     tilt = _tilt(matched, beside, calibration)
     diameter = diameter_mm(calibration, edges[0], edges[1], depth, strip.lean, tilt)
-    # Towards the ends of what was seen, and beyond, slopes add to the error of the edges.
+    # Away from the middle of the visible part, the error of the slopes adds to that of the edges.
     span = max(strip.last - strip.first, 1)
     lever = math.sqrt(1.0 + 12.0 * ((place - strip.reference) / span) ** 2)
     relative = math.hypot(strip.deviation * lever / pixels, error / max(beside - calibration.offset, 1e-6))
@@ -135,7 +134,7 @@ def measure(
 def _place_at(
     height: float, strip: Strip, corner: tuple[int, int], matched: StalkDisparity, calibration: Calibration, ground: Ground
 ) -> float:
-    """Line of the mask at which a stalk is so high above the ground, m, or the nearest one in which its edges are seen."""
+    """Return the row of the mask with visible edges nearest to a ``height`` in m; the reference row if heights are unknown."""
     ends = np.array([strip.first, strip.last], float)
     disparities = [matched.at(place + corner[0]) for place in ends]
     known = [disparity_here[0] for disparity_here in disparities if disparity_here is not None]
@@ -160,7 +159,7 @@ def _disparity(
     depths: tuple[float, float],
     disparity: np.ndarray | None,
 ) -> StalkDisparity:
-    """Disparities of a stalk that stands between two depths in m."""
+    """Compute the disparities of a stalk within a range of depths, m; see `stalk_disparity`."""
     far, near = (float(calibration.disparity(np.array(depth))) for depth in (depths[1], depths[0]))
     return stalk_disparity(strip, corner, left, right, calibration, (far, near), disparity)
 
@@ -174,15 +173,15 @@ def stalk_disparity(
     bounds: tuple[float, float],
     disparity: np.ndarray | None = None,
 ) -> StalkDisparity:
-    """Match windows of a stalk that are spread over the lines in which both edges are seen.
+    """Match windows of a stalk, spread over the rows in which both edges are visible.
 
     Args:
         strip: Edges of the stalk's mask.
-        corner: Line and column of the mask's first pixel in the image.
-        left, right: [H, W] grey, uint8 or float32, rectified.
+        corner: Image row and column of the first pixel of the mask.
+        left, right: Rectified greyscale images [H, W], uint8 or float32.
         calibration: Calibration of the cameras.
-        bounds: Least and greatest disparity, pixels.
-        disparity: [H, W] float32, disparities that are known, in place of those that are matched.
+        bounds: Minimum and maximum disparity, pixels.
+        disparity: Known disparities [H, W] float32 to sample instead of matching, pixels; NaN where unknown. None to match.
     """
     half = max(round(8 * calibration.focal / 2168), 3)
     lines = np.unique(np.linspace(strip.first + half, max(strip.last - half, strip.first + half), _WINDOWS).round()).astype(int)
@@ -193,7 +192,7 @@ def stalk_disparity(
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:
-    """Return the lean of the stalk away from the camera; 0 if too short a piece of it was matched to tell."""
+    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short or the tilt implausible."""
     if matched.lines.size < 6 or np.ptp(matched.lines) < 0.03 * calibration.focal:
         return 0.0
     first, second = index_pairs(matched.lines.size, 3)

@@ -1,15 +1,14 @@
-"""Disparity inside detections: how far to the left the right camera sees the same stalk, to a fraction of a pixel.
+"""Subpixel stereo disparity of detected stalks.
 
-Only what lies in a detection is matched: matching all of a 9-megapixel pair takes 20 s on two cores, and one row of pixels in
-twenty of a stalk says as much about its distance. Three ways:
+Only detections are matched: matching a whole 9-megapixel pair takes 20 s on two cores, and every twentieth row of a stalk is as
+informative about its distance. Three methods:
 
-    match_rows     one-dimensional: windows of a few lines of the stalk, compared at every whole disparity by normalised
-                   cross-correlation; then a parabola through the best and its neighbours. The default.
-    match_sgbm     OpenCV's semi-global matching of the detection's strip; what the thesis used, on the whole image.
-    sample_rows    takes them from an image of disparities that somebody else computed.
+    match_rows     one-dimensional: windows of a few rows of the stalk are compared at every integer disparity by normalised
+                   cross-correlation, and refined by a parabola through the maximum and its neighbours. The default.
+    match_sgbm     OpenCV's semi-global matching of the detection's strip; the thesis applied it to the whole image.
+    sample_rows    samples a disparity image from another source.
 
-The first two see a window as a whole at one depth, as a stalk nearly is, and leave windows out that look alike elsewhere or
-nowhere.
+`match_rows` assumes one depth per window, which nearly holds on a stalk, and rejects windows with an ambiguous match or none.
 """
 
 import dataclasses
@@ -22,10 +21,10 @@ from jaxrl_vis.stalks.phenotyping.measure.width import index_pairs, median
 
 _MIN_SCORE = 0.5
 _AGREEING = 0.4
-_SCATTER = 1.0  # pixels: windows that scatter by more do not see one stalk
-_FIRST = 6  # windows of a stalk that are looked for at every disparity
-_BESIDE = 12  # pixels: how far beside what they say the others are looked for
-_UNIQUE = 0.97  # a second peak of so much of the first one's height makes a window ambiguous
+_SCATTER = 1.0  # pixels: maximum scatter of the disparities of one stalk
+_FIRST = 6  # windows of a stalk that are searched over all disparities
+_BESIDE = 12  # pixels: search range of the other windows around the disparity expected from the first ones
+_UNIQUE = 0.97  # maximum ratio of the second to the first peak; above, a window is ambiguous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,10 +32,10 @@ class StalkDisparity:
     """Disparities of one stalk.
 
     Attributes:
-        lines: [N] float64, middle line of each window that was matched.
-        values: [N] float64, disparity there, pixels.
-        scores: [N] float64, how alike both sides are, up to 1.
-        tried: Number of windows.
+        lines: [N] float64, centre row of each matched window.
+        values: [N] float64, disparity of each, pixels.
+        scores: [N] float64, normalised cross-correlation of each, up to 1.
+        tried: Number of windows, including unmatched ones.
     """
 
     lines: np.ndarray
@@ -45,10 +44,11 @@ class StalkDisparity:
     tried: int
 
     def at(self, line: float) -> tuple[float, float] | None:
-        """Disparity in a line and its standard error, by a straight line through the windows that most agree with.
+        """Estimate the disparity in an image row by a robust straight-line fit to the windows.
 
         Returns:
-            Pixels; None where fewer than three windows agree, or less than 0.4 of those that were tried.
+            Disparity and its standard error, pixels; None if there are fewer than three inliers, or fewer than 0.4 of the
+            windows tried.
         """
         least = max(3, math.ceil(_AGREEING * self.tried))
         if self.lines.size < least:
@@ -74,7 +74,7 @@ class StalkDisparity:
 
 
 def grey(image: np.ndarray) -> np.ndarray:
-    """An image [H, W] or [H, W, 3] of any depth as [H, W] float32."""
+    """Convert an image [H, W] or [H, W, 3] of any dtype to greyscale [H, W] float32."""
     return (
         image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
     )
@@ -90,16 +90,16 @@ def match_rows(
     core: float = 0.7,
     spread: int = 2,
 ) -> StalkDisparity:
-    """Disparities of a stalk whose edges are known, window by window.
+    """Match windows along a stalk with known edges.
 
     Args:
-        left, right: [H, W] grey, uint8 or float32, rectified; only the lines around ``lines`` are looked at.
-        lines: [N] middle line of each window, whole numbers.
-        edges: Columns [N] of the stalk's left and right edge in each of them.
-        bounds: Least and greatest disparity, pixels.
-        half_height: A window has twice as many lines and one.
-        core: Share of the stalk's width that a window spans, in its middle: towards its edges a stalk is further away.
-        spread: Number of lines that the right image may lie too low or too high.
+        left, right: Rectified greyscale images [H, W], uint8 or float32; only rows around ``lines`` are used.
+        lines: Integer centre row [N] of each window.
+        edges: Columns [N] of the stalk's left and right edge in each of these rows.
+        bounds: Minimum and maximum disparity, pixels.
+        half_height: Rows of a window above and below its centre row.
+        core: Central fraction of the stalk's width that a window spans: towards its edges a stalk is further away.
+        spread: Tolerance for vertical misalignment of the right image, rows up or down.
     """
     wanted = [
         _Window(
@@ -110,7 +110,7 @@ def match_rows(
         for line, begin, end in zip(np.asarray(lines, int), *edges)
     ]
     wanted = [strip for strip in wanted if strip.inside(left.shape, half_height, spread)]
-    # A few windows are looked for wherever they may be. Where they agree, the others are looked for near to where that says.
+    # A few windows are searched over all disparities. If these agree, the others are searched near the expected disparity.
     first = sorted(set(np.linspace(0, len(wanted) - 1, min(_FIRST, len(wanted))).round().astype(int)))
     whole = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
     matches = {place: _match(left, right, wanted[place], whole, half_height, spread) for place in first}
@@ -130,14 +130,14 @@ def match_rows(
 
 @dataclasses.dataclass(frozen=True)
 class _Window:
-    """A piece of a stalk: its middle line, its first column and the one past its last."""
+    """Window of a stalk: its centre row, first column, and end column (exclusive)."""
 
     line: int
     first: int
     last: int
 
     def inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
-        """Return True if it is wide enough, and the image holds it and the lines around it that the right image may need."""
+        """Return whether the window is wide enough and, with the margin for vertical misalignment, inside the image."""
         reach = half_height + spread
         tall = reach <= self.line and self.line + reach + 1 <= shape[0]
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
@@ -146,7 +146,7 @@ class _Window:
 def _match(
     left: np.ndarray, right: np.ndarray, window: _Window, within: tuple[int, int], half_height: int, spread: int
 ) -> tuple[float, float] | None:
-    """Disparity of a window and how alike both sides are; None where nothing within the bounds is alike, or too much."""
+    """Return the disparity and correlation of a window; None if there is no match within the bounds, or an ambiguous one."""
     top, bottom = window.line - half_height, window.line + half_height + 1
     begin, end = max(window.first - within[1] - 1, 0), min(window.last - within[0] + 1, right.shape[1])
     if end - begin < window.last - window.first + 2:
@@ -158,7 +158,10 @@ def _match(
 
 
 def _agreed(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
-    """Offset and slope of the line through most of some (line, disparity); None unless at least three agree."""
+    """Fit a robust line to (row, disparity) pairs and return its offset and slope.
+
+    Returns None unless at least three, and all but one, are inliers.
+    """
     if len(matches) < 3:
         return None
     line, value = np.array(matches, float).T
@@ -176,14 +179,14 @@ def sample_rows(
     bounds: tuple[float, float],
     core: float = 0.7,
 ) -> StalkDisparity:
-    """Disparities of a stalk whose edges are known, out of an image of disparities.
+    """Sample the disparities of a stalk with known edges from a disparity image.
 
     Args:
-        disparity: [H, W] float32, pixels; not a number where there is none.
-        lines: [N] whole numbers.
-        edges: Columns [N] of the stalk's left and right edge in each of them.
-        bounds: Least and greatest disparity, pixels.
-        core: Share of the stalk's width that is looked at, in its middle.
+        disparity: [H, W] float32, pixels; NaN where unknown.
+        lines: Integer image rows [N].
+        edges: Columns [N] of the stalk's left and right edge in each of these rows.
+        bounds: Minimum and maximum disparity, pixels.
+        core: Central fraction of the stalk's width that is used.
     """
     samples = []
     for line, begin, end in zip(np.asarray(lines, int), *edges):
@@ -192,7 +195,7 @@ def sample_rows(
         if not 0 <= line < disparity.shape[0] or last <= first:
             continue
         values = disparity[line, first:last]
-        values = values[(values >= bounds[0]) & (values <= bounds[1])]  # not a number is neither
+        values = values[(values >= bounds[0]) & (values <= bounds[1])]  # false for NaN
         if 2 * values.size >= last - first:
             samples.append((float(line), float(np.median(values))))
     columns = np.array(samples, float).reshape(-1, 2)
@@ -200,7 +203,7 @@ def sample_rows(
 
 
 def _peak(score: np.ndarray) -> tuple[float, float] | None:
-    """Column to a fraction of a pixel, and height of the one clear peak of a correlation; None where there is none."""
+    """Return the subpixel column and the height of the unique peak of a correlation; None if there is none."""
     row, column = divmod(int(score.argmax()), score.shape[1])
     height = float(score[row, column])
     if not height >= _MIN_SCORE or column in (0, score.shape[1] - 1):
@@ -216,20 +219,20 @@ def _peak(score: np.ndarray) -> tuple[float, float] | None:
 
 
 def match_sgbm(left: np.ndarray, right: np.ndarray, box: tuple[int, int, int, int], bounds: tuple[float, float]) -> np.ndarray:
-    """Disparities of all pixels of a box, by semi-global matching of the strip that the box spans.
+    """Compute the disparities of all pixels of a box by semi-global matching.
 
     Args:
-        left, right: [H, W] or [H, W, 3] uint8, rectified.
-        box: First column and line, and one past the last ones.
-        bounds: Least and greatest disparity, pixels.
+        left, right: Rectified images [H, W] or [H, W, 3] uint8.
+        box: Left, top, right and bottom, pixels; right and bottom are exclusive.
+        bounds: Minimum and maximum disparity, pixels.
 
     Returns:
-        [h, w] float32, pixels; not a number where nothing matches.
+        Disparities [h, w] float32, pixels; NaN where unmatched.
     """
     first, top, last, bottom = box
     low = int(np.floor(bounds[0]))
     count = max(-(-(int(np.ceil(bounds[1])) - low + 1) // 16) * 16, 16)
-    # SGBM looks to the left by up to its greatest disparity, so the strip begins so much further left.
+    # SGBM searches to the left up to the maximum disparity, so the strip is extended to the left by as much.
     begin = max(first - low - count, 0)
     strips = [np.ascontiguousarray(image[top:bottom, begin:last]) for image in (left, right)]
     if strips[0].shape[1] <= low + count:

@@ -1,11 +1,11 @@
-"""Width of a stalk's mask in pixels, across its axis: by its two edges (`strip_width`), or by ellipses as in the thesis.
+"""Width of a stalk's mask in pixels, perpendicular to its axis: by its two edges (`strip_width`) or by ellipses (thesis).
 
-    mask -> left and right edge in each line, to a fraction of a pixel      `line_edges`
-         -> one straight line through each, deaf to outliers                `strip_width`, near one line `strip_near`
-         -> their distance across the axis, at any line                     `Strip.width`
+    mask -> left and right edge in each row, with subpixel precision        `line_edges`
+         -> robust straight line fit to each edge                           `strip_width`, locally `strip_near`
+         -> distance of the edges perpendicular to the axis, at any row     `Strip.width`
 
-An ellipse is no strip: its minor axis misses the width of one by -19 to +16 %, depending on how it is fitted, see
-benchmarks/stalks/strip_widths.py. Columns and lines are pixels, with (0, 0) in the middle of the first one.
+An ellipse is a poor model of a strip: its minor axis deviates from the width by -19 to +16 %, depending on the fit, see
+benchmarks/stalks/strip_widths.py. Coordinates are in pixels, with (0, 0) at the centre of the first one.
 """
 
 import dataclasses
@@ -18,29 +18,29 @@ import numpy as np
 
 EllipseFit = Literal["pixels", "pixels_direct", "contour", "contour_direct", "contour_ams", "moments"]
 ELLIPSE_FITS: tuple[EllipseFit, ...] = ("pixels", "pixels_direct", "contour", "contour_direct", "contour_ams", "moments")
-"""Ways to fit an ellipse to a blob. ``pixels``, least squares over all its pixels, is what the thesis describes."""
+"""Methods of fitting an ellipse to a blob. ``pixels``, least squares over all its pixels, is the method of the thesis."""
 
 _MIN_LINES = 8
-_SETTLED = 1e-3  # weights that change by less are those that they would become
-_SWELLING = 0.12  # of the width: by how much an edge may lie beside that of the rest of a stalk
-_OUTLIER_DISTANCE = 1.5  # pixels: an edge that lies further beside the others of its neighbourhood belongs to something else
+_SETTLED = 1e-3  # change of weights below which the robust fit has converged
+_SWELLING = 0.12  # of the width: maximum distance of a local edge from the edge fitted to the whole stalk
+_OUTLIER_DISTANCE = 1.5  # pixels: maximum distance of an edge from the mode of its neighbours
 _NOISE = (
-    0.35  # pixels: how far an edge of a perfect mask lies from the line through it (0.29, the error of rounding, and some more)
+    0.35  # pixels: standard deviation of the edge of a perfect mask about its line (0.29, the rounding error, plus a margin)
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Strip:
-    """A stalk as the two straight edges of its mask: column = offset + slope * (line - reference).
+    """Straight edges fitted to the mask of a stalk: column = offset + slope * (row - reference).
 
     Attributes:
-        reference: Middle line of those that were used.
+        reference: Mean row of the fit.
         left, right: Offset and slope of each edge.
-        first, last: First and last line that was used.
-        used: Share of the mask's lines whose two edges both lie on the fitted ones; what is missing is hidden, or a node.
-        residual: Root mean square distance of used edges from the fitted ones, pixels.
-        deviation: Standard error of the width at the reference line, pixels.
-        points: Lines [N] and columns of the left and right edge in each [N], which all of it was made of.
+        first, last: First and last inlier row.
+        used: Fraction of the mask's rows in which both edges are inliers; the others are occluded, or show a node.
+        residual: Root mean square distance of the inlier edge points from the fitted edges, pixels.
+        deviation: Standard error of the width at the reference row, pixels.
+        points: Rows [N] and columns of the left and right edge in each [N], outliers included.
     """
 
     reference: float
@@ -55,37 +55,37 @@ class Strip:
 
     @property
     def lean(self) -> float:
-        """Angle between the axis and the image's vertical, rad; positive where the stalk leans to the right."""
+        """Angle between the axis and the vertical of the image, rad; positive if the stalk leans to the right."""
         return -math.atan(0.5 * (self.left[1] + self.right[1]))
 
     def edges(self, line: float | None = None) -> tuple[float, float]:
-        """Columns of both edges in a line; in the reference line if none is given."""
+        """Return the columns of the left and right edges in a row; in the reference row if None."""
         offset = 0.0 if line is None else line - self.reference
         return self.left[0] + self.left[1] * offset, self.right[0] + self.right[1] * offset
 
     def width(self, line: float | None = None) -> float:
-        """Width across the axis where the axis crosses a line, pixels; at the reference line if none is given."""
+        """Return the width in pixels, perpendicular to the axis where it crosses a row; at the reference row if None."""
         left, right = self.edges(line)
         return (right - left) * math.cos(self.lean)
 
     @property
     def confidence(self) -> float:
-        """0 to 1: the share of lines that agree, less where they are few or scatter."""
+        """Confidence from 0 to 1: the fraction of inlier rows, reduced if these are few or scattered."""
         lines = self.last - self.first + 1
         enough = min(lines / (2.0 * max(self.width(), 1.0)), 1.0)
         return self.used * enough / (1.0 + (self.residual / 1.5) ** 2)
 
 
 def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Left and right edge of the longest run in each line of a mask.
+    """Find the left and right edge of the longest run in each row of a mask.
 
     Args:
-        mask: [H, W] bool, or float32 from 0 to 1, whose edges are found to a fraction of a pixel.
-        threshold: Lowest value that belongs to the stalk.
+        mask: [H, W] bool, or float32 from 0 to 1 for subpixel precision.
+        threshold: Minimum value of the stalk's pixels.
 
     Returns:
-        Lines [N] int64, and the columns of their left and right edges [N] float64. Lines in which a run touches the image's
-        left or right side are left out: the stalk goes on there.
+        Rows [N] int64, and the columns of their left and right edges [N] float64. Rows in which the longest run touches the
+        left or right side of the mask are omitted: the stalk may extend beyond it.
     """
     soft = np.asarray(mask, np.float32)
     inside = soft >= threshold
@@ -96,7 +96,7 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
     _, end = np.nonzero(change == -1)  # one past the last column of the run
     if not line.size:
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    # The longest run of each line, and of equally long ones the first.
+    # The longest run of each row; the first one in case of ties.
     order = np.lexsort((start, start - end, line))
     first = np.concatenate([[True], np.diff(line[order]) > 0])
     line, start, end = (array[order][first] for array in (line, start, end))
@@ -104,7 +104,7 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
     line, start, end = line[whole], start[whole], end[whole]
 
     def crossing(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-        """Return the position between the inner and the outer pixel at which the mask passes the threshold, 0 to 1."""
+        """Return the position between the inner and the outer pixel at which the mask crosses the threshold, 0 to 1."""
         out, within = soft[line, outer], soft[line, inner]
         return np.where(within > out, (within - threshold) / np.maximum(within - out, 1e-6), 0.5)
 
@@ -112,34 +112,36 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
 
 
 def strip_width(mask: np.ndarray, threshold: float = 0.5) -> Strip | None:
-    """The edges of a stalk's mask as two straight lines.
+    """Fit two straight lines to the edges of a stalk's mask.
 
-    Lines in which the stalk is partly hidden, swollen by a node, or cut off by the end of the strip do not count. Unbiased for
-    stalks that lean by up to 30 degrees: the width is taken across the axis, not along the image's lines.
+    Rows in which the stalk is partially occluded, swollen by a node, or cut off by the end of the strip are rejected as
+    outliers. Unbiased for stalks that lean by up to 30 degrees, as the width is perpendicular to the axis instead of along the
+    rows.
 
     Args:
-        mask: [H, W] bool, or float32 from 0 to 1: of one stalk, or a piece of it, standing more upright than lying.
-        threshold: Lowest value that belongs to the stalk.
+        mask: Mask [H, W] of one stalk or a segment of it, more upright than horizontal; bool, or float32 from 0 to 1.
+        threshold: Minimum value of the stalk's pixels.
 
     Returns:
-        The strip; None where fewer than eight lines agree.
+        Fitted strip; None if there are fewer than eight inlier rows.
     """
     return fit_edges(*line_edges(mask, threshold))
 
 
 def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | None:
-    """The edges of a stalk near a line: what it is like there, and not where a sheath covers it.
+    """Fit the edges of a stalk locally around a row, so that sheaths elsewhere have no effect.
 
-    Slopes are those of the whole strip, which many more lines tell.
+    Slopes are those of the whole strip, which are determined by many more rows.
 
     Args:
-        strip: Strip of a whole mask.
-        line: Line of the mask.
-        reach: Distance above and below the line within which edges are looked at, pixels.
-        lines: Number of lines of the mask.
+        strip: Strip of the whole mask.
+        line: Row of the mask.
+        reach: Distance above and below the row within which edges are used, pixels.
+        lines: Height of the mask.
 
     Returns:
-        The strip; None where less than half of the lines there agree, or they do not go with the rest of the stalk.
+        Local strip; None if fewer than half of the rows (or eight) are inliers, these do not enclose ``line``, or they are
+        inconsistent with the rest of the stalk.
     """
     first, last = max(math.floor(line - reach), 0), min(math.ceil(line + reach) + 1, lines)
     if last - first < _MIN_LINES:
@@ -172,26 +174,26 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
 
 
 def _deviation(rms: float, count: int) -> float:
-    """Standard deviation of a width, pixels: of two edges that so many lines agree on, each no better than a twentieth."""
+    """Return the standard error of a width from ``count`` rows with edge residuals ``rms`` (0.05 or more), pixels."""
     return math.sqrt(2.0) * max(rms, 0.05) / math.sqrt(count)
 
 
 def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | None:
-    """Straight lines through edges that were found line by line.
+    """Fit robust straight lines to edges found row by row.
 
     Args:
-        line: [N] lines.
-        left, right: [N] float64 columns of the edges.
+        line: Rows [N], in ascending order.
+        left, right: Columns [N] float64 of the edges.
 
     Returns:
-        The strip; None where fewer than eight lines agree.
+        Fitted strip; None if there are fewer than eight inlier rows.
     """
     if line.size < _MIN_LINES:
         return None
     points, total = (line, left, right), line.size
     slope = _common_slope(line, left, right)
-    # A strip that ends across its axis has lines at both ends in which one edge is that of the end. They lie within a width's
-    # projection of the first and last line.
+    # Near the ends of a strip that is cut perpendicular to its axis, one of the edges in a row belongs to the cut. These rows
+    # lie within the projected width of the first and last row.
     wide = median(right - left)
     cut = math.ceil(wide * abs(slope) / (1.0 + slope**2)) if abs(slope) > 0.01 else 0
     inner = (line >= line[0] + cut) & (line <= line[-1] - cut)
@@ -222,7 +224,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
         scale = max(scale, spread)
     if good.sum() < _MIN_LINES:
         return None
-    # Both edges of the same lines, so that what hides one of them tilts neither.
+    # Use the same rows for both edges, so that an occlusion of one edge tilts neither.
     fits = [_line(offset, edge, good.astype(float)) for edge in (left, right)]
     residuals = np.concatenate([edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), fits)])[np.tile(good, 2)]
     rms = float(np.sqrt(np.mean(residuals**2)))
@@ -240,7 +242,7 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
 
 
 def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> float:
-    """Slope that most pairs of edge points agree on, left or right: columns a line."""
+    """Estimate the common slope of both edges, columns per row: the mode over pairs of edge points."""
     step = max(line.size // 60, 1)
     places = np.arange(0, line.size, step)
     first, second = index_pairs(places.size, max(places.size // 4, 1))
@@ -252,19 +254,19 @@ def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> floa
 
 @functools.lru_cache(maxsize=512)
 def index_pairs(count: int, apart: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of indices below ``count`` that are so far ``apart`` or further, the lower one first."""
+    """Return all pairs of indices below ``count`` that differ by at least ``apart``, as arrays of the lower and upper ones."""
     return np.triu_indices(count, k=apart)
 
 
 def median(values: np.ndarray) -> float:
-    """Return the median of a few values [N], at least one: many times quicker than NumPy's, which looks after much else."""
+    """Return the median of a few values [N], N >= 1; many times faster than `np.median` for small arrays."""
     ordered = np.sort(values)
     half = len(ordered) // 2
     return float(ordered[half]) if len(ordered) % 2 else 0.5 * float(ordered[half - 1] + ordered[half])
 
 
 def _mode(values: np.ndarray, width: float = 1.0) -> float:
-    """Middle of the densest stretch of ``width``: what most values agree on, even where that is less than half of them."""
+    """Estimate the mode: the median of the interval of length ``width`` with the most values, even if these are a minority."""
     ordered = np.sort(values)
     upper = np.searchsorted(ordered, ordered + width, side="right")
     best = int(np.argmax(upper - np.arange(ordered.size)))
@@ -272,7 +274,7 @@ def _mode(values: np.ndarray, width: float = 1.0) -> float:
 
 
 def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Offset and slope of the weighted least-squares line."""
+    """Return the offset and slope of the weighted least-squares line."""
     total = weight.sum()
     mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
     spread = (weight * (x - mean_x) ** 2).sum()
@@ -281,15 +283,15 @@ def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, floa
 
 
 def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
-    """Width as the thesis takes it: the largest minor axis of the ellipses that are fitted to the mask's blobs.
+    """Compute the width as in the thesis: the largest minor axis of the ellipses fitted to the blobs of the mask.
 
     Args:
         mask: [H, W] bool, or float32 from 0 to 1.
         fit: Method of fitting an ellipse; see `ELLIPSE_FITS`.
 
     Returns:
-        Pixels; None where no blob has an ellipse that makes sense. Fits that come out wider than a blob of that area and length
-        can be, which OpenCV's do for some near-straight sets of points, are left out.
+        Width in pixels; None if no blob has a valid ellipse. Ellipses wider than a blob of that area and length can be, as
+        OpenCV returns for some nearly collinear points, are rejected.
     """
     inside = (np.asarray(mask, np.float32) >= 0.5).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)

@@ -1,1 +1,1 @@
-"""Sightings of stalks, followed from pair to pair along a plot."""
+"""Sightings of stalks in stereo pairs, and their tracking from pair to pair along a plot."""

@@ -1,7 +1,7 @@
-"""Direction in which the robot drove, and a check that its odometry and its images can both be right.
+"""Driving direction of the robot, and a consistency check of its odometry and images.
 
-Odometry counts metres, but does not say whether the cameras moved to their own right or to their left: that depends on the
-side of the robot that they look from. Two pairs that show the same stalks say by how much and which way they moved.
+Odometry gives distances, but not whether the cameras moved to their own right or left, which depends on the side of the robot
+they are mounted on. Two pairs that show the same stalks determine distance and direction of the motion.
 """
 
 import dataclasses
@@ -12,13 +12,13 @@ from jaxrl_vis.stalks.phenotyping.track.follow import Path, Track, follow
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 from jaxrl_vis_envs.plants import Calibration
 
-_ALONG, _DEPTH = 0.006, 0.02  # m: by what two sightings of one stalk differ at most once the drive is taken off
-_MIN_SHARED = 4  # stalks that two pairs must share before they say anything
-_SHARED_SHARE = 0.75  # of the stalks of the pair that has fewer: by chance, so many do not stand as they do in another pair
-_MAX_STEP_SHARE = 0.5  # of those: the odometry's own step explains less
-_MIN_CONTRADICTIONS = 0.25  # of the pairs with so many stalks must say something against the odometry
-_MIN_LINKED = 0.3  # of all sightings must go on a track the other way: fewer may do so by chance
-_LINK_RATIO = 1.2  # by what more stalks go together the other way, where nothing is wrong with the way as it is given
+_ALONG, _DEPTH = 0.006, 0.02  # m: maximum differences of two sightings of one stalk after motion compensation
+_MIN_SHARED = 4  # minimum number of shared stalks of two pairs to be compared
+_SHARED_SHARE = 0.75  # minimum shared fraction of the smaller pair's stalks: so many do not match by chance
+_MAX_STEP_SHARE = 0.5  # of those: a pair contradicts the odometry if its step matches fewer
+_MIN_CONTRADICTIONS = 0.25  # minimum fraction of the comparable pairs that contradict the odometry
+_MIN_LINKED = 0.3  # minimum fraction of all sightings that are linked in reverse: fewer may be so by chance
+_LINK_RATIO = 1.2  # minimum ratio of links in reverse to forward, if the forward direction is consistent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Followed:
     """Tracks of a plot, and the robot's path.
 
     Attributes:
-        tracks: Stalks, and what does not count.
-        path: The robot's path; places grow as the odometry does, also where the cameras moved to their own left.
-        fits: The images agree with the odometry. If not, nothing can be counted.
+        tracks: Tracks of stalks, including those that are not counted.
+        path: Path of the robot; places increase with the odometry, even if the cameras moved to their own left.
+        fits: True if the images are consistent with the odometry. If False, stalks cannot be counted.
     """
 
     tracks: list[Track]
@@ -42,20 +42,20 @@ def follow_either_way(
     calibration: Calibration,
     columns: tuple[float, float] | None = None,
 ) -> Followed:
-    """Put the sightings of a plot together, whichever way the cameras moved.
+    """Track the stalks of a plot in whichever direction the cameras moved.
 
-    What goes together with distances that grow to the cameras' right stays as `track.follow` makes it.
+    If the images are consistent with a motion to the cameras' right, the result is that of `follow.follow`.
 
     Args:
-        frames: Sightings of each pair, in the order in which the robot passed.
-        distances: [F] float64, how far it had driven by its odometry, m.
+        frames: Sightings of each pair, in driving order.
+        distances: Distance driven [F] float64 by odometry, m.
         calibration: Calibration of the cameras.
-        columns: See `track.follow`.
+        columns: Range of visible image columns; see `follow.follow`.
     """
     tracks, path = follow(frames, distances, calibration, columns=columns)
     fits = not _contradicted(frames, path.places)
     back, backwards = follow(frames, -np.asarray(distances, float), calibration, columns=columns)
-    # Where pairs are too unlike each other to contradict anything, the way on which they go together is the right one.
+    # If pairs differ too much to contradict either direction, take the one in which more sightings are linked.
     better = _links(back) > (_LINK_RATIO if fits else 1.0) * _links(tracks)
     well = _links(back) > _MIN_LINKED * sum(map(len, frames))
     if better and well and not _contradicted(frames, backwards.places):
@@ -65,16 +65,16 @@ def follow_either_way(
 
 
 def _links(tracks: list[Track]) -> int:
-    """Count the sightings of stalks that an earlier pair showed."""
+    """Count the sightings that continue a track from an earlier pair."""
     return sum(len(track.sightings) - 1 for track in tracks)
 
 
 def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
-    """Return True if most pairs that share stalks with the one before contradict the path.
+    """Return whether most pairs that share stalks with the previous one contradict the path.
 
     Args:
         frames: Sightings of each pair.
-        places: [F] float64, of each pair along the row, m.
+        places: Position [F] float64 of each pair along the row, m.
     """
     compared = judged = against = 0
     for first, second, step in zip(frames, frames[1:], np.diff(places)):
@@ -87,7 +87,7 @@ def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
 
 
 def _places(sightings: list[Sighting]) -> np.ndarray:
-    """Return the positions of a pair's stalks that are known, [N, 2] float64: along the row and away from the cameras, m."""
+    """Return the known positions [N, 2] float64 of the stalks of a pair: along the row and depth, m."""
     known = [
         (sighting.along_m, sighting.depth_m)
         for sighting in sightings
@@ -97,16 +97,19 @@ def _places(sightings: list[Sighting]) -> np.ndarray:
 
 
 def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, int, int]:
-    """Count the stalks that two pairs share: after the step that shares most, after a given one, and at the very most.
+    """Count the stalks that two pairs share, by matching their positions after a step of the cameras.
 
     Args:
-        first, second: [N, 2] and [M, 2] float64, see `_places`.
-        step: Distance that the cameras moved between them, m.
+        first, second: Positions [N, 2] and [M, 2] float64, see `_places`.
+        step: Distance that the cameras moved between the pairs by odometry, m.
+
+    Returns:
+        Number of shared stalks after the best step and after about the given step, and the maximum possible number.
     """
     most = min(len(first), len(second))
     if most < _MIN_SHARED:
         return 0, 0, most
-    moved = first[:, None, 0] - second[None, :, 0]  # [N, M], m: by what the cameras moved if the two were one stalk
+    moved = first[:, None, 0] - second[None, :, 0]  # [N, M], m: motion of the cameras if the two are one stalk
     near = np.abs(first[:, None, 1] - second[None, :, 1]) < _DEPTH
 
     def count(by: float) -> int:
@@ -115,6 +118,6 @@ def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, in
 
     candidates = moved[near]
     best = max((count(float(by)) for by in candidates), default=0)
-    # Odometry may be wrong by a few per cent, which `follow` takes off where it can; a step near enough is its own.
+    # Tolerate an error of the odometry of a few per cent, which `follow` corrects where possible.
     own = max((count(float(by)) for by in candidates if abs(by - step) < 0.018), default=0)
     return best, own, most

@@ -1,8 +1,8 @@
-"""Tracks: sightings in several pairs that are one stalk, and its position along the row.
+"""Tracking of stalks: association of sightings in several pairs, and the position of each stalk along the row.
 
-The robot says how far it has driven, to a few per cent; stereo says where a stalk stands beside it, to millimetres. A stalk's
-place along the row is their sum and stays the same from pair to pair, so a sighting belongs to the stalk that stands where it
-is. What most stalks moved by between two pairs corrects the robot's odometry.
+Odometry gives the distance driven to a few per cent; stereo gives the position of a stalk relative to the robot to millimetres.
+Their sum, the position along the row, is constant from pair to pair, so sightings are associated by position. The median motion
+of the stalks between two pairs corrects the odometry.
 """
 
 import dataclasses
@@ -14,26 +14,26 @@ from scipy.optimize import linear_sum_assignment
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 from jaxrl_vis_envs.plants import Calibration
 
-_USUAL_DEPTH = 0.8  # m, where no pair says
-_SOLID = 0.6  # of the distance at which two stalks touch
-_MAX_LEAN = 25.0  # degrees: what leans further was measured wrongly
-_FORBIDDEN_COST = 1e3  # cost of what does not belong together
+_USUAL_DEPTH = 0.8  # m, if no depth was measured
+_SOLID = 0.6  # minimum distance of two stalks, as a fraction of that at which they touch
+_MAX_LEAN = 25.0  # degrees: a larger lean is a measurement error
+_FORBIDDEN_COST = 1e3  # cost of an assignment outside the gates
 
 
 @dataclasses.dataclass(frozen=True)
 class Gates:
-    """Limits of what belongs together, lengths in m.
+    """Gates (thresholds) of the tracker, lengths in m.
 
     Attributes:
-        along: Greatest distance along the row between a stalk and a sighting of it.
-        depth: The same away from the cameras.
-        merge: Along the row, between two pieces of one stalk's track.
-        behind: The same, of pieces of which one has another depth, if it had not.
-        astray: Share of the pairs of the shorter piece that may show both.
-        row: Away from the cameras, between a stalk of the row and most others.
-        share: Share of the pairs that should show a stalk which must show it.
-        least: Least number of pairs that must show it, if so many can.
-        ends: Distance beyond the ends of the path within which a stalk's foot still counts.
+        along: Maximum distance along the row between a track and a sighting assigned to it.
+        depth: Maximum difference of their depths.
+        merge: Maximum distance along the row between two tracks of one stalk, which are merged.
+        behind: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
+        astray: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
+        row: Maximum difference between the depth of a counted stalk and the median depth.
+        share: Minimum fraction of the pairs with the stalk in view that must show it to count it.
+        least: Minimum number of pairs that must show it, unless fewer have it in view.
+        ends: Maximum distance of a counted stalk's foot beyond the ends of the path.
     """
 
     along: float = 0.018
@@ -49,14 +49,14 @@ class Gates:
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """One stalk.
+    """Track of one stalk.
 
     Attributes:
-        sightings: Pair and place in its list of each sighting.
-        position_m: Along the row, from where the robot was at the first pair.
-        depth_m: From the cameras; not a number where no pair says.
-        counted: It counts: enough pairs show it, and it stands beside the path.
-        reason: Why it does not count; empty where it does.
+        sightings: Index of the pair, and index within its sightings, of each sighting.
+        position_m: Position along the row, relative to the robot's at the first pair, m.
+        depth_m: Depth from the cameras, m; NaN if never measured.
+        counted: True if the stalk is counted: enough pairs show it, and it belongs to the row and to the path.
+        reason: Reason why it is not counted; empty if it is.
     """
 
     sightings: tuple[tuple[int, int], ...]
@@ -68,12 +68,12 @@ class Track:
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """The robot's path.
+    """Path of the robot.
 
     Attributes:
-        places: [F] float64, of each pair along the row, m: odometry, corrected by what stereo saw.
-        length: Length of the row that it passed, m: half a step more at each end.
-        seen: Share of that length which any pair shows.
+        places: [F] float64, position of each pair along the row, m: odometry corrected by stereo.
+        length: Length of the row that was passed, m, including half a step at each end.
+        seen: Fraction of that length in view of any pair.
     """
 
     places: np.ndarray
@@ -83,7 +83,7 @@ class Path:
 
 @dataclasses.dataclass
 class _Open:
-    """A track in the making."""
+    """Track under construction; its lists have one entry per sighting."""
 
     sightings: list[tuple[int, int]] = dataclasses.field(default_factory=list)
     along: list[float] = dataclasses.field(default_factory=list)
@@ -92,11 +92,11 @@ class _Open:
     feet: list[float] = dataclasses.field(default_factory=list)
 
     def depths(self) -> np.ndarray:
-        """Return its depth as the last pairs measured it, m."""
+        """Return the finite depths of the sightings, m."""
         return np.array(self.depth)[np.isfinite(self.depth)]
 
     def at(self, depth: float) -> float:
-        """Return its position along the row if it were at a depth in m, m."""
+        """Return the position along the row, m, assuming a depth in m."""
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
     def place(self) -> tuple[float, float]:
@@ -111,14 +111,17 @@ def follow(
     gates: Gates = Gates(),
     columns: tuple[float, float] | None = None,
 ) -> tuple[list[Track], Path]:
-    """Put the sightings of a plot together.
+    """Track the stalks of a plot.
 
     Args:
-        frames: Sightings of each pair, in the order in which the robot passed.
-        distances: [F] float64, how far it had driven by its odometry, m.
+        frames: Sightings of each pair, in driving order.
+        distances: Distance driven [F] float64 by odometry, m; increasing if the cameras moved to their own right.
         calibration: Calibration of the cameras.
-        gates: Limits of what belongs together.
-        columns: First column of the images that shows anything, and one past the last; None for all.
+        gates: Thresholds of the tracker.
+        columns: Half-open range of image columns without black borders; None for all.
+
+    Returns:
+        Tracks in the order in which the robot passed them, including those not counted, and the robot's path.
     """
     tracks: list[_Open] = []
     places = np.zeros(len(frames))
@@ -160,12 +163,12 @@ def follow(
 
 
 def _seen(places: np.ndarray, step: float, field: list[float]) -> float:
-    """Return the share of the row beside the path that any pair shows.
+    """Return the fraction of the row beside the path that is in view of any pair.
 
     Args:
-        places: [F] float64, of each pair along the row, m.
+        places: Position [F] float64 of each pair along the row, m.
         step: Distance between two pairs, m.
-        field: Both ends of what a pair shows of the row, from the pair's place, m.
+        field: Ends of the field of view along the row, relative to the position of the pair, m.
     """
     if not len(places):
         return 0.0
@@ -179,14 +182,14 @@ class _PairView:
     """Positions of the sightings of one pair, arrays [N].
 
     Attributes:
-        rays: Tangent of the angle at which the left camera sees a stalk.
-        along: Beside the middle between the cameras, m; taken to be as far away as most where the pair does not say.
-        depth: Depth of the fronts, m.
-        known: The pair measured its depth.
-        there: It may be a stalk of the row.
-        over: Distance along the row between its foot and the place of its measurement, m; 0 if its height is not known.
-        half: Half the baseline, m.
-        usual: Usual depth, m.
+        rays: Tangent of the horizontal angle at which the left camera sees the stalk.
+        along: Position along the row relative to the midpoint of the cameras, m; at the usual depth if not measured.
+        depth: Depth of the front surface, m; NaN if not measured.
+        known: True if position and depth were measured.
+        there: True if the sighting may be a stalk of the row.
+        over: Distance along the row from the stalk's foot to the place of its measurement, m; 0 if its height is unknown.
+        half: Half the baseline (scalar), m.
+        usual: Median depth over all pairs (scalar), m.
     """
 
     rays: np.ndarray
@@ -204,7 +207,7 @@ class _PairView:
         along = np.array([math.nan if sighting.along_m is None else sighting.along_m for sighting in sightings])
         depth = np.array([math.nan if sighting.depth_m is None else sighting.depth_m for sighting in sightings])
         known = np.isfinite(along) & np.isfinite(depth)
-        # What stands elsewhere is no stalk of the row.
+        # A depth without a position: not a stalk of the row.
         elsewhere = np.array([sighting.depth_m is not None and sighting.along_m is None for sighting in sightings], bool)
         over = np.array([_over(sighting) for sighting in sightings])
         half = 0.5 * calibration.baseline
@@ -212,22 +215,22 @@ class _PairView:
         return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), over, half, usual)
 
     def beside(self, depth: float) -> np.ndarray:
-        """Return their positions along the row, [N], if they were at a depth in m, m."""
+        """Return the positions along the row [N], m, assuming a ``depth`` in m; the usual depth if NaN."""
         return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
 
 
 def _over(sighting: Sighting) -> float:
-    """Return the distance along the row between a stalk's foot and the place where it was measured, m."""
+    """Return the distance along the row from a stalk's foot to the place of its measurement, m; 0 if unknown."""
     if sighting.height_m is None or sighting.lean_deg is None or abs(sighting.lean_deg) > _MAX_LEAN:
         return 0.0
     return sighting.height_m * math.tan(math.radians(sighting.lean_deg))
 
 
 def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
-    """Return True for the sightings of a pair that may be stalks of their own, [N] bool: two cannot stand in one place.
+    """Return [N] bool, True for sightings of a pair that are distinct stalks: two stalks cannot intersect in space.
 
-    Of two that do, one was found twice, and the less certain one goes. Their measured diameters are taken to be too large by up
-    to 40 % together with the error of their places.
+    Of two that do, the less certain one is a duplicate and marked False. The minimum distance is 60 % of that at which they
+    touch, to allow for errors of diameters and positions.
     """
     own = np.ones(len(sightings), bool)
     order = sorted(range(len(sightings)), key=lambda place: -sightings[place].score * (0.1 + sightings[place].confidence))
@@ -245,11 +248,11 @@ def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
 
 
 def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) -> list[tuple[int, int]]:
-    """Assign sightings to tracks: pairs of indices, every index at most once."""
+    """Assign sightings to tracks by minimum cost; return pairs (track, sighting) of indices, each used at most once."""
     if not tracks or not view.rays.size:
         return []
     there = np.array([track.place() for track in tracks])
-    # A sighting that does not say how far away it is, is looked for where the camera would see the track's stalk.
+    # A sighting without depth is compared at the depth of the track.
     along = np.where(view.known, view.along, [view.beside(depth) for _, depth in there]) + place
     aside = np.abs(there[:, :1] - along) / gates.along
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
@@ -259,17 +262,17 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
 
 
 def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
-    """Return the tracks without those that continue where another one was lost: they stand in one place and no pair shows both.
+    """Merge tracks of one stalk into the longer one, which is modified in place: same position, and hardly ever seen together.
 
-    Or they are seen in one place, always, and one depth is wrong: of two solid stalks that stand behind each other, the cameras
-    would see both as soon as they have moved on.
+    Tracks are also merged if they always lie on the same rays and one of the depths is wrong: of two stalks one behind the
+    other, the cameras would see both as they move on.
     """
     merged: list[_Open] = []
     for track in sorted(tracks, key=lambda track: -len(track.sightings)):
         for other in merged:
             aside, away = _apart(track, other)
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
-            # A sighting that went astray may make one pair show both.
+            # A wrongly assigned sighting may make both appear in one pair.
             near = aside < gates.merge and away < gates.depth
             if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.astray * len(track.sightings):
                 other.sightings += track.sightings
@@ -284,7 +287,7 @@ def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
 
 
 def _one_behind(track: _Open, other: _Open) -> float:
-    """Return the distance along the row, m, between two tracks if both were as far away as the other one."""
+    """Return the distance along the row, m, between two tracks if ``track`` is placed at the depth of ``other``."""
     depths = other.depths()
     if len(track.sightings) < 2 or not len(depths):
         return math.inf
@@ -294,12 +297,12 @@ def _one_behind(track: _Open, other: _Open) -> float:
 
 
 def _apart(track: _Open, other: _Open) -> tuple[float, float]:
-    """Return the distances of two tracks along the row and away from the cameras, m."""
+    """Return the distances of two tracks along the row and in depth, m."""
     depths = track.depths(), other.depths()
     if all(map(len, depths)) or not any(map(len, depths)):
         aside = abs(float(np.median(track.along) - np.median(other.along)))
         return aside, abs(float(np.median(depths[0]) - np.median(depths[1]))) if len(depths[0]) else 0.0
-    # One does not say how far away it is: it is taken to be as far away as the other.
+    # One has no depth: assume that of the other.
     depth = float(np.median(np.concatenate(depths)))
     return abs(track.at(depth) - other.at(depth)), 0.0
 
@@ -308,11 +311,11 @@ def _closed(track: _Open, path: Path, step: float, field: tuple[float, ...], usu
     position = float(np.median(track.along))
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
-    # What matters is how many pairs have the stalk well inside.
+    # Expected number of sightings: pairs with the stalk well inside the field of view.
     middle, half = (0.5 * (field[1] + sign * field[0]) * (depth if math.isfinite(depth) else usual) for sign in (1.0, -1.0))
     expected = int((np.abs(path.places + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
-    # What no pair says the distance of must be seen the more often.
+    # A stalk without a measured depth must be seen twice as often.
     wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.share * expected), 1)
     begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
     if len(track.sightings) < wanted:

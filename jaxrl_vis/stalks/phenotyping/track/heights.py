@@ -1,7 +1,7 @@
-"""Widths of stalks at stated heights above the ground, 12 and 24 inches, and the taper between them.
+"""Widths of stalks at 12 and 24 inches above the ground, and the taper between them.
 
-A stalk is measured as near to a height as its edges are seen. Where that is not quite there, taper makes up for the rest: how
-much thinner stalks become from inch to inch, by the stalks of the same plot that were measured at both heights.
+A stalk is measured as near to a height as its edges are visible. Widths measured at another height are corrected by the taper,
+the decrease in width per inch: the median over stalks of the same plot that were measured at both heights.
 """
 
 import dataclasses
@@ -16,34 +16,32 @@ from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 LOWER, UPPER = HEIGHTS
 USUAL_TAPER = 0.405
-"""mm per inch: of the thesis, for plots with too few stalks that were measured at both heights."""
-_TAPER_SPREAD = 0.3  # of a stalk's own taper about the plot's, of 1
+"""Taper of the thesis, mm per inch, for plots with too few stalks measured at both heights."""
+_TAPER_SPREAD = 0.3  # relative standard deviation of the taper of stalks within a plot
 _MIN_SIGHTINGS = 5
-_MIN_CLEAR = 3  # sightings without a hidden edge that make others unnecessary
+_MIN_CLEAR = 3  # number of sightings without an occluded edge from which the others are ignored
 _LOWER_BOUNDS = 0.85
-# What pairs do not disagree about, so that their scatter does not tell it: by the errors of synthetic stalks.
-_MASK_ERROR = 0.7  # pixels: masks err alike on one texture
-_HIDING_ERROR = 0.8  # mm, where all pairs may hide an edge
-_CALIBRATION_ERROR = 0.005  # of the width: focal length and baseline of a good calibration
-_FEW = 2.0  # pairs: few of them scatter by less than many would
-_FURTHEST = 4.0 * INCH  # m: what was measured further away says nothing of a height
-_NEAR_HEIGHT = 0.5 * INCH  # m: taper within that does not matter
-_ASIDE = (
-    20.0  # degrees beside the cameras' axis: from there another side of an oval stalk is seen than the one that faces the row
-)
+# Errors common to all pairs, which their scatter does not show; estimated on synthetic stalks.
+_MASK_ERROR = 0.7  # pixels: bias of masks on one texture
+_HIDING_ERROR = 0.8  # mm, if an edge may be occluded in all pairs
+_CALIBRATION_ERROR = 0.005  # relative: focal length and baseline of a good calibration
+_FEW = 2.0  # pairs: correction for the underestimated scatter of few pairs
+_FURTHEST = 4.0 * INCH  # m: maximum distance of a measurement from a height
+_NEAR_HEIGHT = 0.5 * INCH  # m: distance within which the taper correction is negligible
+_ASIDE = 20.0  # degrees off the cameras' axis at which the weight is 1/e: from aside, oval stalks show another side
 
 
 @dataclasses.dataclass(frozen=True)
 class Width:
-    """Diameter of a stalk by all its sightings.
+    """Diameter of a stalk, estimated from all its sightings.
 
     Attributes:
-        mm: Weighted median.
-        error: Its standard error, mm: of the scatter between pairs, of masks that err alike in all of them, of hidden edges,
-            and of a good calibration. Intervals of twice that cover about 95 % of synthetic stalks.
-        scatter: Standard error of the scatter between pairs alone, mm, and at least what edges and disparity tell.
-        count: Number of sightings.
-        corrected: Most of them were measured elsewhere, so that taper had to make up for it.
+        mm: Weighted median of the diameters, mm; a higher quantile if too few sightings show both edges.
+        error: Standard error, mm: from the scatter between pairs, the common bias of masks, occluded edges, and a good
+            calibration. Intervals of +/- 2 standard errors cover about 95 % of synthetic stalks.
+        scatter: Standard error from the scatter between pairs alone, mm, at least that from the errors of edges and disparity.
+        count: Number of sightings that were used.
+        corrected: True if most of them were measured at another height and corrected by the taper.
     """
 
     mm: float
@@ -55,13 +53,13 @@ class Width:
 
 @dataclasses.dataclass(frozen=True)
 class StalkWidths:
-    """One stalk.
+    """Widths of one stalk.
 
     Attributes:
-        lower: At 12 inches, or where it was seen if ``height_known`` is false.
-        upper: At 24 inches.
-        taper: Between them, mm per inch; None unless both were measured.
-        height_known: A pair that shows the stalk shows the ground.
+        lower: Width at 12 inches, or wherever it was measured if ``height_known`` is False; None if not measured.
+        upper: Width at 24 inches; None if not measured.
+        taper: Decrease in width between both heights, mm per inch; None unless both were measured.
+        height_known: True if ``lower`` is a width at 12 inches, which requires a pair that shows both the stalk and the ground.
     """
 
     lower: Width | None
@@ -71,7 +69,7 @@ class StalkWidths:
 
 
 def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
-    """Widths of the stalks of a plot, in the order of their tracks."""
+    """Estimate the widths of the stalks of a plot, in the order of their tracks."""
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
     first = [_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
     tapers = [width.taper for width in first if width.taper is not None]
@@ -81,14 +79,14 @@ def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[Stal
 
 @dataclasses.dataclass(frozen=True)
 class _Value:
-    """Width in one pair.
+    """Diameter measured in one pair.
 
     Attributes:
         mm, deviation: Diameter and its standard error, mm.
-        height: Of the measurement, m.
-        confidence: Weight.
-        hidden: An edge may be hidden.
-        pixel: Length of a pixel there, mm.
+        height: Height of the measurement above the ground, m.
+        confidence: Weight of the measurement.
+        hidden: True if an edge may be occluded.
+        pixel: Size of a pixel at the stalk, mm; 0 if unknown.
     """
 
     mm: float
@@ -127,17 +125,17 @@ def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
 
 
 def _pixel(mm: float, pixels: float | None) -> float:
-    """Return the length of a pixel, mm, at a stalk that is so wide; 0 where nobody knows."""
+    """Return the size of a pixel, mm, at a stalk of this width in mm and pixels; 0 if unknown."""
     return mm / pixels if pixels else 0.0
 
 
 def _facing(sighting: Sighting) -> float:
-    """Return the weight of a sighting for the side of a stalk that faces the row, 0 to 1."""
+    """Return the weight of a sighting by its viewing angle, 0 to 1; 1 if the angle is unknown."""
     return 1.0 if sighting.ray_deg is None else math.exp(-((sighting.ray_deg / _ASIDE) ** 2))
 
 
 def _at(height: float, values: list[_Value], taper: float) -> Width | None:
-    """Width at a height in m."""
+    """Estimate the width at a height in m; None if nothing was measured near it."""
     near, far = [], 0
     for value in values:
         beside = (value.height - height) / INCH
@@ -151,7 +149,7 @@ def _at(height: float, values: list[_Value], taper: float) -> Width | None:
 
 
 def robust_width(sightings: list[Sighting]) -> Width | None:
-    """Diameter of a stalk wherever it was measured; None if it never was."""
+    """Estimate the diameter of a stalk from sightings at any height; None if it was never measured."""
     return _robust(
         [
             _Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.hidden, _pixel(e.diameter_mm, e.width_px))
@@ -162,9 +160,10 @@ def robust_width(sightings: list[Sighting]) -> Width | None:
 
 
 def _robust(values: list[_Value]) -> Width | None:
-    """The median of what shows both edges; None where there is nothing.
+    """Estimate a width as the weighted median of the measurements with both edges visible; None if there are none at all.
 
-    Where too little does, a stalk is at least as thick as it looks, and most of what is said of it is too thin.
+    If there are too few of these, all measurements are used, and the 0.85 quantile instead of the median, as measurements with
+    an occluded edge are lower bounds.
     """
     clear = [value for value in values if not value.hidden]
     some, share = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)

@@ -1,4 +1,4 @@
-"""Faults of a pair that would make its widths wrong: swapped, upside down, not rectified, or calibrated in another unit."""
+"""Detection of faults of a pair that make widths wrong: swapped, upside down, unrectified, or calibrated in a wrong unit."""
 
 import dataclasses
 
@@ -12,12 +12,12 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sightin
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
-_MOST = 0.7  # of the detections: so many of a good pair are measured
-_SAME_DEPTH = 0.15  # of a distance, by which stalks of one row differ
-_NEAREST = 3.0  # baselines: nearer, the cameras see hardly anything in common
+_MOST = 0.7  # minimum fraction of the detections that are measured in a good pair
+_SAME_DEPTH = 0.15  # maximum relative difference of the depths of one row
+_NEAREST = 3.0  # minimum depth in baselines: below, the fields of view hardly overlap
 _LEAST_DISPARITY = 2.0  # pixels
 _SMALL_SHARE, _LARGE_SHARE = 0.25, 0.6
-_LINES = (6, 12, 24, 48)  # how far two images lie apart that are not rectified, pixels at a focal length of 2168
+_LINES = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
 
 
 def pair_fault(
@@ -28,14 +28,14 @@ def pair_fault(
     calibration: Calibration,
     ground: Ground | None = None,
 ) -> str | None:
-    """Say in words what is wrong with a pair; None if nothing is, or too few stalks were detected to tell.
+    """Return a message on what is wrong with a pair; None if nothing is, or there are too few detections to tell.
 
     Args:
-        detections: In the left image.
-        sightings: Their sightings.
-        left, right: [H, W, 3] uint8.
+        detections: Detections in the left image.
+        sightings: Sighting of each detection.
+        left, right: Images [H, W, 3] uint8.
         calibration: Calibration of the cameras.
-        ground: The ground that the pair shows.
+        ground: Ground plane found in the pair; None if none.
     """
     grey_left, grey_right = grey_at(left), grey_at(right)
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
@@ -46,7 +46,7 @@ def pair_fault(
         return fault
     if len(detections) < _MIN_STALKS or measured > _SMALL_SHARE * len(detections):
         return None
-    # Seen in a mirror, a pair that is swapped is one that is not.
+    # The mirror image of a swapped pair is a correct pair.
     mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
     turned = [
         dataclasses.replace(
@@ -67,7 +67,7 @@ def pair_fault(
 
 
 def _upside_down(left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
-    """Say in words that a pair [H, W] grey is upside down; None if it is not."""
+    """Return a message if a greyscale pair [H, W] is upside down; None if not."""
     column, line = calibration.centre
     turned = dataclasses.replace(calibration, centre=(column, calibration.height - 1 - line))
     if find_ground(left[::-1], right[::-1], turned) is not None:
@@ -79,7 +79,7 @@ def _upside_down(left: np.ndarray, right: np.ndarray, calibration: Calibration) 
 
 
 def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> str | None:
-    """Say in words that the stalks of a pair [H, W] grey stand where no row does, by its calibration; None if they do not."""
+    """Return a message if the stalks of a greyscale pair [H, W] have an implausible depth by its calibration; None if not."""
     depths = [depth for depth in (_any_depth(find, left, right, calibration) for find in _some(detections)) if depth]
     if len(depths) < _MIN_STALKS:
         return None
@@ -95,7 +95,7 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
 
 
 def _any_depth(find: Detection, left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float | None:
-    """Return the depth of a detection wherever it may be, m; None where the right image does not show it clearly."""
+    """Return the depth of a detection without the usual limits, m; None if it has no clear match in the right image."""
     strip = find.strip or strip_width(find.mask)
     if strip is None:
         return None
@@ -106,12 +106,12 @@ def _any_depth(find: Detection, left: np.ndarray, right: np.ndarray, calibration
 
 
 def _some(detections: list[Detection]) -> list[Detection]:
-    """Return ten of the detections at most."""
+    """Return at most ten of the detections, evenly spaced."""
     return detections[:: -(-len(detections) // 10)] if detections else []
 
 
 def _share(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
-    """Return the share of detections, ten at most, that the right image shows."""
+    """Return the fraction of the detections, of which at most ten are tried, that can be measured with the right image."""
     some = _some(detections)
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
     measured = [

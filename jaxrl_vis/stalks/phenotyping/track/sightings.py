@@ -1,4 +1,4 @@
-"""Sightings: the stalks that one pair shows, measured where the pair allows it."""
+"""Sightings: the stalks detected in one stereo pair, with their measurements where possible."""
 
 import dataclasses
 import math
@@ -20,44 +20,44 @@ from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
 Find = Callable[[np.ndarray, float | None], list[Detection]]
-"""Finds the stalks in a left image [H, W, 3] uint8 with so many pixels per metre at the row; None if nobody knows."""
+"""Detector of the stalks in a left image [H, W, 3] uint8, given its pixels per metre at the row, or None if unknown."""
 USUAL_DISTANCE = 0.8
-"""Distance from the cameras to the row, m, where nothing says otherwise."""
-_OTHER_DISTANCES = (0.55, 1.15)  # m: at which a row is looked for that is not seen at the usual one
-_SAME_DISTANCE = 0.12  # of 1: networks find stalks that are by so much larger or smaller than those of the usual distance
-_AT_DISTANCE = 3  # stalks that say how far away the row is
-_FAR_FROM_ROW = 0.2  # m: what stands there is not of the row
-_HIDDEN = 0.1  # of its confidence that a sighting keeps if one of its edges may be hidden
-_BEHIND = 0.003  # m: what stands so much further away hides nothing
-_TOUCHING = 0.1  # of half a stalk's width: edges so near are one
-_SAME_DEPTH = 0.06  # m, within 12 inches of a stalk that leans by 10 degrees
+"""Default distance from the cameras to the row, m."""
+_OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
+_SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
+_AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
+_FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
+_HIDDEN = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
+_BEHIND = 0.003  # m: a stalk further behind occludes nothing
+_TOUCHING = 0.1  # of half a stalk's width: distance within which edges touch
+_SAME_DEPTH = 0.06  # m: change of depth over 12 inches of a stalk that leans by 10 degrees
 
 
 @dataclasses.dataclass(frozen=True)
 class Sighting:
-    """One stalk in one pair. Lengths that are not known are None.
+    """One stalk in one pair. Unknown lengths are None.
 
     Attributes:
-        box: Left, top, right, bottom of its part in the band, pixels of the left image; (0, 0) is the middle of the first one.
-        axis: Columns of its middle at the box's top and bottom.
+        box: Left, top, right and bottom of its part in the band, pixels of the left image; (0, 0) is the centre of the first
+            pixel.
+        axis: x coordinates of its centre line at the top and bottom of the box, pixels.
         score: Score of the detector, 0 to 1.
-        line, column: Place of the measurement: line, and column of its middle, pixels.
-        width_px: Across its axis there, pixels.
-        lean_deg: Against the image's vertical, degrees, positive to the right.
-        diameter_mm: Across its axis.
-        deviation_mm: Its standard error.
-        depth_m: Planar depth of its front.
-        along_m: Position along the row, from the middle between the cameras.
-        height_m: Height of the measurement above the ground; None if the pair shows no ground.
+        line, column: Row of the measurement, and column of the stalk's centre line in it, pixels.
+        width_px: Width perpendicular to the axis, pixels.
+        lean_deg: Angle against the vertical of the image, degrees, positive to the right.
+        diameter_mm: Diameter perpendicular to the axis, mm.
+        deviation_mm: Standard error of the diameter, mm.
+        depth_m: Planar depth of the front surface, m.
+        along_m: Position along the row, relative to the midpoint of the cameras, m.
+        height_m: Height of the measurement above the ground, m; None if no ground was found in the pair.
         upper_mm, upper_deviation_mm, upper_height_m, upper_confidence: Diameter, its standard error, height and confidence
-            around 24 inches above the ground.
-        upper_place: Column, line and width in pixels of that.
-        confidence: 0 to 1.
-        hidden, upper_hidden: One of its edges may be hidden, so that it is at least so thick: another stalk stands
-            there, or, of the lower one, the edges were not seen around the height itself. All of the upper piece is near its
-            height.
-        ray_deg: Angle between the left camera's axis and the ray to it, degrees, positive to the right.
-        reason: Why it was not measured; empty where it was.
+            of the measurement around 24 inches above the ground.
+        upper_place: Column, row and width of that measurement, pixels.
+        confidence: Confidence of the measurement, 0 to 1.
+        hidden, upper_hidden: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches it,
+            or, for the lower measurement, the edges are not visible around the row itself.
+        ray_deg: Horizontal angle between the left camera's axis and the ray to the stalk, degrees, positive to the right.
+        reason: Reason why the stalk was not measured; empty if it was.
     """
 
     box: tuple[float, float, float, float]
@@ -85,10 +85,10 @@ class Sighting:
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> "Sighting":
-        """From what JSON kept of `dataclasses.asdict`.
+        """Build a sighting from the JSON object of its `dataclasses.asdict`.
 
         Raises:
-            ValueError: Something is missing, unknown, or of another kind.
+            ValueError: A field is missing, unknown, or of the wrong type or length.
         """
         parts: dict[str, Any] = {}
         for name, (kind, optional, length) in _KINDS.items():
@@ -106,7 +106,7 @@ class Sighting:
 
 
 def _field_kind(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
-    """Type of a field's values, whether it may be None, and the number of values."""
+    """Return the type of a field's values, whether it is optional, and its number of values."""
     one, optional, several = fields.unwrap(hint)
     length = next((len(get_args(part)) for part in (hint, *get_args(hint)) if get_origin(part) is tuple), 1)
     return (int, float) if one is float else one, optional, length if several else 1
@@ -116,7 +116,7 @@ _KINDS = {name: _field_kind(hint) for name, hint in fields.hints(Sighting).items
 
 
 def grey_at(image: np.ndarray) -> np.ndarray:
-    """An image [H, W, 3] uint8 as [H, W] uint8."""
+    """Convert an RGB image [H, W, 3] uint8 to greyscale [H, W] uint8."""
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
@@ -128,14 +128,17 @@ def find_with_ground(
     disparity: np.ndarray | None = None,
     distance: float = USUAL_DISTANCE,
 ) -> tuple[list[Detection], Ground | None]:
-    """The stalks and the ground of a pair, looked for at the same time: an accelerator finds the one and the host the other.
+    """Detect the stalks of a pair and find its ground plane concurrently, the latter in a thread on the host.
 
     Args:
-        find: Detector of the stalks.
-        left, right: [H, W, 3] uint8, rectified.
-        calibration: Calibration of the cameras; without it, no ground is looked for.
-        disparity: See `find_ground`.
-        distance: Distance from the cameras to the row, m, which with the focal length gives the size of stalks in pixels.
+        find: Stalk detector.
+        left, right: Rectified images [H, W, 3] uint8.
+        calibration: Calibration of the cameras; None to skip the ground, and to call ``find`` without a resolution.
+        disparity: Known disparities; see `find_ground`.
+        distance: Distance from the cameras to the row, m, which with the focal length gives the pixels per metre at the row.
+
+    Returns:
+        Detections, and the ground plane, None if not found.
     """
     if calibration is None:
         return find(left, None), None
@@ -146,13 +149,13 @@ def find_with_ground(
 
 @dataclasses.dataclass(frozen=True)
 class PairView:
-    """All that a pair shows.
+    """Detections and measurements of one stereo pair.
 
     Attributes:
-        detections: In its left image.
-        sightings: Of each of them.
-        ground: Origin of heights; None where it shows none.
-        frame: Part of the left image that shows anything.
+        detections: Detections in the left image.
+        sightings: Sighting of each detection.
+        ground: Ground plane, the reference for heights; None if not found.
+        frame: Part of the left image without black borders.
     """
 
     detections: list[Detection]
@@ -169,17 +172,17 @@ def view_pair(
     method: Method = "strip",
     disparity: np.ndarray | None = None,
 ) -> PairView:
-    """Find and measure the stalks of a pair, whose row may be nearer or further away than usual.
+    """Detect and measure the stalks of a pair, whose row may be nearer or further away than usual.
 
-    Networks find stalks of about one size in pixels. Where stereo says that the row stands elsewhere, or nothing is found, they
-    look again for stalks of the size that they have there.
+    The networks detect stalks of about one size in pixels. If stereo shows that the row is at another distance, or few stalks
+    are detected, detection is repeated with images scaled for other distances.
 
     Args:
-        find: Detector of the stalks.
-        left, right: [H, W, 3] uint8, rectified.
-        calibration: Calibration of the cameras.
-        method: Method of widths.
-        disparity: See `measure_pair`.
+        find: Stalk detector.
+        left, right: Rectified images [H, W, 3] uint8.
+        calibration: Calibration of the cameras; None if unknown.
+        method: Method of measuring widths.
+        disparity: Known disparities; see `measure_pair`.
     """
     detections, ground = find_with_ground(find, left, right, calibration, disparity)
     frame = find_frame(left)
@@ -200,7 +203,7 @@ def view_pair(
 
 
 def row_distance(sightings: list[Sighting]) -> float | None:
-    """Return the distance at which most stalks of a pair, or of several, were measured, m; None where too few were."""
+    """Return the median depth of the measured stalks of one or several pairs, m; None if there are too few."""
     depths = [sighting.depth_m for sighting in sightings if sighting.diameter_mm is not None and sighting.depth_m is not None]
     return float(np.median(depths)) if len(depths) >= _AT_DISTANCE else None
 
@@ -214,15 +217,18 @@ def measure_pair(
     ground: Ground | None = None,
     disparity: np.ndarray | None = None,
 ) -> list[Sighting]:
-    """Measure what was found in a pair.
+    """Measure the detections of a pair.
 
     Args:
-        detections: In the left image.
-        left, right: [H, W, 3] uint8, rectified.
-        calibration: Calibration of the cameras; without it there are no millimetres and no metres.
-        method: Method of widths.
-        ground: Origin of heights; without it a stalk is measured in the middle of its box, and only there.
-        disparity: [H, W] float32, disparities that are known, pixels.
+        detections: Detections in the left image.
+        left, right: Rectified images [H, W, 3] uint8.
+        calibration: Calibration of the cameras; None for measurements in pixels only.
+        method: Method of measuring widths.
+        ground: Ground plane, the reference for heights; None to measure stalks only in the middle of their boxes.
+        disparity: Known disparities [H, W] float32 to use instead of matching, pixels; NaN where unknown. None to match.
+
+    Returns:
+        One sighting per detection.
     """
     if calibration is None:
         return [_in_pixels(detection) for detection in detections]
@@ -252,12 +258,12 @@ def measure_pair(
 def _without_strangers(
     measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, begin: int
 ) -> list[tuple[Measurement, Measurement | None]]:
-    """Return measurements without those that matched something else, as the right image does not reach as far as their stalk.
+    """Invalidate measurements of stalks outside the right image, which were matched with something else.
 
     Args:
-        measured: Measurements of the stalks of a pair, lower and upper.
+        measured: Lower and upper measurement of each stalk of a pair.
         calibration: Calibration of the cameras.
-        begin: First column that the right image shows.
+        begin: First column of the right image without a black border.
     """
     depths = [got.depth for got, _ in measured if got.diameter_mm is not None]
     if len(depths) < _AT_DISTANCE:
@@ -275,8 +281,9 @@ def _without_strangers(
 
 
 def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
-    """Return True for the stalks with an edge at another one that is not behind them: it may be the other's, and they look too
-    thin.
+    """Return True for stalks with an edge at another stalk that is not behind them.
+
+    Such an edge may be that of the other stalk, and the width too small.
     """
     hidden = []
     for measurement in measurements:
@@ -317,19 +324,19 @@ def _in_pixels(detection: Detection) -> Sighting:
 
 
 def _sighting(detection: Detection, got: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
-    """Rounded, so that what JSON keeps is what was measured."""
+    """Build a sighting from measurements, rounded so that it is unchanged by a round trip through JSON."""
     line = got.line if math.isfinite(got.line) else 0.5 * (detection.box[1] + detection.box[3])
     column = got.column if math.isfinite(got.column) else 0.5 * sum(detection.axis)
 
     def known(value: float | None, digits: int) -> float | None:
         return None if value is None or not math.isfinite(value) else round(value, digits)
 
-    # Another stalk may stand where this one's axis was followed to.
+    # Another stalk may stand where this one's axis was extrapolated to.
     same = upper is not None and abs(upper.depth - got.depth) < _SAME_DEPTH
     higher = upper if upper is not None and upper.diameter_mm is not None and same else Measurement()
     along = None
     if got.diameter_mm is not None:
-        # The middle stands behind the front by half a diameter.
+        # The axis is half a diameter behind the front surface.
         depth = got.depth + 0.5e-3 * got.diameter_mm
         along = (column - calibration.centre[0]) / calibration.focal * depth - 0.5 * calibration.baseline
     return Sighting(

@@ -1,19 +1,19 @@
-"""The same image, differently lit, leaning, mirrored: what the networks must not depend on."""
+"""Data augmentation: random lighting, geometry and texture, to which the networks should be invariant or equivariant."""
 
 import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING
 
-_WELL_ROOT = 94.9  # square root of the electrons of a white pixel of the synthetic cameras
-_DARK = 0.016  # light that makes as much noise as the sensor does by itself, of white
+_WELL_ROOT = 94.9  # square root of the full-well capacity (electrons at white) of the synthetic cameras
+_DARK = 0.016  # signal, as a fraction of white, whose shot noise equals the read noise
 _TAPS = 3  # pixels: reach of the blur
 
 
 def relight(images: jax.Array, key: jax.Array) -> jax.Array:
-    """Images [N, H, W, 3] uint8 as taken with other light, lens, sensor and tone curve, uint8.
+    """Augment images [N, H, W, 3] uint8 with random lighting, colour, blur, noise and tone curve; same shape and dtype.
 
-    Light, blur and noise act where they do in a camera: on linear values, before what is negative or beyond white is cut off.
+    Lighting, blur and noise are applied as in a camera: to linear values, before clipping.
     """
     names = ("gain", "gamma", "colour", "grey", "noise", "level", "blotch", "strength", "blur", "sharp")
     keys: dict[str, jax.Array] = dict(zip(names, jax.random.split(key, len(names))))
@@ -26,11 +26,11 @@ def relight(images: jax.Array, key: jax.Array) -> jax.Array:
     grey = values.mean(axis=-1, keepdims=True)
     values = jnp.maximum(grey + (values - grey) * each("grey", 0.2, 1.5), 0.0)
     gain = jnp.exp(each("gain", -1.2, 1.0)) * jnp.exp(0.2 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
-    # Blotches of brightness, as of other textures, a few pixels to a tenth of the image large.
+    # Smooth random variations of brightness, as of other textures, on a grid of 24 x 24 cells.
     coarse = jax.random.normal(keys["blotch"], (count, 24, 24, 1))
     gain = gain * jnp.exp(each("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
     values = _blurred(values * gain, jnp.where(each("sharp", 0.0, 1.0) > 0.5, each("blur", 0.3, 1.3), 0.05))
-    # Up to three times the shot and read noise that is there already, less where the image is reduced.
+    # Up to three times the shot and read noise of the original images, of which downscaled ones have less.
     level = 3.0 * each("level", 0.0, 1.0) ** 2 / _WELL_ROOT
     values = values + level * jnp.sqrt(values + _DARK) * jax.random.normal(keys["noise"], values.shape)
     curve = jnp.exp(0.15 * jax.random.normal(keys["gamma"], (count, 1, 1, 1))) / 2.2
@@ -38,7 +38,7 @@ def relight(images: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
-    """Values [N, H, W, C] seen through a lens whose point spread is a normal one, ``deviation`` [N, 1, 1, 1] pixels wide."""
+    """Blur values [N, H, W, C] by a Gaussian with standard deviation ``deviation`` [N, 1, 1, 1], pixels."""
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation) ** 2)  # [N, 1, 1, taps]
     taps = taps / taps.sum(axis=-1, keepdims=True)
     for axis in (1, 2):
@@ -52,14 +52,17 @@ def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
 def move(
     images: jax.Array, stalks: jax.Array, kinds: jax.Array, sizes: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Images mirrored, sheared, stretched and shifted, with their stalks; a quarter of them is only mirrored.
+    """Randomly mirror, shear, stretch and shift images and their stalks; a quarter of them is mirrored at most.
 
     Args:
-        images: [N, H, W, 3] uint8, padded below and on the right.
-        stalks: [N, T, 6].
-        kinds: [N, T] int32.
-        sizes: [N, 2] int32, lines and columns of the images without what was added.
-        key: For the random numbers.
+        images: [N, H, W, 3] uint8, padded at the bottom and on the right.
+        stalks: [N, T, 6], boxes and axes.
+        kinds: [N, T] int32, see `losses.assign`.
+        sizes: [N, 2] int32, height and width of the images without padding.
+        key: PRNG key.
+
+    Returns:
+        Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``.
     """
     keys = jax.random.split(key, images.shape[0])
     return jax.vmap(_moved)(images, stalks, kinds, sizes, keys)
@@ -92,7 +95,7 @@ def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Arr
     top, bottom = (tall * (edge - height / 2) + height / 2 + down for edge in (top, bottom))
     begin, end = jnp.where(mirror, width - end, begin), jnp.where(mirror, width - begin, end)
     above, below = (jnp.where(mirror, width - column, column) for column in (above, below))
-    # The axis goes on beyond what the image's edges leave of the box.
+    # Boxes are clipped to the image, and the axis is evaluated at the clipped top and bottom.
     begin, end = jnp.clip(begin, 0.0, width), jnp.clip(end, 0.0, width)
     low, high = jnp.clip(top, 0.0, height), jnp.clip(bottom, 0.0, height)
     slope = (below - above) / jnp.maximum(bottom - top, 1.0)
@@ -102,7 +105,7 @@ def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Arr
 
 
 def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Array) -> jax.Array:
-    """An image at other places, by bilinear interpolation; black beyond ``shape``."""
+    """Sample an image at rows ``line`` and columns ``column`` by bilinear interpolation; black outside ``shape``."""
     inside = (line >= -0.5) & (line <= shape[0] - 0.5) & (column >= -0.5) & (column <= shape[1] - 0.5)
     line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
     top, left = jnp.floor(line).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
@@ -115,7 +118,7 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Arr
 
 
 def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Snips [N, H, W, 3] uint8 and masks [N, H, W] bool: relit, with other textures and widths, and half of them mirrored."""
+    """Augment stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool: width, texture, contrast, mirroring and lighting."""
     light, side, marks, size, contrast, along = jax.random.split(key, 6)
     snips, masks = _stretched(snips, masks, size)
     snips = _striped(_set_off(_textured(snips, marks), masks, contrast), masks, along)
@@ -126,10 +129,10 @@ def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.
 
 
 def _stretched(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Snips and masks wider or narrower by up to a third, about their middle."""
+    """Stretch crops and masks horizontally about their centre by a factor from exp(-0.3) to exp(0.3)."""
     count, _, width = snips.shape[:3]
     wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
-    place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], where a column comes from
+    place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], source of each column
     place = jnp.clip(place, 0.0, width - 1.0)
     left = jnp.minimum(jnp.floor(place).astype(jnp.int32), width - 2)
     share = (place - left)[:, None, :]
@@ -144,7 +147,7 @@ def _stretched(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.
 
 
 def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
-    """Snips with speckles, fibres along the stalk and dark sides: the textures of a family are not all that there are."""
+    """Add random speckles, fibres along the stalk and shading to crops, to cover more than the textures of a family."""
     count, height, width = snips.shape[:3]
     spots, fibres, shades, amounts = jax.random.split(key, 4)
     amount = jax.random.uniform(amounts, (4, count, 1, 1))
@@ -159,14 +162,13 @@ def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
-    """Snips of which most have stalks with lighter and darker stripes along them, as of ribs and folded sheaths, which change
-    from node to node.
+    """Add light and dark stripes along the stalk to 70 % of the crops, as of ribs and folded sheaths, varying by internode.
 
-    A dark stripe looks like a gap between two stalks, and what lies beyond it like another one; but it ends with the stalk.
+    A dark stripe looks like a gap between two stalks, but the stalk continues on its other side.
     """
     count, height, width = snips.shape[:3]
     keys = jax.random.split(key, 5)
-    # Internodes: which of four each line belongs to.
+    # Index of the internode, out of four, that each row belongs to.
     nodes = jnp.sort(jax.random.uniform(keys[0], (3, count)), axis=0) * height
     internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, lines]
     stripes = jnp.zeros(masks.shape)
@@ -181,16 +183,17 @@ def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
-    """Snips whose stalks differ more or less from what is behind them, and are darker towards their edges.
+    """Randomise the contrast of stalks to the background, and their shading towards the edges, in half of the crops.
 
-    How quickly a round stalk darkens towards its edges depends on its surface and on the light. A network that learns it by
-    heart puts the edges of other stalks too far in or out. What is black stays black: no edge is drawn where none is seen.
+    The shading of a round stalk towards its edges depends on its surface and on the light. A network that overfits to it
+    misplaces the edges of other stalks. The change is multiplicative, so black remains black and no edge appears where none was
+    visible.
     """
     count, _, width = snips.shape[:3]
     keys = jax.random.split(key, 6)
     inside = masks.astype(jnp.float32)
     own = jnp.exp(0.3 * jax.random.normal(keys[0], (count, 1, 1, 1)) + 0.15 * jax.random.normal(keys[1], (count, 1, 1, 3)))
-    # Share of the stalk in what lies beside each pixel of it: 1 in its middle, about a half at its edges.
+    # Fraction of stalk pixels in the horizontal neighbourhood of each pixel: 1 at the centre, about a half at the edges.
     share = jnp.zeros_like(inside)
     weights = jax.nn.softmax(2.0 * jax.random.normal(keys[2], (3, count)), axis=0)
     for reach, weight in zip((4, 8, 16), weights):
@@ -200,7 +203,7 @@ def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     amount = jax.random.uniform(keys[3], (count, 1, 1), minval=-0.3, maxval=0.8)
     power = jnp.exp(0.4 * jax.random.normal(keys[4], (count, 1, 1)))
     shade = 1.0 - amount * jnp.clip(2.0 * (1.0 - share), 0.0, 1.0) ** power
-    # Half of them stay as they are: their own contrast is all that a network has to go by elsewhere.
+    # Half of the crops are unchanged: in real images, the original contrast is the only cue.
     changed = jax.random.bernoulli(keys[5], 0.5, (count, 1, 1, 1)) & masks[..., None]
     factor = jnp.where(changed, own * shade[..., None], 1.0)
     return jnp.round(jnp.clip(snips * factor, 0.0, 255.0)).astype(jnp.uint8)

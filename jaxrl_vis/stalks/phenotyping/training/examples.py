@@ -1,4 +1,4 @@
-"""Training examples: reduced images with the stalks in them, and crops at full resolution with their masks."""
+"""Training examples: resized images with true stalks, and full-resolution stalk crops with masks."""
 
 import dataclasses
 import functools
@@ -29,28 +29,30 @@ from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
 
 MIN_VISIBLE = 0.3
-"""Share of a stalk in the band that must be seen for it to count."""
+"""Minimum visible fraction of a stalk's part in the band to count it as a `STALK`."""
 _MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
-"""Masks [N, h, w] bool of the snips of stalks with indices [N], from their places [N or more, 6] and the snips' shape."""
+"""Function that returns the masks [N, h, w] bool of the crops of stalks with indices [N], given their positions (boxes and
+axes) [N or more, 6] and the (height, width) of crops."""
 MAX_STALKS = 56
-"""Stalks of an image that networks learn from."""
-_BARELY = 0.02  # what is seen less is not there
+"""Maximum number of stalks per training image; further ones are dropped."""
+_BARELY = 0.02  # visible fraction below which a stalk is ignored
 _THIN = 4
-_AT_STALKS = 0.8  # of images that are cut: the share that is cut around a stalk
-_SCALES = (-0.5, 0.6)  # logarithms of the factors by which the scale of images by day varies
-_HIGHER = 0.3  # share of the stalks of which the networks also learn the piece around the upper height
+_AT_STALKS = 0.8  # fraction of the random image crops that are placed around a stalk
+_SCALES = (-0.5, 0.6)  # range of the log scale factor of daylight images
+_HIGHER = 0.3  # fraction of the stalks with an additional crop around the upper height
 
 
 @dataclasses.dataclass(frozen=True)
 class Example:
-    """One image.
+    """Training example from one image.
 
     Attributes:
-        image: [h, w, 3] uint8, reduced.
-        stalks: [T, 6] float32, box and columns of the axis at its top and bottom, pixels of the reduced image; padded.
-        kinds: [T] int32: `losses.NOTHING`, ``UNCLEAR`` or ``STALK``.
-        snips: [S, H, W, 3] uint8, at full resolution; not padded.
-        masks: [S, H, W] bool.
+        image: Resized image [h, w, 3] uint8.
+        stalks: [T, 6] float32, boxes, and x coordinates of the axis at the top and bottom of the box, pixels of the resized
+            image; padded to T = `MAX_STALKS`.
+        kinds: [T] int32: `losses.NOTHING` (padding), ``UNCLEAR`` or ``STALK``.
+        snips: Stalk crops [S, H, W, 3] uint8 at full resolution; S is not padded.
+        masks: Masks [S, H, W] bool of the crops.
     """
 
     image: np.ndarray
@@ -61,34 +63,34 @@ class Example:
 
 
 def synthetic_examples(family: Family, settings: Settings, seed: int, frames: int = 4) -> list[Example]:
-    """Examples of one plot of a family.
+    """Render the training examples of one synthetic plot.
 
     Args:
-        family: Family that the plot is drawn from.
+        family: Family from which the plot is sampled.
         settings: Settings of the networks.
         seed: Seed of the plot.
-        frames: Number of images of it, spread over it.
+        frames: Number of images, spread over the plot; fewer if it has fewer.
     """
     sequence = Sequence.of(draw(family, seed))
     settled = sequence.plot.family
     density = sequence.drive.true.focal / settled.rig.distance
     rng = np.random.default_rng([seed, 17])
     by_day = settled.scene.share > 0
-    if by_day:  # nobody knows the scale of other people's images exactly
+    if by_day:  # the scale of third-party images is not known exactly
         density *= float(np.exp(rng.uniform(*_SCALES)))
     length = len(sequence)
     chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
     examples = []
     for frame in chosen:
         image, instance, depth = sequence.left(frame)
-        # What shows, and how much of it, is as well counted in every fourth pixel.
+        # Every fourth pixel suffices to estimate visibility.
         true = sequence.drive.true
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         masks_of = functools.partial(_instance_masks, instance, indices)
         example = _example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER)
         if by_day:
-            # Lenses and scales differ from plot to plot, and each shape of snips would be a program of its own.
+            # Lenses and scales differ between plots, and each shape of crops would need a compilation.
             shape = snip_shape((settings.snip_lines, settings.snip_columns), family.rig.width / settings.full_width)
             example = resized_snips(cut_out(example, (settings.lines, settings.width), rng), shape)
         examples.append(example)
@@ -96,7 +98,7 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
 
 
 def resized_snips(example: Example, shape: tuple[int, int]) -> Example:
-    """Return an example whose snips, and their masks, have so many lines and columns."""
+    """Resize the stalk crops and masks of an example to ``shape`` (height, width)."""
     if not len(example.snips) or example.snips.shape[1:3] == shape:
         return example
     size = (shape[1], shape[0])
@@ -106,12 +108,15 @@ def resized_snips(example: Example, shape: tuple[int, int]) -> Example:
 
 
 def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:
-    """Return an example with a part of its image of at most so many lines and columns, mostly around a stalk.
+    """Crop the image of an example at random, mostly around a stalk.
 
     Args:
-        example: The example; its snips stay as they are.
-        most: Most lines and columns.
-        rng: For the place.
+        example: Example to crop; its stalk crops are unchanged.
+        most: Maximum height and width.
+        rng: Generator of the position.
+
+    Returns:
+        Example with clipped stalks, of which those that are hardly left in the image are ``NOTHING``.
     """
     size = example.image.shape[:2]
     lines, columns = (min(length, limit) for length, limit in zip(size, most))
@@ -135,7 +140,7 @@ def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -
 
 
 def _clipped(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
-    """Return stalks [T, 6] with boxes cut off where an image ends, and the axis where the box does."""
+    """Clip the boxes of stalks [T, 6] to an image of ``lines`` x ``columns`` pixels, and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = stalks.T
     slope = (below - above) / np.maximum(bottom - top, 1e-3)
     first, last = np.clip(top, 0, lines), np.clip(bottom, 0, lines)
@@ -146,24 +151,25 @@ def _clipped(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
 def _instance_masks(
     instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Masks of the snips of some stalks, cut out of what each pixel shows."""
-    cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is beyond the image
+    """Cut the masks of stalk crops out of an instance segmentation; see `_MasksOf`."""
+    cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is outside the image
     return cut_out == indices[parts][:, None, None] + 1
 
 
 def true_boxes(
     plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The stalks of the near row whose part in the band one image shows, in continuous coordinates of the image.
+    """Compute the true boxes of the stalks of the near row whose part in the band is visible in an image.
 
     Args:
-        plot: The plants.
+        plot: Plot with its plants.
         pose: Pose of the left camera.
-        camera: As it is.
-        instance, depth: [h, w], of each first of `_THIN` pixels in both directions.
+        camera: True calibration of the camera.
+        instance, depth: Instance and depth images [h, w], subsampled by `_THIN` in both directions.
 
     Returns:
-        [N, 6] float32 boxes that may reach beyond the image, and axes; [N] int32 kinds; [N] int32 indices of the stalks.
+        Boxes and axes [N, 6] float32 in continuous image coordinates, which may extend beyond the image; kinds [N] int32; and
+        indices of the stalks [N] int32.
     """
     centre = (camera.centre[0] / _THIN, camera.centre[1] / _THIN)
     small = Calibration(instance.shape[1], instance.shape[0], camera.focal / _THIN, centre, camera.baseline)
@@ -191,13 +197,13 @@ def _example(
     rng: Any,
     higher: float = 0.0,
 ) -> Example:
-    """An example of a whole image [H, W, 3]; of a share of its stalks, there are snips around the upper height, too."""
+    """Build the example of an image [H, W, 3]; a fraction ``higher`` of its stalks also gets a crop around the upper height."""
     whole = np.asarray(image)
     reduced, scale = resize(whole, settings, density)
     share = settings.width / settings.full_width / settings.resizing(whole.shape[1], density)
     shape = snip_shape((settings.snip_lines, settings.snip_columns), share)
     clear = np.flatnonzero(kinds == STALK)
-    # A find is not exactly where the stalk is.
+    # Jitter the positions, as detections are not exact.
     moved = stalks[clear].copy()
     wide = 0.015 * (stalks[clear, 3] - stalks[clear, 1])[:, None]
     moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
@@ -209,7 +215,7 @@ def _example(
     on_device, places = jnp.asarray(image), moved
     snips, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
     if len(clear):
-        filled = -(-len(clear) // 16) * 16  # few shapes, few programs
+        filled = -(-len(clear) // 16) * 16  # few shapes, few compilations
         places = np.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
         snips = np.asarray(cut(on_device, places, shape))[: len(clear)]
         masks = masks_of(clear, places, shape)
@@ -221,10 +227,12 @@ def _example(
 
 
 def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Iterator[Example]:
-    """Examples of a folder of annotated images; see `read_annotations`. Its calibration, if it has one, gives their scale.
+    """Yield the examples of a folder of annotated images; see `read_annotations`.
+
+    The scale of the images is taken from the calibration in the folder, if there is one.
 
     Raises:
-        RequestError: There are no annotations, or one is wrong; or an image is missing, or of another size than they say.
+        RequestError: Annotations are missing or invalid, or an image is missing or differs in size from its annotations.
     """
     data = read_annotations(folder, labels)
     density_of = _densities(folder, data["images"])
@@ -239,7 +247,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         except OSError as error:
             raise RequestError(f"the annotations in {folder} name an image that cannot be read: {error}") from error
         if image is None or image.shape[:2] != size:
-            # Where it is larger or smaller than what was annotated, boxes lie where no stalk is.
+            # In an image of another size than the annotated one, boxes would be misplaced.
             raise RequestError(
                 f"{path} has {there[1]} x {there[0]} pixels, but {about['source']} is for "
                 f"{size[1]} x {size[0]}: save the image at the size at which it was annotated"
@@ -257,16 +265,16 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
 
 
 def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
-    """Strips [N, 6] float32, as wide as the image's stalks, that cover regions of stalks that nobody told apart.
+    """Cover crowd regions (stalks annotated together) with overlapping strips [N, 6] float32 as wide as the image's stalks.
 
-    Boxes are compared with strips, so that one of a region as a whole would keep no box in it from counting as a mistake.
+    Detections are ignored by their overlap with unclear stalks, and would hardly overlap the box of a whole region.
     """
     strips = []
     for crowd in crowds:
         left, top, wide, tall = crowd["bbox"]
         typical = float(np.median(stalks[:, 2] - stalks[:, 0])) if len(stalks) else tall / 8
         count = int(np.clip(round(2 * wide / max(typical, 1.0)) - 1, 1, MAX_STALKS // 2))
-        narrow = 2 * wide / (count + 1)  # each overlaps the next by half
+        narrow = 2 * wide / (count + 1)  # width, as each overlaps the next by half
         begins = left + np.arange(count) * narrow / 2
         strips += [[begin, top, begin + narrow, top + tall, begin + narrow / 2, begin + narrow / 2] for begin in begins]
     return np.array(strips, np.float32).reshape(-1, 6)
@@ -279,7 +287,10 @@ def _own_masks(
     places: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """Masks of the snips of some stalks, cut out of the mask of each: they may overlap, and together fill the memory."""
+    """Cut the masks of stalk crops out of annotations; see `_MasksOf`.
+
+    One at a time: masks may overlap, and all of an image together could exceed the memory.
+    """
     snips = [
         np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[place : place + 1], shape))
         for place, part in enumerate(parts)
@@ -288,7 +299,7 @@ def _own_masks(
 
 
 def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
-    """Pixels per metre at the row of each image by its id; None for all where the folder has no calibration.
+    """Return the pixels per metre at the row of each image by its id; all None if the folder has no calibration.
 
     Raises:
         RequestError: The calibration cannot be read, or is for images of another size.
@@ -304,14 +315,14 @@ def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | 
 
 _MOST_ENLARGED = 3.0
 _WIDEST_SNIP = 512  # pixels
-_WIDEST = 2048  # pixels of an image that was resized so that its boxes have the size that networks know
+_WIDEST = 2048  # pixels: maximum width of a resized image
 
 
 def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
-    """Settings whose anchors are as large as the boxes of a folder's annotations.
+    """Return settings with anchors adapted to the boxes of a folder's annotations.
 
-    Images of unknown cameras are resized so that boxes are as tall as the band; what was learned from them is looked for in
-    images that are resized likewise. Snips grow and shrink with them, as they show the stalk of a box.
+    If the folder has no calibration, images are resized so that boxes are as tall as the band; detection with networks trained
+    on them uses the same resizing. Stalk crops are scaled accordingly.
 
     Raises:
         RequestError: The annotations or the calibration of the folder cannot be read.
@@ -328,7 +339,7 @@ def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
         settings = dataclasses.replace(settings, density=0.0, width=max(width, 32), full_width=max(round(ratio * width), 32))
     factors = {number: resize_factor(width, settings, densities[number]) for number, width in widths.items()}
     sizes = np.array([np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]] for annotation in boxes])
-    # A snip is at least twice as wide as the boxes: trunks are thicker than stalks.
+    # A stalk crop is at least twice as wide as the median box: trunks are thicker than stalks.
     columns = 8 * math.ceil(2.0 * settings.full_width / settings.width * float(np.median(sizes[:, 0])) / 8)
     return dataclasses.replace(
         settings,
@@ -339,13 +350,13 @@ def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
 
 
 def any_outlined(folder: Path, labels: tuple[str, ...] = ()) -> bool:
-    """Return True if any stalk that a folder annotates has more than a box."""
+    """Return whether any annotated stalk of a folder has a segmentation besides its box."""
     annotations = read_annotations(folder, labels)["annotations"]
     return any(annotation["segmentation"] and not annotation.get("iscrowd") for annotation in annotations)
 
 
 def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
-    """The mask [H, W] bool of one annotation; all of the box where there is none."""
+    """Return the mask [H, W] bool of one annotation; its box if it has no segmentation."""
     segmentation = annotation["segmentation"]
     if isinstance(segmentation, dict):
         return decode_mask(segmentation)
@@ -355,7 +366,7 @@ def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.nda
 
 
 def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
-    """Box and axis [6] of one annotation."""
+    """Return the box and axis [6] of one annotation; the axis is fitted to its mask."""
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
     line, column = np.nonzero(_annotated_mask(annotation, size))

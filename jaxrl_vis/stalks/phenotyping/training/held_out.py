@@ -1,4 +1,4 @@
-"""Scores of networks on annotated images that they did not learn from."""
+"""Evaluation of the networks on held-out annotated images."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,21 +14,21 @@ from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precisi
 from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
-_SNIPS = 8  # that go through the network together
+_SNIPS = 8  # stalk crops per batch
 LEAST_SCORE = 0.5
-"""Lowest score of a find that counts."""
+"""Minimum score of a detection to be counted."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Finds:
-    """Finds in one image.
+    """Detections in one image, matched with its annotations.
 
     Attributes:
-        stalks: [K, 6] float32, pixels of the reduced image.
+        stalks: Boxes and axes [K, 6] float32, pixels of the resized image.
         scores: [K] float32.
-        right: [K] bool, True for finds of an annotated stalk.
-        ignored: [K] bool, True for finds in a region of stalks that nobody told apart.
-        labels: Number of stalks that are annotated.
+        right: [K] bool, True for true positives.
+        ignored: [K] bool, True for detections of unclear stalks or in crowd regions, which are not counted.
+        labels: Number of annotated stalks.
     """
 
     stalks: np.ndarray
@@ -40,14 +40,15 @@ class Finds:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Score of networks on several images.
+    """Metrics of the networks on several images.
 
     Attributes:
-        images, labels: Numbers of images, and of annotated stalks.
-        finds, right: Numbers of finds with a score of `LEAST_SCORE` or more, and of those that are annotated stalks.
-        precision, recall, f1: Of these; not a number where there is nothing to divide by.
-        ap50: Average precision at an overlap of 0.5, of all finds.
-        soft: 2 x (sum of the scores of right finds) / (sum of all scores + labels): as F1, but it changes evenly.
+        images, labels: Numbers of images and of annotated stalks.
+        finds, right: Numbers of detections with a score of at least `LEAST_SCORE`, and of true positives among them.
+        precision, recall, f1: Metrics of these detections; NaN if the denominator is 0.
+        ap50: Average precision of all detections at an intersection over union of 0.5; NaN without labels.
+        soft: Soft F1, 2 x (sum of the scores of true positives) / (sum of all scores + labels), which is continuous in the
+            scores.
     """
 
     images: int
@@ -62,14 +63,14 @@ class Score:
 
 
 def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any) -> list[Finds]:
-    """Find stalks in the reduced images of examples.
+    """Detect stalks in the images of examples and match them with the true ones.
 
     Args:
         params: Parameters of the detector.
-        examples: Images with their stalks.
-        shape: Lines and columns that images are padded to.
+        examples: Images with true stalks.
+        shape: Height and width to which images are padded.
         settings: Settings of the networks.
-        dtype: In which convolutions are computed.
+        dtype: Compute dtype of the convolutions.
     """
     finds = []
     for example in examples:
@@ -82,16 +83,16 @@ def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], se
 
 
 def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Match finds with true stalks, the best first, a stalk once, at an overlap of boxes of 0.5.
+    """Match detections with true stalks greedily by score, one to one, at a box overlap of at least 0.5.
 
     Args:
-        stalks: [K, 6] finds.
-        scores: [K].
-        truth: [T, 6] stalks of the image.
+        stalks: Detections [K, 6].
+        scores: Scores [K] of the detections.
+        truth: True stalks [T, 6] of the image.
         kinds: [T] int32: `losses.NOTHING`, ``UNCLEAR`` or ``STALK``.
 
     Returns:
-        Which finds are stalks [K] bool, and which lie on unclear ones and count neither way [K] bool.
+        True positives [K] bool, and detections of unclear stalks, which are ignored [K] bool.
     """
     clear, unclear = truth[kinds == STALK], truth[kinds == UNCLEAR]
     right, free = np.zeros(len(stalks), bool), np.ones(len(clear), bool)
@@ -104,13 +105,13 @@ def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds
 
 
 def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, dtype: Any) -> float:
-    """Overlap (intersection over union) of masks with the annotated ones, mean over snips; not a number where there are none.
+    """Compute the mean intersection over union of predicted and true masks over stalk crops; NaN without crops.
 
     Args:
-        params: Parameters of the segmentation.
-        examples: Images with snips and their masks.
+        params: Parameters of the segmentation network.
+        examples: Examples with stalk crops and true masks.
         settings: Settings of the networks.
-        dtype: In which convolutions are computed.
+        dtype: Compute dtype of the convolutions.
     """
     overlaps = []
     for example in examples:
@@ -125,7 +126,7 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
 
 
 def score(finds: Sequence[Finds]) -> Score:
-    """Score finds in several images together."""
+    """Compute the metrics of the detections in several images, pooled."""
     labels = sum(each.labels for each in finds)
     scores = np.concatenate([each.scores[~each.ignored] for each in finds] or [np.zeros(0)])
     right = np.concatenate([each.right[~each.ignored] for each in finds] or [np.zeros(0, bool)])

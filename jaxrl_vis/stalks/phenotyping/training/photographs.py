@@ -1,7 +1,7 @@
-"""Images of one photograph, and the split of a folder's images into those that are learned from and those that are held out.
+"""Grouping of images by photograph, and the split of a folder's images into training and held-out ones by group.
 
-Exports of labelling programs hold copies of a photograph that were turned, relit or cut, and frames of a video are nearly the
-same. A copy on either side of a split would make a test of memory of it.
+Exports of labelling programs include augmented copies of a photograph (rotated, relit or cropped), and frames of a video are
+nearly identical. Copies on both sides of a split would leak training data into the evaluation.
 """
 
 import dataclasses
@@ -11,22 +11,22 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-_SIDE = 16  # pixels of a thumbnail
-_ALIKE = 0.97  # correlation of the thumbnails of copies
+_SIDE = 16  # pixels: height and width of a thumbnail
+_ALIKE = 0.97  # minimum correlation of the thumbnails of copies
 _COPY = re.compile(r"([._-]rf[._-][0-9a-f]{6,}|[ ._-]*(aug|copy|flip|mirror|rot)[a-z]*[ ._-]*\d*|[ ._-]*\(\d+\))$")
 FEWEST = 5
-"""Photographs below which nothing is held out."""
+"""Minimum number of photographs to hold out any."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Split:
-    """Indices of the images of each part.
+    """Indices of the images of each part of a split.
 
     Attributes:
-        train: Learned from.
-        stop: What decides when training ends.
-        test: Shown in the report, and used for no decision.
-        photographs: Number of photographs of which there are images.
+        train: Training set.
+        stop: Validation set for early stopping.
+        test: Test set for the report, used for no decision.
+        photographs: Number of distinct photographs.
     """
 
     train: tuple[int, ...]
@@ -36,11 +36,14 @@ class Split:
 
 
 def photographs_of(names: Sequence[str], images: Sequence[np.ndarray]) -> np.ndarray:
-    """Number the photographs that images show: [N] int, equal for images of one.
+    """Group images by photograph: copies by the name of the file or by the similarity of thumbnails.
 
     Args:
-        names: Their files; what labelling programs append to the names of copies does not count.
-        images: [h, w, 3] uint8 of any size.
+        names: File names; suffixes that labelling programs append to copies are ignored.
+        images: Images [h, w, 3] uint8 of any size.
+
+    Returns:
+        [N] int, equal for images of one photograph.
     """
     thumbnails = np.array([_thumbnail(image) for image in images])
     flat = thumbnails.reshape(len(images), -1)
@@ -71,11 +74,13 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
 
 
 def split(photographs: np.ndarray, seed: int) -> Split:
-    """Split images by photograph: a fifth for the report, a sixth of the rest to stop by; nothing where there are few.
+    """Split images by photograph: a fifth for testing, and a sixth of the rest for early stopping.
+
+    With fewer than `FEWEST` photographs, all images are for training.
 
     Args:
         photographs: [N] int, see `photographs_of`.
-        seed: Of the choice.
+        seed: Seed of the split.
     """
     groups = np.random.default_rng([seed, 23]).permutation(np.unique(photographs))
     count = len(groups)

@@ -1,9 +1,9 @@
-"""Training on a few dozen to a few hundred annotated images: goes on from weights, and stops where held-out images say so.
+"""Fine-tuning on a few dozen to a few hundred annotated images, with early stopping on held-out images.
 
-    read -> split by photograph -> compile -> updates, with a look at held-out images between them -> the best weights
+    read -> split by photograph -> compile -> updates, with evaluations on held-out images in between -> the best weights
 
-Minutes are those of updates: what is read and compiled before is timed apart. Layers near the pixels stay as they are where
-there are weights to start from, as a few images are too few to learn them from.
+The time limit applies to updates only: reading and compilation are timed separately. When starting from trained weights, the
+first layers are frozen, as a few images are too few to train them.
 """
 
 import contextlib
@@ -30,28 +30,28 @@ from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, find_in, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import Split
 
 FROZEN = ("stem", "fine")
-"""Layers that stay as they are where there are weights to start from."""
-_WARM_UP = 50  # updates until the rate is highest
-_STRIP, _BESIDE = 256, 3.0  # columns of what is learned from at once: pixels, and widths of the widest box
-_HEARTBEAT = 10.0  # s between signs of life of what takes long
+"""Prefixes of the names of layers that are frozen when starting from trained weights."""
+_WARM_UP = 50  # updates of linear warm-up of the learning rate
+_STRIP, _BESIDE = 256, 3.0  # minimum width of training crops: pixels, and multiples of the widest box
+_HEARTBEAT = 10.0  # s between progress messages of long operations
 
 Say = Callable[[str], None]
-"""Called with a line about what goes on."""
+"""Callback that is called with a line of text on the progress."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """Schedule.
+    """Fine-tuning schedule.
 
     Attributes:
-        steps: Most updates.
-        minutes: Most minutes of updates; None for no limit.
-        batch: Images per update.
-        snips: Snips per update; 0 where masks are not learned.
-        rate: Highest learning rate.
-        look: Updates between looks at held-out images.
-        patience: Looks without a better score until training ends.
-        seed: Seed of everything random.
+        steps: Maximum number of updates.
+        minutes: Maximum duration of the updates in minutes; None for no limit.
+        batch: Batch size of images.
+        snips: Batch size of stalk crops; 0 if masks are not trained.
+        rate: Peak learning rate.
+        look: Number of updates between evaluations on held-out images.
+        patience: Number of evaluations without improvement after which training stops.
+        seed: Random seed.
     """
 
     steps: int
@@ -66,15 +66,15 @@ class Tuning:
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """Result of a training.
+    """Result of fine-tuning.
 
     Attributes:
-        params: Parameters with ``detector`` and ``segmenter``.
-        steps: Update that they are of.
-        made: Number of updates that were made.
-        why: Reason for the end.
-        before, after: Finds in each image of the report, with the weights of the beginning and of the end.
-        compile_s, update_s: Time of compilation, and of updates and looks, s.
+        params: Best parameters, with keys ``detector`` and ``segmenter``; the last ones if no images are held out.
+        steps: Number of updates after which these parameters were reached.
+        made: Total number of updates.
+        why: Reason why training ended.
+        before, after: Detections in each test image with the initial and the resulting parameters.
+        compile_s, update_s: Durations of compilation, and of updates and evaluations, s.
     """
 
     params: Any
@@ -96,19 +96,20 @@ def tune(
     say: Say,
     keep: Callable[[Any, int], None] = lambda params, step: None,
 ) -> Tuned:
-    """Train networks on annotated images.
+    """Fine-tune the networks on annotated images.
 
     Args:
-        examples: All images.
-        parts: Split of them.
+        examples: Examples of all images.
+        parts: Split of the examples.
         settings: Settings of the networks.
-        tuning: Schedule.
-        start: Parameters to go on from; None for random ones.
-        say: See `Say`.
-        keep: Called with the best parameters so far and their update, so that a training that is stopped leaves them.
+        tuning: Fine-tuning schedule.
+        start: Initial parameters, whose first layers are frozen; None for random initialisation.
+        say: Progress callback, see `Say`.
+        keep: Called with the best parameters so far and their update, so that they survive an interruption. Without images for
+            early stopping, called with the latest parameters at each evaluation.
 
     Raises:
-        NonFiniteError: A loss is not finite any more.
+        NonFiniteError: A loss is not finite.
     """
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
     frozen = ((*FROZEN,) if start is not None else ()) + (() if tuning.snips else ("segmenter",))
@@ -165,7 +166,7 @@ def tune(
 
 
 class _Watch:
-    """Looks at held-out images and keeps the best weights; those of the beginning count, too."""
+    """Early stopping: evaluate parameters on held-out images and keep the best ones, which may be the initial ones."""
 
     def __init__(
         self, examples: list[Example], shape: tuple[int, int], settings: Settings, dtype: Any, params: Any, patience: int
@@ -178,35 +179,35 @@ class _Watch:
         return score(find_in(params["detector"], self._examples, *self._about)).soft if self._examples else 0.0
 
     def look(self, params: Any, step: int) -> str:
-        """Look at the images with other weights; return what to say of it."""
+        """Evaluate new parameters and return text for the progress line, empty without held-out images."""
         if not self._examples:
             return ""
         now = self._score(params)
         self._since += 1
         if now > self.best:
-            # Updates donate what they are given.
+            # Copy, as updates donate their input buffers.
             self.best, self.step, self._since, self.params = now, step, 0, jax.tree.map(jnp.copy, params)
         return f"  held out {now:.3f}" + ("" if self._since else ", the best so far")
 
     @property
     def over(self) -> bool:
-        """True where the score has not become better for long."""
+        """True if the score has not improved for ``patience`` evaluations."""
         return bool(self._examples) and self._since >= self._patience
 
 
 class _Batches:
-    """Batches of images and snips, drawn at random."""
+    """Sampler of random batches of images and stalk crops."""
 
     def __init__(self, examples: list[Example], shape: tuple[int, int], tuning: Tuning) -> None:
         self._examples, self._tuning = examples, tuning
-        # All lines, as the height of a find is a matter of what is above and below it.
+        # Crops span the full height, as the vertical extent of a box depends on what is above and below it.
         widest = max(float((stalk[2] - stalk[0]).max()) for stalk in (example.stalks.T for example in examples))
         self._shape = shape[0], min(shape[1], padded_shape((1, max(_STRIP, round(_BESIDE * widest))))[1])
         self._rng = np.random.default_rng(tuning.seed)
         self._snips, self._masks = _alike(examples) if tuning.snips else (np.zeros(0), np.zeros(0))
 
     def draw(self) -> Any:
-        """Draw a batch, as `update_networks` takes it."""
+        """Sample a batch for `update_networks`."""
         chosen = [
             cut_out(self._examples[place], self._shape, self._rng)
             for place in self._rng.integers(len(self._examples), size=self._tuning.batch)
@@ -219,7 +220,7 @@ class _Batches:
 
 
 def _alike(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
-    """Return snips [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to the size in the middle of theirs."""
+    """Return the stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to their median size."""
     shapes = sorted(example.snips.shape[1:3] for example in examples for _ in example.snips)
     if not shapes:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)
@@ -235,7 +236,7 @@ def _largest(examples: Sequence[Example]) -> tuple[int, int]:
 
 @contextlib.contextmanager
 def heartbeat(words: str, say: Say) -> Iterator[None]:
-    """Say every ten seconds that something is still going on."""
+    """Report progress through ``say`` at the start and every ten seconds while the context is active."""
     over, began = threading.Event(), time.monotonic()
 
     def beat() -> None:

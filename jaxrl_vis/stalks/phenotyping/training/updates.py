@@ -1,4 +1,4 @@
-"""Updates for a number of steps or of minutes, whichever ends first, on examples that are made meanwhile."""
+"""Training loop for a number of steps or minutes, whichever ends first, on examples generated in the background."""
 
 import time
 from collections.abc import Callable
@@ -12,15 +12,15 @@ from jaxrl_vis.errors import NonFiniteError, RequestError
 from jaxrl_vis.stalks.phenotyping.training.pool import Pool
 
 Report = Callable[[int, float, int, dict[str, float], Any], None]
-"""Called now and then with the step, progress from 0 to 1, how many images there are, losses, and the weights so far."""
+"""Progress callback (step, progress from 0 to 1, number of examples, losses by name, averaged parameters)."""
 
 Update = Callable[[int, tuple[jax.Array, jax.Array]], tuple[dict[str, jax.Array], Any] | None]
-"""(step, (learning rate, share of the old weights that stays in the average)) -> (losses, averaged weights); or None where
-there is nothing to learn from yet."""
+"""Update function (step, (learning rate, decay rate of the parameter average)) -> (losses by name, averaged parameters), or
+None if there are not enough examples yet."""
 
 
 class Schedule(Protocol):
-    """A schedule of training: most updates and minutes, number of examples to begin with, highest rate, share of the mean."""
+    """Training schedule: maximum updates and minutes, peak learning rate, and decay rate of the parameter average."""
 
     @property
     def steps(self) -> int: ...  # noqa: D102
@@ -33,22 +33,24 @@ class Schedule(Protocol):
 
 
 def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: Report, every: float) -> int:
-    """Update until the plan's steps or minutes are over.
+    """Run updates until the plan's steps or minutes are reached.
+
+    The learning rate has a linear warm-up over 200 updates and a cosine decay in progress, which follows steps or time.
 
     Args:
-        update: Makes one.
-        pool: Source of examples; filled with as many as are wanted to begin with.
-        plan: Schedule.
-        started: Start of the minutes, by `time.monotonic`.
-        report: See `Report`.
-        every: Interval of reports, s.
+        update: Update function, see `Update`.
+        pool: Pool of examples, already filled with the initial ones.
+        plan: Training schedule.
+        started: Start time of the minutes, by `time.monotonic`.
+        report: Progress callback, see `Report`.
+        every: Minimum interval between reports, s.
 
     Returns:
-        How many updates were made.
+        Number of updates.
 
     Raises:
-        NonFiniteError: A loss is not finite any more.
-        RequestError: The time was over before the first update.
+        NonFiniteError: A reported loss is not finite.
+        RequestError: The time limit was reached before the first update.
     """
     last_report, step, before = started, 0, None
     while step < plan.steps:
@@ -58,7 +60,7 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
         if progress >= 1.0:
             break
         rate = plan.rate * min((step + 1) / 200.0, 1.0) * 0.5 * (1.0 + np.cos(np.pi * progress))
-        # At first the average forgets quickly, so that it holds nothing of the random start.
+        # The decay rate is lower at first, so that the average forgets the random initialisation.
         rates = jnp.float32(rate), jnp.float32(min(plan.average, (1.0 + step) / (10.0 + step)))
         made = update(step, rates)
         if made is None:
@@ -71,7 +73,7 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
             if not np.isfinite(list(losses.values())).all():
                 raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
             report(step, progress, len(pool.examples), losses, weights)
-        # The device is kept one update ahead and no more: examples are drawn on it, too, and wait for what is queued.
+        # Queue at most one update ahead: examples are rendered on the same device and would wait for the queue.
         jax.block_until_ready(before)
         before = parts
     if not step:
