@@ -15,7 +15,7 @@ from jaxrl_vis.stalks.cli.phenotype_run import SKIPPED
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run(CameraOptions):
-    """Detect grasp points in folders of stereo pairs: tables of points and of runs, and overlays."""
+    """Detect grasp points in folders of stereo pairs: tables of points and of runs, and an overlay per run."""
 
     folder: Annotated[Path, AlsoPositional()]
     """Folder with the pairs of a run (left_000.png, right_000.png, ...), or a folder of such folders."""
