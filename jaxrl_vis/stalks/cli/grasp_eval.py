@@ -39,8 +39,8 @@ class Eval(EvaluationOptions):
     """With --reach: amplitude of the stalks' sway in the wind, mm; 0 if not given. Perception runs only once for several
     amplitudes, such as 0 10 20."""
     loops: tuple[Literal["open", "again", "policy"], ...] = _LOOPS
-    """With --reach: control of the arm: to where the stalk was seen (open), with the stalk detected again on the way (again),
-    or by a policy of VisualStalkReach (policy). With policy, all loops are compared on scenes like those of its task."""
+    """With --reach: control loops of the arm: move to where the stalk was seen (open), detect it again on the way (again), or
+    follow a policy of VisualStalkReach (policy). With policy, all loops are compared on scenes like those of its task."""
     policy: Path | None = None
     """Run folder of the policy, for --loops policy."""
     trust: bool = False

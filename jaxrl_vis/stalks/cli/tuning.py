@@ -94,7 +94,7 @@ def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, 
 
 
 def _split(options: DetectorTraining, names: list[str], examples: list[Example], say: Any) -> Split:
-    """Split the images by photograph into training, stopping and test sets, and report their sizes."""
+    """Split the images by photograph into training, early-stopping and test sets, and report their sizes."""
     from jaxrl_vis.stalks.phenotyping.training.photographs import FEWEST, photographs_of, split
 
     parts = split(photographs_of(names, [example.image for example in examples]), options.seed)

@@ -51,7 +51,7 @@ def covering(counts: Sequence[float], height: int, width: int) -> np.ndarray:
     """Validate the runs of an image and return them as [N] int64.
 
     Raises:
-        ValueError: They are no whole numbers from 0, or do not cover the image.
+        ValueError: They are not non-negative integers, or do not cover the image.
     """
     numbers = np.asarray(counts, np.float64)
     if numbers.ndim != 1 or (numbers < 0).any() or (numbers % 1 != 0).any() or numbers.sum() != height * width:
@@ -60,7 +60,7 @@ def covering(counts: Sequence[float], height: int, width: int) -> np.ndarray:
 
 
 def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndarray:
-    """Rasterise polygons to a mask [H, W] bool: the pixels whose centre lies inside any of them (even-odd rule).
+    """Rasterise polygons to a mask [H, W] bool: the pixels whose centre lies inside any of them (by the even-odd rule).
 
     The mean number of mask pixels per row thus equals the width of a strip; filling the boundary, too, as OpenCV does, would
     make it one pixel wider.

@@ -57,7 +57,7 @@ def _mask(shape: dict[str, Any], points: np.ndarray, size: tuple[int, int]) -> d
     """Decode a mask, stored as a base64 PNG of the box between two corner pixels (inclusive), to COCO runs.
 
     Raises:
-        ValueError: The mask is no PNG, does not match its box, or reaches beyond the image.
+        ValueError: The mask is not a PNG, or reaches beyond the image.
     """
     if len(points) != 2 or not np.isfinite(points).all() or np.abs(points).max() > 1e7:
         raise ValueError("a mask without its box")

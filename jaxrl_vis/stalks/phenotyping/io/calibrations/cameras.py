@@ -102,7 +102,7 @@ def named_size(store: Mapping[str, Any], path: Path) -> Size | None:
         path: The file, for messages.
 
     Raises:
-        RequestError: It is no valid size.
+        RequestError: The size is invalid.
     """
     for names in (("image_width", "image_height"), ("width", "height")):
         values = [store.get(name) for name in names]
@@ -125,7 +125,7 @@ def whole(values: list[Any], path: Path, names: str) -> Size:
         names: Names of the values, for messages.
 
     Raises:
-        RequestError: They are no whole floats from 1 to `MAX_SIDE`.
+        RequestError: They are not floats with integer values from 1 to `MAX_SIDE`.
     """
     if not all(isinstance(value, float) and 1 <= value <= MAX_SIDE and value.is_integer() for value in values):
         raise RequestError(f"{path}: {names} must be numbers of pixels, without quotation marks")

@@ -41,7 +41,7 @@ def cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[str]]]
         Names of the columns; the non-empty rows with their line numbers; and whether commas in numbers are decimal separators.
 
     Raises:
-        RequestError: The text is no table.
+        RequestError: The text is not a table.
     """
     lines = text.splitlines()
     first = next((place for place, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), len(lines))

@@ -87,7 +87,7 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
     """Read the distance driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
 
     Args:
-        plot: Plot with ``odometry.csv`` or one of the alternative files in its folder.
+        plot: Plot, whose folder may hold ``odometry.csv`` or one of the alternatives, see `odometry_file`.
         speed: Speed of the robot, m/s, for files that hold only times.
 
     Returns:
