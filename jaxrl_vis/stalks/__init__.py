@@ -1,8 +1,8 @@
-"""The farm: sorghum stalks counted, measured and grasped from stereo images (chapters 3 and 4 of the thesis).
+"""Counting, measuring and grasping of sorghum stalks from stereo images (chapters 3 and 4 of the thesis).
 
-    phenotyping    counts and widths of the stalks in a plot        grasping    stalks found, reached and held
+    phenotyping    counts and widths of the stalks in a plot        grasping    detecting, reaching and grasping stalks
     cli            the commands ``phenotype`` and ``grasp``
 
-A product of its own, with the extras ``phenotyping`` and ``grasping``. It builds on the rest of `jaxrl_vis`, which reaches it
-through `cli.COMMANDS` alone.
+A separate application, with the extras ``phenotyping`` and ``grasping``. It builds on the rest of `jaxrl_vis`, which accesses
+it only through `cli.COMMANDS`.
 """

@@ -1,4 +1,4 @@
-"""Digests that tell apart what results were computed from: weights, families of plants, calibrations."""
+"""Digests that identify the inputs of results: weights, families of plants, calibrations."""
 
 import hashlib
 import json
@@ -9,7 +9,7 @@ _DIGITS = 12
 
 
 def file_digest(path: Path) -> str:
-    """Return 12 hexadecimal digits of the SHA-256 digest of a file's contents.
+    """Compute the first 12 hexadecimal digits of the SHA-256 digest of a file's contents.
 
     Raises:
         OSError: The file cannot be read.
@@ -18,5 +18,5 @@ def file_digest(path: Path) -> str:
 
 
 def value_digest(value: Any) -> str:
-    """Return 12 hexadecimal digits of the SHA-256 digest of a value that JSON can hold; the order of keys does not matter."""
+    """Compute the first 12 hexadecimal digits of the SHA-256 digest of a JSON-serialisable value, independent of key order."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:_DIGITS]

@@ -1,7 +1,7 @@
-"""A folder of results that a command can continue: what it was asked for, and records that hold as long as their sources do.
+"""Results folder of a resumable command: its request, and records that are valid while their sources are unchanged.
 
-OUT/run.json    the request: a folder holds the results of one
-records         JSON files, each with the state of the files that it was made from
+OUT/run.json    the request, of which a folder holds the results of only one
+records         JSON files, each with the state of its source files
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ _SOURCES = "of"
 
 
 def file_state(path: Path | None) -> list[int] | None:
-    """Return the size in bytes of a file and the time of its last change in ns; None where there is no file."""
+    """Return the size of a file in bytes and its modification time in ns; None if there is no file."""
     try:
         status = None if path is None else path.stat()
     except OSError:
@@ -40,7 +40,7 @@ def write_record(path: Path, record: Mapping[str, Any], sources: Any) -> None:
     Args:
         path: The file.
         record: Contents.
-        sources: State of everything that the record was made from, read before that was.
+        sources: State of all sources of the record as JSON, determined before they were read.
 
     Raises:
         OSError: The file cannot be written.
@@ -49,12 +49,13 @@ def write_record(path: Path, record: Mapping[str, Any], sources: Any) -> None:
 
 
 def is_current(path: Path, sources: Any, is_whole: Callable[[dict[str, Any]], bool]) -> bool:
-    """Return True if a record was made from these sources and is whole.
+    """Return whether a record exists, is complete, and was made from the current sources.
 
     Args:
         path: The file.
-        sources: State of what it should have been made from.
-        is_whole: From the record to True if it need not be made again; it may raise what reading an unknown record raises.
+        sources: Current state of its sources.
+        is_whole: Return whether a record is complete; it may raise ValueError, KeyError, TypeError or AttributeError for a
+            malformed one.
     """
     try:
         record = read_json(path)
@@ -71,21 +72,22 @@ def claim(
     about: Mapping[str, Any],
     begun: bool,
 ) -> None:
-    """Write a request into its folder of results, or check that it is the one before.
+    """Write the request to its results folder, and check that the results there belong to the same request.
 
-    A folder that holds no results yet may be claimed for another request, and a plot that had no calibration may get one:
-    that is what messages advise.
+    A folder without results may be claimed for another request, and a plot without a calibration may get one later, as error
+    messages suggest.
 
     Args:
-        out: The folder; made if it is missing.
-        noun: Word for the folders of pairs, in the plural.
+        out: The folder; created if missing.
+        noun: Noun for the folders of pairs, in the plural: their key in run.json.
         folders: Folders of pairs.
-        calibrations: Calibration of each folder by its name; None where there is none.
-        about: Anything else that results depend on, as JSON.
-        begun: The folder holds results.
+        calibrations: Calibration of each folder by name; None if there is none.
+        about: Everything else that results depend on, as JSON.
+        begun: Whether the folder holds results.
 
     Raises:
         RequestError: The folder holds the results of another request.
+        OSError: The folder or file cannot be written.
     """
     request = {
         "version": jaxrl_vis.__version__,
@@ -111,12 +113,12 @@ def claim(
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return the differences of two requests that matter, in words; empty if there are none."""
+    """Describe the relevant differences between two requests; empty if there are none."""
     differences = []
     for name in dict.fromkeys([*now, *before]):
         old, new = before.get(name), now.get(name)
         if name == "calibrations" and isinstance(old, dict) and isinstance(new, dict):
-            # Records state the calibration that they were made with, so one that comes later makes them again.
+            # A calibration added later is no conflict: records store theirs and are made again.
             old = {plot: new.get(plot) if calibration is None else calibration for plot, calibration in old.items()}
         if old == new:
             continue

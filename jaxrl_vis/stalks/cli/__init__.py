@@ -1,6 +1,7 @@
-"""The commands of the farm, ``phenotype`` and ``grasp``: the one door through which the rest of `jaxrl_vis` reaches `stalks`.
+"""Commands ``phenotype`` and ``grasp``: the only interface through which the rest of `jaxrl_vis` accesses `stalks`.
 
-Importing it loads no JAX. One file a command: its options as a frozen dataclass, and the function that carries it out.
+Importing this package does not import JAX. Each command has a module with its options, a frozen dataclass, and the function
+that runs it.
 """
 
 from collections.abc import Callable
@@ -36,4 +37,4 @@ COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "grasp figure 4.5": (grasp_figure.PathFigure, grasp_figure.draw_path),
     "grasp figure 4.6": (grasp_figure.GraspsFigure, grasp_figure.draw_grasps),
 }
-"""Name -> options, and the function that carries the command out and returns the exit status."""
+"""Name -> options class, and the function that runs the command and returns the exit status."""

@@ -1,4 +1,4 @@
-"""``jaxrl-vis grasp eval``."""
+"""``jaxrl-vis grasp eval``: score grasp perception and simulated grasps against ground truth."""
 
 import dataclasses
 from pathlib import Path
@@ -20,31 +20,31 @@ _LOOPS: tuple[Literal["open", "again", "policy"], ...] = ("again",)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval(EvaluationOptions):
-    """Compare masks, stitches and grasp points with the exact truth of synthetic runs, which are drawn for it."""
+    """Compare masks, stitched clouds and grasp points with the exact ground truth of synthetic runs, rendered on the fly."""
 
     masks: Literal["gan", "segmentation", "truth"] = "segmentation"
-    """Source of masks: the segmentation that ships, a GAN that you have trained (--weights), or the truth, to see how good
-    everything after the masks is."""
+    """Source of masks: the shipped segmentation, a GAN that you have trained (--weights), or the ground truth, to evaluate
+    everything downstream of the masks."""
     thesis: bool = False
-    """Stitch and find grasp points as the thesis describes it: --stitch thesis --points thesis."""
+    """Use the thesis's stitching and grasp point detection: --stitch thesis --points thesis."""
     stitch: Literal["default", "thesis"] | None = None
-    """Stitching of clouds; default if not given."""
+    """Method of stitching clouds; default if not given."""
     points: Literal["default", "thesis"] | None = None
-    """Finding of grasp points; default if not given."""
+    """Method of detecting grasp points; default if not given."""
     runs: int = 10
     """Number of runs."""
     reach: bool = False
-    """Send the simulated arm to every grasp point, too, and score its grasps."""
+    """Also move the simulated arm to every grasp point, and score its grasps."""
     wind: tuple[float, ...] = ()
-    """With --reach: amplitude of the stalks' sway in the wind, mm; 0 if not given. Several, such as 0 10 20, share one
-    perception."""
+    """With --reach: amplitude of the stalks' sway in the wind, mm; 0 if not given. Perception runs only once for several
+    amplitudes, such as 0 10 20."""
     loops: tuple[Literal["open", "again", "policy"], ...] = _LOOPS
-    """With --reach: the arm goes to where a stalk was seen (open), finds it again on the way (again), or is brought there by a
-    policy of VisualStalkReach (policy). With policy, all loops are compared on scenes like those of its task."""
+    """With --reach: control loops of the arm: move to where the stalk was seen (open), detect it again on the way (again), or
+    follow a policy of VisualStalkReach (policy). With policy, all loops are compared on scenes like those of its task."""
     policy: Path | None = None
-    """The run folder of that policy."""
+    """Run folder of the policy, for --loops policy."""
     trust: bool = False
-    """Run that run's own code without a question, where its task is module:Name and somebody else trained it."""
+    """Run the code of the policy's run without asking, if its task is module:Name and was trained by somebody else."""
     policy_seed: int | None = None
     """Seed of the policy within its run; the first if not given."""
 
@@ -53,14 +53,14 @@ def check_wind(wind: float) -> None:
     """Check an amplitude of the stalks' sway in the wind, mm.
 
     Raises:
-        RequestError: It is negative, or more than any stalk bears.
+        RequestError: It is not from 0 to 100 mm.
     """
     if not 0 <= wind <= _MAX_WIND:
         raise RequestError(f"--wind must be from 0 to {_MAX_WIND:g} mm, not {wind:g}")
 
 
 def _check(options: Eval) -> None:
-    """Raise a `RequestError` where options contradict each other."""
+    """Raise a `RequestError` if an option is invalid or options contradict each other."""
     check_counts(runs=options.runs)
     options.check()
     check_masks(options.masks, options.weights)
@@ -80,7 +80,7 @@ def _check(options: Eval) -> None:
 
 
 def evaluate(options: Eval) -> int:
-    """Print the figures."""
+    """Evaluate the runs, print their scores, and return the exit status."""
     _check(options)
     if options.policy is not None:
         check_run(options.policy)
@@ -117,7 +117,7 @@ def evaluate(options: Eval) -> int:
 
 
 def _reach(options: Eval, table: RecordFile, numbers: range) -> None:
-    """Send the arm, and print the scores of its grasps."""
+    """Run the simulated arm for each loop and wind, and print the scores of its grasps."""
     from jaxrl_vis.stalks.grasping.evaluation import records
 
     policy, name = _policy(options)
@@ -141,7 +141,7 @@ def _reach(options: Eval, table: RecordFile, numbers: range) -> None:
 
 
 def _policy(options: Eval) -> "tuple[Policy | None, str]":
-    """Return the policy of the loop that has one, and its name."""
+    """Load the policy for the loop ``policy``, and return it with a name that identifies it; None and "" without one."""
     if options.policy is None:
         return None, ""
     from jaxrl_vis.run.trained.policy import load_policy
@@ -153,7 +153,7 @@ def _policy(options: Eval) -> "tuple[Policy | None, str]":
 
 
 def _print_run(number: int, record: Record) -> None:
-    """Print a line for one run."""
+    """Print one line with the scores of a run."""
     from jaxrl_vis.stalks.grasping.evaluation import records
     from jaxrl_vis.stalks.grasping.evaluation.scoring import summary
 

@@ -13,7 +13,7 @@ from jaxrl_vis.stalks.cli.options import check_extra
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _FigureOptions:
-    """Options of all figures."""
+    """Options common to all figures."""
 
     name: ClassVar[str]
 
@@ -23,10 +23,10 @@ class _FigureOptions:
     """Seed of the run, or of the first run."""
 
     def check(self) -> Path:
-        """Check the options, the packages and the devices, and return the file of the figure.
+        """Check the options, packages and devices, and return the file of the figure.
 
         Raises:
-            RequestError: An option makes no sense, a package is missing, or no device works.
+            RequestError: An option is invalid, a package is missing, or no device works.
         """
         if self.seed < 0:
             raise RequestError(f"--seed must be at least 0, not {self.seed}")
@@ -44,36 +44,36 @@ class PerceptionFigure(_FigureOptions):
     name: ClassVar[str] = "4.4"
 
     weights: Path | None = None
-    """Weights of masks, from `grasp train`; the shipped segmentation if not given. The thesis shows `--loss gan`."""
+    """Weights of the mask network, from `grasp train`; the shipped segmentation if not given. The thesis shows `--loss gan`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PathFigure(_FigureOptions):
-    """Draw figure 4.5: the planned path of the grip to a stalk of a synthetic run, and the path taken."""
+    """Draw figure 4.5: planned and actual path of the gripper to a stalk of a synthetic run."""
 
     name: ClassVar[str] = "4.5"
 
     wind: float = 10.0
     """Amplitude of the stalks' sway in the wind, mm."""
     video: Path | None = None
-    """A .gif, .mp4 or .html file of all reaches of the run."""
+    """Video of all reaches of the run: a .gif, .mp4 or .html file."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GraspsFigure(_FigureOptions):
-    """Draw figure 4.6: attempts and grasps of 16 runs of half a metre."""
+    """Draw figure 4.6: grasp attempts and successes in 16 runs of half a metre."""
 
     name: ClassVar[str] = "4.6"
 
     wind: float = 10.0
     """Amplitude of the stalks' sway in the wind, mm."""
     evaluation: Path | None = None
-    """A file that `grasp eval --reach --json` wrote; if not given, runs are evaluated first, and the file goes beside the
+    """File written by `grasp eval --reach --json`; if not given, runs are evaluated first, and the file is written beside the
     figure."""
 
 
 def draw_perception(options: PerceptionFigure) -> int:
-    """Draw figure 4.4."""
+    """Draw figure 4.4, and return the exit status."""
     out = options.check()
     from jaxrl_vis.stalks.grasping.masks.loading import load_painter, resolve_weights
     from jaxrl_vis.stalks.grasping.report.perception_figure import draw_figure
@@ -87,7 +87,7 @@ def draw_perception(options: PerceptionFigure) -> int:
 
 
 def draw_path(options: PathFigure) -> int:
-    """Draw figure 4.5, and the video."""
+    """Draw figure 4.5, optionally with a video, and return the exit status."""
     check_wind(options.wind)
     if options.video is not None:
         from jaxrl_vis.report.videos import check_output
@@ -108,7 +108,7 @@ def draw_path(options: PathFigure) -> int:
 
 
 def draw_grasps(options: GraspsFigure) -> int:
-    """Draw figure 4.6, from an evaluation, or after one."""
+    """Draw figure 4.6 from an evaluation, which is run first if necessary, and return the exit status."""
     check_wind(options.wind)
     out = options.check()
     from jaxrl_vis.stalks.grasping.report import reach_figures

@@ -1,4 +1,4 @@
-"""``jaxrl-vis grasp run``."""
+"""``jaxrl-vis grasp run``: detect grasp points in recorded stereo pairs."""
 
 import dataclasses
 import sys
@@ -15,12 +15,12 @@ from jaxrl_vis.stalks.cli.phenotype_run import SKIPPED
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run(CameraOptions):
-    """Find grasp points in folders of stereo pairs: a table of points and of runs, and an overlay per run."""
+    """Detect grasp points in folders of stereo pairs: tables of points and of runs, and an overlay per run."""
 
     folder: Annotated[Path, AlsoPositional()]
-    """A run's folder of pairs (left_000.png, right_000.png, ...), or a folder of such folders."""
+    """Folder with the pairs of a run (left_000.png, right_000.png, ...), or a folder of such folders."""
     out: Path = Path("grasp_results")
-    """Folder for the results; a command that was stopped continues where it was."""
+    """Folder for the results; an interrupted command continues where it stopped."""
     height: float = 1.0
     """Height of the left camera above the ground, m."""
     pitch: float = 15.0
@@ -28,13 +28,13 @@ class Run(CameraOptions):
     weights: Path | None = None
     """Weights from `grasp train`; the shipped ones if not given."""
     masks: Literal["gan", "segmentation", "truth"] = "segmentation"
-    """Source of masks: the segmentation that ships, a GAN that you have trained (--weights), or the truth of synthetic runs."""
+    """Source of masks: the shipped segmentation, a GAN that you have trained (--weights), or the truth of synthetic runs."""
     thesis: bool = False
-    """Stitch and find grasp points as the thesis describes it."""
+    """Use the thesis's stitching and grasp point detection."""
 
 
 def run(options: Run) -> int:
-    """Write tables and overlays."""
+    """Process the runs, write tables and overlays, and return the exit status: 3 if pairs were skipped."""
     check_speed(options.speed)
     if not 0.05 <= options.height <= 3.0:
         raise RequestError(f"--height must be from 0.05 to 3 m, not {options.height:g}")

@@ -1,4 +1,4 @@
-"""``jaxrl-vis grasp synth``."""
+"""``jaxrl-vis grasp synth``: write synthetic runs."""
 
 import dataclasses
 
@@ -11,14 +11,14 @@ from jaxrl_vis.stalks.cli.phenotype_synth import write_synthetic
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Synth(SynthOptions):
-    """Write synthetic runs for grasping: folders of five stereo pairs over half a metre, with odometry and exact truth."""
+    """Write synthetic runs for grasping: folders of five stereo pairs over half a metre, with odometry and ground truth."""
 
     runs: int = 1
     """Number of runs."""
 
 
 def synth(options: Synth) -> int:
-    """Write the runs."""
+    """Write the runs, and return the exit status."""
     check_counts(runs=options.runs)
     options.check()
     check_extra("grasping")

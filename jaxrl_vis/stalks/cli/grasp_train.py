@@ -1,4 +1,4 @@
-"""``jaxrl-vis grasp train``."""
+"""``jaxrl-vis grasp train``: train the mask network."""
 
 import dataclasses
 import functools
@@ -15,7 +15,7 @@ from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import DEFAULT_STEPS, TrainingOptions, check_extra
 
 _FIRST_SEED = 100_000
-"""First seed of the rows that networks learn from: evaluations use the seeds below."""
+"""First seed of the training rows with --seed 0; lower seeds are for evaluation."""
 
 
 _RATES = {"segmentation": 1e-3, "gan": 4e-4}
@@ -23,16 +23,16 @@ _RATES = {"segmentation": 1e-3, "gan": 4e-4}
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train(TrainingOptions):
-    """Train the network that paints stalks red, on synthetic rows: against a discriminator, or as a plain segmentation."""
+    """Train the network that masks stalks, on synthetic rows: as a GAN, or as a plain segmentation."""
 
     loss: Literal["gan", "segmentation"] = "segmentation"
-    """Loss: that of a discriminator as in pix2pix, or cross entropy and Dice of the mask."""
+    """Loss: adversarial as in pix2pix (gan), or cross entropy and Dice of the mask (segmentation)."""
     crop: int = 384
-    """Height and width of a crop, pixels: a multiple of 64."""
+    """Side length of square training crops in pixels, a multiple of 64."""
 
 
 def train(options: Train) -> int:
-    """Train the network and write its weights."""
+    """Train the network, write its weights, and return the exit status."""
     check_counts(crop=options.crop)
     options.check()
     if options.crop % 64:

@@ -1,4 +1,4 @@
-"""Options that commands of the farm share by inheritance, and their checks."""
+"""Base classes of the options of ``phenotype`` and ``grasp``, and checks of options."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.io.folders import Patterns, PlotFolder
     from jaxrl_vis_envs.plants import Calibration, Family
 
-# Module -> package, for the packages of an extra.
+# Packages of an extra: module -> package.
 _GRASPING = {"cv2": "opencv-python-headless", "scipy": "scipy", "yaml": "pyyaml"}
 _EXTRAS = {"phenotyping": {**_GRASPING, "tifffile": "tifffile", "pandas": "pandas"}, "grasping": _GRASPING}
 _COMMANDS = {"phenotyping": "phenotype", "grasping": "grasp"}
 Purpose = Literal["phenotyping", "grasping"]
 DEFAULT_STEPS = 20_000
-"""Most updates of a training on synthetic images."""
+"""Default maximum number of updates of a training on synthetic images."""
 
 
 def check_extra(extra: Purpose) -> None:
@@ -37,17 +37,17 @@ def check_extra(extra: Purpose) -> None:
 
 
 def check_masks(masks: str, weights: Path | None) -> None:
-    """Check that no weights are named where masks are the truth.
+    """Check that no weights are given if the masks are the ground truth.
 
     Raises:
-        RequestError: They are.
+        RequestError: There are weights.
     """
     if masks == "truth" and weights is not None:
         raise RequestError("--masks truth uses no weights: leave out --weights")
 
 
 def check_speed(speed: float | None) -> None:
-    """Check that the speed of the robot in m/s is positive, if it is known.
+    """Check that the speed of the robot in m/s is positive, if it is given.
 
     Raises:
         RequestError: It is not.
@@ -58,42 +58,42 @@ def check_speed(speed: float | None) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlantOptions:
-    """Options of a command that draws synthetic plants."""
+    """Options of a command that renders synthetic plants."""
 
     family: Literal["training", "shifted"] | None = None
-    """Family of plants: `training`, which networks learn from, or `shifted`, with every factor of the world shifted. If not
-    given, `shifted` for `phenotype eval` and `training` elsewhere."""
+    """Family of plants: `training`, the training distribution, or `shifted`, with all factors shifted. If not given, `shifted`
+    for `phenotype eval` and `training` otherwise."""
     shift: tuple[str, ...] = ()
-    """Shift only these factors of the family: flash, lean, rig, noise, leaves, textures."""
+    """Factors of the family to shift alone: flash, lean, rig, noise, leaves, textures."""
     spec: Path | None = None
-    """A JSON or TOML file with the values of a family of your own."""
+    """JSON or TOML file with the values of a custom family."""
     frames: int | None = None
-    """Pairs of a plot or run, in place of the family's: 34 for `phenotype`, 5 for `grasp`."""
+    """Number of pairs per plot or run; that of the family if not given: 34 for `phenotype`, 5 for `grasp`."""
     width: int | None = None
-    """Width of an image in pixels, in place of the family's (3376 for `phenotype`, 1024 for `grasp`); the scene stays the
-    same."""
+    """Image width in pixels, with the field of view unchanged; that of the family if not given: 3376 for `phenotype`, 1024 for
+    `grasp`."""
     seed: int = 0
-    """Seed of the first plot or run, the others have the numbers that follow; in training, the seed of everything random."""
+    """Seed of the first plot or run; the others follow consecutively. In training, the random seed."""
 
     def check(self) -> None:
         """Check the values of the options.
 
         Raises:
-            RequestError: One makes no sense.
+            RequestError: A value is invalid.
         """
         check_counts(frames=self.frames, width=self.width)
         if self.seed < 0:
             raise RequestError(f"--seed must be at least 0, not {self.seed}")
 
     def read_family(self, purpose: Purpose, default: str = "training") -> Family:
-        """Return the family that the options ask for.
+        """Return the family that the options select.
 
         Args:
-            purpose: Application whose families ``--family`` names.
-            default: Name of the family to take where neither ``--family`` nor ``--spec`` is given.
+            purpose: Application, whose families are meant by ``--family``.
+            default: Name of the family if neither ``--family`` nor ``--spec`` is given.
 
         Raises:
-            RequestError: The options contradict each other, or the file of a family makes no sense.
+            RequestError: The options contradict each other, or a value or the file of a family is invalid.
         """
         from jaxrl_vis_envs.plants import FAMILIES, read, shift
         from jaxrl_vis_envs.plants.grasping import GRASPING_FAMILIES
@@ -119,9 +119,9 @@ class SynthOptions(PlantOptions):
     """Options of a command that writes synthetic plots or runs."""
 
     out: Annotated[Path, AlsoPositional()]
-    """The folder to write to; plots or runs that it holds already are not drawn again."""
+    """Folder to write to; plots or runs that it already holds are not rendered again."""
     format: Literal["png", "tiff", "jpeg"] = "png"
-    """Format of the cameras' images."""
+    """Format of the camera images."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -129,26 +129,26 @@ class TrainingOptions(PlantOptions):
     """Options of a command that trains networks."""
 
     out: Annotated[Path, AlsoPositional()]
-    """The file to write, .safetensors; `run` and `eval` take it as --weights."""
+    """File of the weights, .safetensors, for --weights of `run` and `eval`."""
     minutes: float | None = None
-    """Most minutes; the weights are written at the end, and every half minute before."""
+    """Maximum duration in minutes; the weights are written at the end and every half minute before."""
     steps: int | None = None
-    """Most updates: 20,000 if not given, and 1,500 where `phenotype train` learns from --data."""
+    """Maximum number of updates; if not given, 20,000, or 1,500 for `phenotype train --data`."""
     images: int = 800
-    """Number of images to learn from."""
+    """Number of synthetic training images."""
     batch: int = 16
-    """Images or crops per update."""
+    """Batch size in images or crops."""
     rate: float | None = None
-    """Highest learning rate. If not given, 0.001, but 0.0004 for `grasp train --loss gan`, and 0.0003 where `phenotype train`
-    starts from weights."""
+    """Peak learning rate. If not given, 0.001, but 0.0004 for `grasp train --loss gan`, and 0.0003 if `phenotype train` starts
+    from weights."""
     workers: int = 4
-    """Number of processes that draw synthetic images while the networks learn; 1: a thread of this one."""
+    """Number of processes that render synthetic images during training; with 1, a thread of the main process does."""
 
     def check(self) -> None:
         """Check the values of the options.
 
         Raises:
-            RequestError: One makes no sense.
+            RequestError: A value is invalid.
         """
         check_counts(steps=self.steps, images=self.images, batch=self.batch, workers=self.workers)
         super().check()
@@ -162,41 +162,41 @@ class TrainingOptions(PlantOptions):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DetectorTraining(TrainingOptions):
-    """Train the networks that find and outline stalks, on synthetic plots or on your own annotated images."""
+    """Train the networks that detect and segment stalks, on synthetic plots or on your own annotated images."""
 
     data: Path | None = None
-    """A folder of annotated images, in place of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal VOC,
-    LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in folders below."""
+    """Folder of annotated images to train on instead of synthetic plots: COCO (of CVAT, Roboflow, Label Studio, ...), Pascal
+    VOC, LabelMe, YOLO, CVAT or Label Studio, with the images beside the annotations or in subfolders."""
     label: tuple[str, ...] = ()
-    """Names of what counts as a stalk in --data, as `stem`; what is called otherwise is background. If not given, what is
-    called a stalk, or everything where nothing has a name."""
+    """Labels that count as stalks in --data, such as `stem`; all others are background. If not given, labels that mean stalk,
+    or all annotations if none has a label."""
     start: str | None = None
-    """Weights to start from: a file of an earlier training, `shipped` for those of the package, or `random`. If not given,
-    `random`, and for --data `shipped`, as a few images are too few to learn everything from."""
+    """Initial weights: a file of an earlier training, `shipped` for those of the package, or `random`. If not given, `random`,
+    but `shipped` for --data, as a few images do not suffice to train from scratch."""
     batch: int = 8
-    """Images per update."""
+    """Batch size in images."""
     snips: int = 32
-    """Strips at full resolution per update, for the masks."""
+    """Number of full-resolution stalk crops per update, for the masks."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvaluationOptions(PlantOptions):
-    """Options of a command that scores results against the truth of synthetic plots or runs."""
+    """Options of a command that scores results against the ground truth of synthetic plots or runs."""
 
     weights: Path | None = None
     """Weights from `train`; the shipped ones if not given."""
     workers: int = 1
-    """Number of processes, each with a plot or run of its own; they share the GPUs and cores, and take about 2 GB of memory
-    each. Figures do not depend on it, times do."""
+    """Number of processes that evaluate plots or runs in parallel; they share the GPUs and cores, and take about 2 GB of memory
+    each. It affects times, but no scores."""
     json: Path | None = None
-    """A file for the figures of all plots or runs together and of each one, written after each. Those that it holds already,
-    under the same conditions, are not evaluated again."""
+    """File for the scores of each plot or run and their summary, updated after each. Those that it already holds, under the
+    same conditions, are not evaluated again."""
 
     def check(self) -> None:
         """Check the values of the options.
 
         Raises:
-            RequestError: One makes no sense.
+            RequestError: A value is invalid.
         """
         check_counts(workers=self.workers)
         super().check()
@@ -208,26 +208,26 @@ class CameraOptions:
 
     calibration: Path | None = None
     """Calibration of all folders: a file of OpenCV, RealSense, Middlebury or KITTI, or a folder with left.yaml and right.yaml
-    of ROS. If not given, the one that lies in each folder: calibration.yaml, extrinsics.yml, calib.txt, left.yaml and
-    right.yaml. Without one there are no metric lengths."""
+    of ROS. If not given, the one in each folder: calibration.yaml, extrinsics.yml, calib.txt, or left.yaml and right.yaml.
+    Without a calibration there are no metric lengths."""
     calibration_unit: str | None = None
-    """Unit of the calibration's baseline, where the file does not say it: m, cm or mm, or the side of a square of the
-    chessboard, as 24mm, where it was counted in squares."""
+    """Unit of the calibration's baseline, if the file does not state it: m, cm or mm, or the side of a chessboard square, such
+    as 24mm, if lengths are in squares."""
     speed: float | None = None
-    """Speed of the robot in m/s, for an odometry.csv that holds times only."""
+    """Speed of the robot in m/s, for an odometry.csv that holds only times."""
 
     left: str | None = None
-    """Pattern of the left images within each plot's folder, as 'image_02/*.png', with --right; what the stars stand for is the
-    same for both images of a pair, or the times that are nearest. If not given, names say left and right, L and R, cam0 and
-    cam1, ... Of a recording of ROS (.bag, .mcap, .db3): its topic."""
+    """Glob pattern of the left images within each plot's folder, such as 'image_02/*.png', with --right; images are paired by
+    the text that the wildcards match, or by nearest timestamps. If not given, sides are recognised by name: left and right, L
+    and R, cam0 and cam1, ... For a ROS recording (.bag, .mcap, .db3): topic of the left images."""
     right: str | None = None
-    """Pattern of the right images, with --left."""
+    """Glob pattern or topic of the right images, with --left."""
 
     def patterns(self) -> Patterns | None:
-        """Return the patterns of the images' names; None where names say it themselves.
+        """Return the patterns of the images' names; None if none are given.
 
         Raises:
-            RequestError: Only one side is given.
+            RequestError: The pattern of only one side is given.
         """
         from jaxrl_vis.stalks.phenotyping.io.folders import Patterns
 
@@ -236,10 +236,10 @@ class CameraOptions:
         return None if self.left is None or self.right is None else Patterns(self.left, self.right)
 
     def find_plots(self, folder: Path, out: Path) -> list[PlotFolder]:
-        """Return the plots of a folder, or of a recording, which is taken apart into the folder ``recording`` in ``out``.
+        """Return the plots in a folder or a recording, which is extracted to the folder ``recording`` in ``out``.
 
         Raises:
-            RequestError: There are none.
+            RequestError: There are none, they are ambiguous, or the recording cannot be read.
         """
         from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
         from jaxrl_vis.stalks.phenotyping.io.recording import Topics, is_recording, take_apart
@@ -251,10 +251,10 @@ class CameraOptions:
         return find_plots(take_apart(folder, out / "recording", topics))
 
     def read_calibration(self, plot: PlotFolder) -> Calibration | None:
-        """Return the calibration of one folder of pairs; None where there is none.
+        """Read the calibration of one folder of pairs; return None if there is none.
 
         Raises:
-            RequestError: The file cannot be read.
+            RequestError: The file cannot be read, or is not a valid calibration.
         """
         from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration, read_calibration
 

@@ -1,4 +1,4 @@
-"""``jaxrl-vis phenotype eval``."""
+"""``jaxrl-vis phenotype eval``: score detections, counts and widths against ground truth."""
 
 import dataclasses
 import json
@@ -19,25 +19,25 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Eval(EvaluationOptions):
-    """Compare detections, counts and widths with the exact truth of synthetic plots, which are drawn for it."""
+    """Compare detections, counts and widths with the exact ground truth of synthetic plots, rendered on the fly."""
 
     masks: Literal["network", "truth"] = "network"
-    """Source of masks: the networks, or the truth, to see how good everything after the masks is."""
+    """Source of masks: the networks, or the ground truth, to evaluate everything downstream of the masks."""
     plots: int = 10
     """Number of plots."""
     method: Literal["strip", "ellipse"] = "strip"
-    """Method of widths."""
+    """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
     least_score: float = 0.5
-    """Lowest score of a detection that counts as a stalk, 0 to 1."""
+    """Minimum score of a detection that counts as a stalk, 0 to 1."""
     thesis: bool = False
-    """Score the thesis's methods too (ellipses, semi-global matching, stalks per metre of image), on the same detections."""
+    """Also score the thesis's methods (ellipses, semi-global matching, stalks per metre of image) on the same detections."""
     each_factor: bool = False
-    """A table: the training family, each factor of the world shifted alone, and all of them; --plots of each. --json names the
-    file of the table; the files of the factors go beside it."""
+    """Evaluate the training family, each factor shifted alone, and all factors shifted, on --plots each, and print a table.
+    --json is the file of the table; the files of the factors are written beside it."""
 
 
 def evaluate(options: Eval) -> int:
-    """Print the figures."""
+    """Evaluate the plots, print their scores, and return the exit status."""
     check_counts(plots=options.plots)
     options.check()
     if not 0.0 <= options.least_score <= 1.0:
@@ -71,7 +71,7 @@ def evaluate(options: Eval) -> int:
 
 
 def _factors(options: Eval) -> "dict[str, Family]":
-    """Return the training family, each factor shifted alone, and all of them, by name."""
+    """Return the families of ``--each-factor``: unshifted (``none``), with each factor shifted alone, and with ``all``."""
     from jaxrl_vis_envs.plants import SHIFTS
 
     alone = {factor: dataclasses.replace(options, family="training", shift=(factor,)) for factor in SHIFTS}
@@ -81,7 +81,7 @@ def _factors(options: Eval) -> "dict[str, Family]":
 
 
 def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | None, name: str) -> dict[str, dict[str, Any]]:
-    """Evaluate all plots of each family, print a line per plot, and return the figures of each family."""
+    """Evaluate all plots of each family, print one line per plot, and return the summary of each family by its key."""
     from jaxrl_vis.stalks.phenotyping.evaluation import records
 
     tasks = {
@@ -106,7 +106,7 @@ def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | N
 
 
 def _path(path: Path | None, factor: str) -> Path | None:
-    """Return the file of one factor, which lies beside that of the table."""
+    """Return the file of one factor, beside that of the table; None without a file."""
     return path.with_name(f"{path.stem}-{factor}.json") if path and factor else path
 
 
@@ -114,7 +114,7 @@ _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_m
 
 
 def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
-    """Print a line of Markdown for each factor that is shifted alone, and write the file."""
+    """Print a Markdown table with one row per shifted factor, and write it as JSON if a file is given."""
     from jaxrl_vis.host.files import write_atomically
 
     if options.json is not None:

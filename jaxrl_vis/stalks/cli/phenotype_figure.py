@@ -16,24 +16,24 @@ from jaxrl_vis.stalks.cli.phenotype_eval import Eval, evaluate
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """Draw a figure of chapter 3: counts, widths or times on synthetic plots of sorghum, beside the thesis's of people."""
+    """Draw a figure of chapter 3: counts, widths or times on synthetic plots of sorghum, compared with humans."""
 
     figure: Annotated[Literal["3.4", "3.5", "table3.1"], tyro.conf.Positional]
     """Figure of the thesis: counts (3.4), widths (3.5) or times (table3.1)."""
     out: Path | None = None
-    """A .png, .pdf or .svg file, and .md for table3.1; figure_FIGURE.png or table_3.1.md in the current folder if not given.
-    Tables go beside it, as .md and .csv."""
+    """File of the figure: .png, .pdf or .svg, or .md for table3.1; figure_FIGURE.png or table_3.1.md in the current folder if
+    not given. Its data are written beside it as .md and .csv."""
     evaluation: Path | None = None
-    """A file that `phenotype eval --json` wrote; if not given, plots are evaluated first, and the file goes beside the
+    """File written by `phenotype eval --json`; if not given, plots are evaluated first, and the file is written beside the
     figure."""
     plots: int | None = None
     """Number of plots to evaluate; 10 if not given."""
     quick: bool = False
-    """For a CPU: three small plots, unless --plots says how many."""
+    """Evaluate small plots, three of them unless --plots is given; suitable for a CPU."""
 
 
 def draw(options: Figure) -> int:
-    """Draw one figure."""
+    """Draw one figure, and return the exit status."""
     is_table = options.figure == "table3.1"
     suffixes = (".md",) if is_table else FIGURE_SUFFIXES
     out = options.out or Path("table_3.1.md" if is_table else f"figure_{options.figure}.png")

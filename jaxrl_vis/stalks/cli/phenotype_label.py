@@ -1,4 +1,4 @@
-"""``jaxrl-vis phenotype label``."""
+"""``jaxrl-vis phenotype label``: propose annotations."""
 
 import dataclasses
 from pathlib import Path
@@ -16,18 +16,18 @@ class Label:
     """Propose boxes and outlines of stalks in your own images, to correct in CVAT, LabelMe or Label Studio and to train on."""
 
     images: Annotated[Path, AlsoPositional()]
-    """A folder of images. Annotations are written beside them; those that are there already stay as they are."""
+    """Folder of images. Annotations are written beside them; existing ones are never overwritten."""
     format: Literal["coco", "labelme"] = "coco"
-    """Form of the annotations: annotations.json of COCO, as CVAT (`COCO 1.0`) and Label Studio import it, or a .json of LabelMe
-    beside each image."""
+    """Format of the annotations: one annotations.json in COCO format, for import in CVAT (`COCO 1.0`) and Label Studio, or a
+    LabelMe .json beside each image."""
     weights: Path | None = None
     """Weights from `phenotype train`; the shipped ones if not given."""
     least_score: float = 0.3
-    """Lowest score of a proposal, 0 to 1: it is quicker to delete one than to draw one."""
+    """Minimum score of a proposal, 0 to 1; low, as deleting a false one is quicker than drawing a missing one."""
 
 
 def label(options: Label) -> int:
-    """Write the proposals."""
+    """Write the proposals, and return the exit status: 3 if images were skipped."""
     if not 0.0 <= options.least_score <= 1.0:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
     check_extra("phenotyping")

@@ -1,4 +1,4 @@
-"""``jaxrl-vis phenotype run``."""
+"""``jaxrl-vis phenotype run``: count and measure stalks in recorded stereo pairs."""
 
 import dataclasses
 import functools
@@ -16,43 +16,43 @@ from jaxrl_vis.stalks.cli.options import CameraOptions, check_extra, check_masks
 from jaxrl_vis.stalks.cli.progress import progress
 
 SKIPPED = 3
-"""Exit status where files were skipped."""
+"""Exit status if files were skipped."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run(CameraOptions):
-    """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per image."""
+    """Count and measure the stalks in folders of stereo pairs: tables per stalk and per plot, and an overlay per pair."""
 
     folder: Annotated[Path | None, AlsoPositional()] = None
-    """A plot's folder of pairs (left_000.png, right_000.png, ...), a folder of such folders, or a recording of ROS (.bag,
-    .mcap, .db3; needs the extra `bags`); the short synthetic row that comes with the package if not given."""
+    """Folder with the pairs of a plot (left_000.png, right_000.png, ...), a folder of such folders, or a ROS recording (.bag,
+    .mcap, .db3; needs the extra `bags`); a short synthetic row that ships with the package if not given."""
     out: Path = Path("phenotype_results")
-    """Folder for the results; a command that was stopped continues where it was."""
+    """Folder for the results; an interrupted command continues where it stopped."""
     weights: Path | None = None
     """Weights from `phenotype train`; the shipped ones if not given."""
     masks: Literal["network", "truth"] = "network"
-    """Source of masks: the networks, or the truth of synthetic plots, to see how good everything after the masks is."""
+    """Source of masks: the networks, or the ground truth of synthetic plots, to evaluate everything downstream of the masks."""
     method: Literal["strip", "ellipse"] = "strip"
-    """Method of widths: between two edges, or by ellipses as in the thesis."""
+    """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
     least_score: float = 0.5
-    """Lowest score of a detection that counts as a stalk, 0 to 1."""
+    """Minimum score of a detection that counts as a stalk, 0 to 1."""
     disparity_scale: float = 256.0
-    """Divisor that makes pixels of disparities in files of 16 bits (disparity_000.png beside the images): 256 as KITTI writes
-    them, 64 as `phenotype synth` does."""
+    """Scale of 16-bit disparity files (disparity_000.png beside the images): their values divided by it are pixels. 256 for
+    KITTI, 64 for `phenotype synth`."""
     field: Path | None = None
-    """Plan of the field: a CSV, or an export of Field Book, whose column plot_id (or plot; or range and row) says which row is
-    of which folder. Its other columns (range, genotype, replicate, ...) are joined to the results in --format."""
+    """Field plan: a CSV or an export of Field Book, whose rows are matched to folders by column plot_id (or plot, or range and
+    row). Its other columns (range, genotype, replicate, ...) are joined to the results in --format."""
     format: Literal["plain", "brapi", "miappe", "plantcv"] = "plain"
-    """Form in which results of plots are written beside plots.csv, with units and terms of ontologies: traits.csv, or as BrAPI,
-    MIAPPE or PlantCV have them."""
+    """Format of the plots' results that are written beside plots.csv, with units and ontology terms: traits.csv (plain), BrAPI,
+    MIAPPE or PlantCV."""
     term: tuple[str, ...] = ()
-    """Terms of an ontology for columns of plots.csv, as `stalks=CO_324:0000001`, in place of those that --format knows."""
+    """Ontology terms of columns of plots.csv, such as `stalks=CO_324:0000001`, instead of the built-in ones."""
     workers: int = 1
-    """Number of processes that look at pairs side by side; they share the GPUs and cores, and take 1 to 2 GB each."""
+    """Number of processes that handle pairs in parallel; they share the GPUs and cores, and take 1 to 2 GB of memory each."""
 
 
 def run(options: Run) -> int:
-    """Write tables and overlays."""
+    """Process the plots, write tables, the page and overlays, and return the exit status: 3 if pairs were skipped."""
     if not 0.0 <= options.least_score <= 1.0:
         raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
     check_speed(options.speed)

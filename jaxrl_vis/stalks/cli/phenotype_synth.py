@@ -1,4 +1,4 @@
-"""``jaxrl-vis phenotype synth``."""
+"""``jaxrl-vis phenotype synth``: write synthetic plots."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Literal
@@ -16,16 +16,17 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Synth(SynthOptions):
-    """Write synthetic plots of sorghum: folders of stereo pairs with calibration, odometry and exact truth."""
+    """Write synthetic plots of sorghum: folders of stereo pairs with calibration, odometry and exact ground truth."""
 
     plots: int = 1
     """Number of plots."""
     truth: Literal["all", "boxes", "none"] = "all"
-    """Truth to write: masks and disparities too, boxes only, or nothing but counts and diameters."""
+    """Ground truth to write: masks, disparities, boxes, counts and diameters (all), no masks and disparities (boxes), or only
+    counts and diameters (none)."""
 
 
 def synth(options: Synth) -> int:
-    """Write the plots."""
+    """Write the plots, and return the exit status."""
     check_counts(plots=options.plots)
     options.check()
     check_extra("phenotyping")
@@ -39,14 +40,14 @@ def synth(options: Synth) -> int:
 def write_synthetic(
     options: SynthOptions, family: "Family", count: int, truth: Literal["all", "boxes", "none"], noun: str
 ) -> None:
-    """Write plots and print a line about them.
+    """Write plots or runs with progress, and print a one-line summary.
 
     Args:
         options: Folder, image format and first seed.
-        family: Family that the plots are drawn from.
+        family: Family that the plots are sampled from.
         count: Number of plots.
-        truth: Truth to write.
-        noun: Word for plots, in the plural.
+        truth: Ground truth to write.
+        noun: Noun for the plots in the summary, in the plural.
 
     Raises:
         RequestError: The folder cannot be written to, or holds another family's plots.

@@ -1,4 +1,4 @@
-"""``jaxrl-vis phenotype train``."""
+"""``jaxrl-vis phenotype train``: train the detection and segmentation networks."""
 
 import dataclasses
 import functools
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 
 _FIRST_SEED = 100_000
-"""First seed of the plots that networks learn from: evaluations use the seeds below."""
+"""First seed of the training plots with --seed 0; lower seeds are for evaluation."""
 
 
 def train(options: DetectorTraining) -> int:
-    """Train the networks and write their weights."""
+    """Train the networks, write their weights, and return the exit status."""
     check_counts(snips=options.snips)
     options.check()
     drawn = (options.family, options.shift, options.spec, options.frames, options.width)
@@ -87,7 +87,7 @@ def _train(options: DetectorTraining) -> int:
 
 
 def _start(options: DetectorTraining) -> tuple[Any, "Settings", str]:
-    """Return parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
+    """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin."""
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 
@@ -95,6 +95,6 @@ def _start(options: DetectorTraining) -> tuple[Any, "Settings", str]:
     if start == "random":
         return None, Settings(), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
-    # How many candidates there are is no part of what was learned: what the head has not seen yet it learns now.
+    # The number of candidates is not tied to the weights: training adapts the head to new ones.
     settings = dataclasses.replace(settings, candidates=Settings().candidates)
     return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"

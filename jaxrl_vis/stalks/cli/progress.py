@@ -1,4 +1,4 @@
-"""Progress of a command: a bar in a terminal, a line for each part elsewhere."""
+"""Progress of a command: progress bars in a terminal, otherwise one line per completed part."""
 
 import contextlib
 import sys
@@ -10,13 +10,13 @@ from jaxrl_vis.host.streams import safe
 from jaxrl_vis.run.loggers.bar import FittingProgress
 
 Done = Callable[[str, int, int], None]
-"""Called with the name of a part, the number of units done, and their total."""
+"""Progress callback, called with the name of a part, the number of units done, and the total number of units."""
 _SHORT_NAME = 20
 
 
 @contextlib.contextmanager
 def progress(unit: str) -> Iterator[Done]:
-    """Show the progress of a command.
+    """Show the progress of a command on stdout, and yield the callback that updates it.
 
     Args:
         unit: Unit of progress, in the plural.

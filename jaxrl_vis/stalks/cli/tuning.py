@@ -1,4 +1,4 @@
-"""``jaxrl-vis phenotype train --data``: the part of the command that learns from annotated images."""
+"""``jaxrl-vis phenotype train --data``: training on annotated images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,13 @@ _RATE, _RATE_FROM_RANDOM = 3e-4, 1e-3
 
 
 def train_on_images(options: DetectorTraining, folder: Path) -> int:
-    """Train on a folder of annotated images; write the weights, and a report on images that were held out beside them."""
+    """Train on a folder of annotated images, and return the exit status.
+
+    Writes the weights and, beside them, an HTML report on held-out images, if there are enough images to hold some out.
+
+    Raises:
+        RequestError: The annotations or images are unusable, the initial weights do not fit them, or a file cannot be written.
+    """
     began = time.monotonic()
 
     def say(line: str) -> None:
@@ -74,7 +80,7 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
 
 
 def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, count: int, say: Any) -> list[Example]:
-    """Read all images with their stalks and snips, and say how far it is every few seconds."""
+    """Read all images with their stalks and stalk crops, and report the progress every few seconds."""
     from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples
 
     examples, told = [], time.monotonic()
@@ -88,7 +94,7 @@ def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, 
 
 
 def _split(options: DetectorTraining, names: list[str], examples: list[Example], say: Any) -> Split:
-    """Split the images by photograph, and say how many are where."""
+    """Split the images by photograph into training, early-stopping and test sets, and report their sizes."""
     from jaxrl_vis.stalks.phenotyping.training.photographs import FEWEST, photographs_of, split
 
     parts = split(photographs_of(names, [example.image for example in examples]), options.seed)
@@ -114,7 +120,7 @@ def _report(
     masks: bool,
     say: Any,
 ) -> None:
-    """Write the page that compares the weights before and after, and print its numbers."""
+    """Write the page that compares the weights before and after training on the test images, and print its scores."""
     import jax.numpy as jnp
 
     from jaxrl_vis.stalks.phenotyping.report.training_page import write_page
@@ -148,7 +154,11 @@ def _report(
 
 
 def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Settings, str]:
-    """Return parameters to go on from (None: random ones), settings of the networks, and what to say of it."""
+    """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
+
+    Raises:
+        RequestError: Weights given by ``--start`` are for stalks of a very different size.
+    """
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
     from jaxrl_vis.stalks.phenotyping.training.examples import settings_for
@@ -167,8 +177,8 @@ def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Sett
             raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
         say(f"starting from random weights: {why}")
         return None, fitting, ""
-    # What was learned goes with its anchors, so those of the annotations are not taken. How many candidates there are is no
-    # part of it: what the head has not seen yet it learns now.
+    # The weights are tied to their anchors, so these are kept instead of those that fit the annotations. The number of
+    # candidates is not: training adapts the head to new ones.
     settings = dataclasses.replace(
         fitting,
         band_lines=settings.band_lines,

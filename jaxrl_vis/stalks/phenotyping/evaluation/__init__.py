@@ -1,1 +1,1 @@
-"""Synthetic plots with exact truth, and scores of detections, counts and widths against it."""
+"""Synthetic plots with exact ground truth, and scores of detections, counts and widths against it."""

@@ -1,4 +1,4 @@
-"""Detections as perfect networks would make them, from true boxes and masks of synthetic pairs, to test everything after."""
+"""Detections from ground-truth boxes and masks of synthetic pairs, to evaluate everything downstream of the networks."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -9,12 +9,12 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, higher_up
 
 
 def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray, least: float = 0.3) -> list[Detection]:
-    """The stalks that an image shows, from left to right.
+    """Return the detections of the visible stalks of an image, from left to right, with score 1.
 
     Args:
-        stalks: With ``stalk``, ``band_box`` and ``band_visible``, as in `truth.StalkInView` or plot.json.
-        instance: [H, W] whole numbers: which stalk each pixel shows.
-        least: Share of a stalk's part in the band that must be seen.
+        stalks: Stalks with ``stalk``, ``band_box`` and ``band_visible``, as in `truth.StalkInView` or plot.json.
+        instance: Index of the stalk that each pixel shows, [H, W] int.
+        least: Minimum visible fraction of a stalk's part in the band.
     """
     detections = []
     height, width = instance.shape
@@ -36,9 +36,15 @@ def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray
 
 
 def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndarray, tuple[int, int]] | None:
-    """True mask of a stalk's piece around the upper height, and its corner; None where the image does not show it."""
+    """Return the true mask of a stalk around the upper height, and its corner; None if that is outside the image.
+
+    Args:
+        stalk: Left, top, right, bottom of the band's box, and columns of the axis at its top and bottom, [6].
+        instance: Index of the stalk that each pixel shows, [H, W] int.
+        index: Index of the stalk.
+    """
     left, top, right, bottom = higher_up(stalk)[:4]
-    beside = right - left  # it may bend
+    beside = right - left  # margin, as the stalk may bend
     first, last = max(round(left - beside), 0), min(round(right + beside), instance.shape[1])
     if top <= 0 or last <= first:
         return None

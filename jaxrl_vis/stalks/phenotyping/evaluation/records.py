@@ -1,8 +1,9 @@
-"""An evaluation of many plots, as `evaluation_pool` goes through them: what is done with one, and what is kept of it.
+"""Evaluation of many plots in parallel processes, with a record per plot that lets an interrupted evaluation continue.
 
     Task, seed -> evaluate_plot -> record -> `RecordFile`: the file, written after each plot -> read_scores -> summary
 
-A score is rounded when it is made, so that what the file keeps is what was scored. Which process scores a plot does not matter.
+Records are rounded when they are made, so results computed from the file and in memory are the same. They do not depend on
+which process evaluates a plot.
 """
 
 import dataclasses
@@ -26,21 +27,21 @@ from jaxrl_vis_envs.plants import Family
 
 SCHEMA = 3
 KEPT_SCORE = 0.05
-"""Lowest score of recorded detections: others matter for nothing but the far end of the precision curve."""
+"""Minimum score of recorded detections: lower ones affect only the far end of the precision-recall curve."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Plots to score and methods to score, the same for all plots of an evaluation.
+    """Settings common to all plots of an evaluation.
 
     Attributes:
-        family: Family that plots are drawn from.
-        weights: File of the networks' weights; None for true boxes and masks.
+        family: Family that plots are sampled from.
+        weights: File of the networks' weights; None for ground-truth boxes and masks.
         finder: Name of the networks, or ``truth``.
-        method: Method of widths.
-        least_score: Lowest score of a detection that counts.
-        thesis: Score the thesis's methods on the same detections, too.
-        workers: Number of processes that share the machine; records state it, as it bears on the time that a pair takes.
+        method: Method of measuring widths.
+        least_score: Minimum score of a detection that counts.
+        thesis: If true, also score the thesis's methods on the same detections.
+        workers: Number of processes on the machine; stored in the records, as it affects the time per pair.
     """
 
     family: Family
@@ -53,10 +54,10 @@ class Task:
 
 
 def evaluate_plot(task: Task, seed: int) -> Record:
-    """Evaluate one plot, and return its record; networks are read once in each process.
+    """Evaluate one plot and return its record. The networks are loaded once per process.
 
     Args:
-        task: For all plots.
+        task: Settings of the evaluation.
         seed: Seed of the plot.
     """
     find = None
@@ -70,7 +71,7 @@ def evaluate_plot(task: Task, seed: int) -> Record:
 
 
 def conditions(task: Task) -> dict[str, Any]:
-    """All that the scores of a plot depend on beside its seed: those of equal conditions belong together."""
+    """Return all conditions that the scores of a plot depend on besides its seed; only records with equal ones are combined."""
     import jax
 
     return {
@@ -78,7 +79,7 @@ def conditions(task: Task) -> dict[str, Any]:
         "family": task.family.name,
         "schema": SCHEMA,
         "version": jaxrl_vis.__version__,
-        # What trains networks and draws figures changes no score.
+        # Code of training and figures does not affect scores.
         "code": code_digest(jaxrl_vis_envs.plants, jaxrl_vis.stalks.phenotyping, leave_out=("training", "figures.py")),
         "platform": jax.default_backend(),
         "family_digest": value_digest(dataclasses.asdict(task.family)),
@@ -97,22 +98,22 @@ def evaluate_tasks(
     started: Callable[[int], None],
     done: Callable[[str, int, Record], None],
 ) -> dict[str, dict[str, Any]]:
-    """Evaluate the same plots for several tasks, side by side in the tasks' number of processes.
+    """Evaluate the same plots for several tasks in parallel processes.
 
     Args:
-        tasks: Name -> task; they agree on `Task.workers` and `Task.least_score`.
+        tasks: Name -> task; all have the same `Task.workers` and `Task.least_score`.
         seeds: Seeds of the plots.
-        paths: Name -> JSON file of the task's records, which is written after each plot; None for no file. Plots that it holds
-            already are not evaluated again.
-        started: Called once with the number of plots that the files hold already.
+        paths: Name -> JSON file of the task's records, written after each plot; None for no file. Plots that it already holds
+            are not evaluated again.
+        started: Called once with the number of evaluations that the files already hold.
         done: Called after each plot with the task's name, the seed and the record.
 
     Returns:
-        Name -> figures of all plots together, see `scoring.summary`.
+        Name -> summary of all plots, see `scoring.summary`.
 
     Raises:
         RequestError: A file holds records of another evaluation, or cannot be read.
-        WorkerError: A process was ended from outside.
+        WorkerError: A process was killed from outside.
     """
     names = list(tasks)
     first = tasks[names[0]]
@@ -136,7 +137,7 @@ def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], nu
 
 
 def read_scores(records: Iterable[Record]) -> list[PlotScore]:
-    """The scores that records hold."""
+    """Convert records to scores."""
     return [_read(record) for record in records]
 
 
@@ -146,7 +147,7 @@ def summarise(least_score: float, records: Iterable[Record]) -> dict[str, Any]:
 
 
 def _record(score: PlotScore, pairs: int) -> Record:
-    """Return the record of a plot, as JSON holds it."""
+    """Convert a plot's score to a record of JSON types."""
     thesis = score.thesis
     return {
         "seed": score.seed,
@@ -165,7 +166,7 @@ def _record(score: PlotScore, pairs: int) -> Record:
 
 
 def _read(record: Record) -> PlotScore:
-    """The inverse of `_record`."""
+    """Convert a record to a score, the inverse of `_record`."""
 
     def pairs(values: list[list[float]]) -> np.ndarray:
         return np.array(values, float).reshape(-1, 2)

@@ -1,6 +1,6 @@
-"""Scores of detections, counts and widths against the exact truth of synthetic plots, which are drawn for it.
+"""Scores of detections, counts and widths against the exact ground truth of synthetic plots, rendered on the fly.
 
-plot -> pairs -> detections -> sightings -> stalks       as `pipeline.run` does, without files
+plot -> pairs -> detections -> sightings -> stalks       as in `pipeline.run`, without files
      -> true boxes, count and diameters             from the plot itself
 """
 
@@ -26,24 +26,26 @@ from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
 
 MIN_VISIBLE = 0.3
 IOU = 0.5
-_DEVIATIONS_95 = 1.96  # standard errors on either side of a width: its interval of 95 %
-PERSON_SD = 1.45  # mm: of one person with calipers, from the thesis's 1.639 mm between two
+_DEVIATIONS_95 = 1.96  # half-width of a 95 % interval in standard errors
+PERSON_SD = 1.45  # mm, of one person with calipers: from the mean absolute difference of 1.639 mm between two, in the thesis
 
 
 @dataclasses.dataclass(frozen=True)
 class PlotScore:
-    """One plot.
+    """Score of one plot.
 
     Attributes:
         seed: Seed of the plot.
-        true, counted: Stalks.
-        widths: [N, 2] float64, measured and true diameter at 12 inches of each stalk that was counted and identified, mm.
-        errors: [N] float64, standard error of each of the measured diameters, mm.
-        upper: [M, 2] float64, the same at 24 inches.
-        seconds: Time of finding and measuring per pair, from arrays in memory; the first pair, which compiles, is left out.
-        thesis: Score of the thesis's methods on the same detections.
-        finds: [K, 2] float64, score of a detection, and 1 if it is a stalk, 0 if not; those of unclear stalks are left out.
-        stalks: Number of stalks that detections could have shown, over all pairs.
+        true, counted: True and counted number of stalks.
+        widths: Measured and true diameter at 12 inches of each stalk that was counted and identified, [N, 2] float64, mm.
+        errors: Standard error of each measured diameter at 12 inches, [N] float64, mm.
+        upper: Measured and true diameter at 24 inches, [M, 2] float64, mm.
+        seconds: Mean time of detection and measurement per pair, images in memory, without the first pair, which includes
+            compilation; NaN for a single pair.
+        thesis: Score of the thesis's methods on the same detections; None if they were not evaluated.
+        finds: Score of each detection, and 1 for a true or 0 for a false positive, [K, 2] float64; matches of mostly occluded
+            stalks are left out.
+        stalks: Number of detectable stalks (ground-truth positives), summed over all pairs.
     """
 
     seed: int
@@ -60,11 +62,11 @@ class PlotScore:
 
 @dataclasses.dataclass(frozen=True)
 class ThesisScore:
-    """Counts and widths of the same detections by the thesis's methods.
+    """Count and widths from the same detections by the thesis's methods.
 
     Attributes:
-        counted: Stalks, by the stalks on each metre of image.
-        widths: [N, 2] float64, measured and true diameter at 12 inches, mm.
+        counted: Estimated number of stalks, from the mean number per metre of image.
+        widths: Measured diameter, and true one at 12 inches, of each identified stalk, [N, 2] float64, mm.
     """
 
     counted: float
@@ -79,15 +81,15 @@ def score_plot(
     least_score: float = 0.5,
     with_thesis: bool = False,
 ) -> PlotScore:
-    """Draw a plot, run everything on it and compare.
+    """Render a plot, run the whole pipeline on it, and score the results.
 
     Args:
-        family: Family that the plot is drawn from.
+        family: Family that the plot is sampled from.
         seed: Seed of the plot.
-        find: Detector of the stalks, those of low scores too; None for true boxes and masks.
-        method: Method of widths.
-        least_score: Lowest score of a detection that counts.
-        with_thesis: Score the thesis's methods on the same detections, too.
+        find: Stalk detector, which should also return detections with low scores; None for ground-truth boxes and masks.
+        method: Method of measuring widths.
+        least_score: Minimum score of a detection that counts.
+        with_thesis: If true, also score the thesis's methods on the same detections.
     """
     sequence = Sequence.of(draw(family, seed))
     drive, plot = sequence.drive, sequence.plot
@@ -141,7 +143,7 @@ def score_plot(
 
 
 def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, density: float | None) -> list[Detection]:
-    """True boxes and masks, as a finder that needs no image."""
+    """Return ground-truth detections, with the signature of a detector; the image and density are ignored."""
     return perfect_detections(map(dataclasses.asdict, stalks), instance, MIN_VISIBLE)
 
 
@@ -153,16 +155,21 @@ def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], 
 
 
 def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
-    """Diameter of a stalk at a height in m as the cameras face it, mm; beside a node, the stalk above and below it is meant."""
+    """Return the true diameter in mm, as the cameras face it, at a height in m; near a node, the mean above and below it."""
     beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
     return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
 
 
 def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:
-    """Match detections with stalks by COCO's rules: the best detection first, a stalk once, at an overlap of boxes of 0.5.
+    """Match detections with stalks as COCO does: greedily by descending score, each stalk once, at an IoU of at least 0.5.
+
+    Args:
+        detections: Detections in an image.
+        stalks: Stalks in view of it.
 
     Returns:
-        The stalk of each find, or None; and score and success of each find, less those of stalks that are too hidden to count.
+        Index of each detection's stalk, None if unmatched; and the score of each detection with 1.0 if it is matched, else 0.0,
+        by descending score and without matches of stalks that are occluded too much to count.
     """
     there = [stalk for stalk in stalks if stalk.band_box is not None]
     clear = np.array([stalk.band_visible >= MIN_VISIBLE for stalk in there], bool)
@@ -185,7 +192,7 @@ def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[
 
 
 def overlaps_with(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Intersection over union [N] of a box [4] with boxes [N, 4]."""
+    """Compute the intersection over union [N] of a box [4] with boxes [N, 4] (left, top, right, bottom)."""
     low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
     common = np.prod(np.clip(high - low, 0.0, None), axis=1)
     areas = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
@@ -193,10 +200,10 @@ def overlaps_with(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 
 def average_precision(finds: np.ndarray, stalks: int) -> float:
-    """Average precision as COCO takes it: the mean over 101 recalls of the best precision at that recall or beyond.
+    """Compute COCO's average precision: the mean over 101 recall levels of the maximum precision at that recall or higher.
 
     Args:
-        finds: [K, 2], score and success.
+        finds: Score of each detection, and 1 if it is correct, else 0, [K, 2].
         stalks: Number of stalks to detect.
     """
     if not stalks or not len(finds):
@@ -212,12 +219,16 @@ def average_precision(finds: np.ndarray, stalks: int) -> float:
 def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, Any]:
     """Summarise the scores of plots.
 
+    Args:
+        scores: Scores of the plots.
+        least_score: Minimum score of a detection for ``precision``, ``recall`` and ``f1``.
+
     Returns:
-        ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (of the true number), ``width_mae_mm``,
-        ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with calipers),
-        ``width_coverage_95`` (share of true widths in the interval of 95 % that is stated), errors of widths at 24 inches,
-        ``ap50``, ``f1``, ``precision``, ``recall``, the best F1 and the least score that gives it, and how much there was of
-        each. Not a number where there was nothing.
+        ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (relative to the true number),
+        ``width_mae_mm``, ``width_bias_mm``, ``width_mae_two_people_mm`` (against the simulated mean of two people with
+        calipers), ``width_coverage_95`` (fraction of true widths in the stated 95 % interval), errors of widths at 24 inches,
+        ``ap50``, ``precision``, ``recall``, ``f1``, the best F1 and the minimum score that gives it, ``seconds_per_pair``, the
+        numbers of samples, and, if evaluated, figures of the thesis's methods. NaN if there are no samples.
     """
     scores = list(scores)
     true = np.array([score.true for score in scores], float)
@@ -261,7 +272,7 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
 
 
 def _best_f1(finds: np.ndarray, stalks: int) -> tuple[float, float]:
-    """Return the best F1 over all lowest scores, and that score; finds [K, 2] as in `PlotScore`."""
+    """Return the maximum F1 over all score thresholds, and that threshold; ``finds`` [K, 2] as in `PlotScore`."""
     if not len(finds) or not stalks:
         return float("nan"), float("nan")
     order = np.argsort(-finds[:, 0], kind="stable")
@@ -272,7 +283,7 @@ def _best_f1(finds: np.ndarray, stalks: int) -> tuple[float, float]:
 
 
 def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
-    """The same figures of the thesis's ways, where all plots have them."""
+    """Summarise the thesis's methods over the plots on which they were evaluated; empty if there are none."""
     both = [(score, score.thesis) for score in scores if score.thesis is not None]
     if not both:
         return {}
@@ -288,7 +299,7 @@ def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
 
 
 def _agreement(counted: np.ndarray, true: np.ndarray) -> float:
-    """1 - SSE / SST against y = x; not a number where all true values are equal."""
+    """Compute 1 - SSE / SST against y = x; NaN if all true values are equal."""
     spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
     return 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan")
 

@@ -1,17 +1,16 @@
-"""Writes synthetic plots: folders of stereo pairs with calibration, odometry and truth.
+"""Writing of synthetic plots: folders of stereo pairs with calibration, odometry and ground truth.
 
-    family.json          what was drawn from
+    family.json          family that the plots are sampled from
     plot_0000/
         left_000.png  right_000.png  ...
-        calibration.yaml     as it is stated, OpenCV
+        calibration.yaml     stated calibration, which may deviate from the true one; OpenCV
         odometry.csv         pair, file names, time_s, distance_m
         annotations.json     COCO: a box and a mask for each stalk of the near row in each left image
         truth/               instance_000.png  disparity_000.png
-        plot.json            count, each stalk's diameters, the cameras as they are; written last, so it says that the plot is
-        whole
+        plot.json            count, diameters of each stalk, true cameras; written last, it marks the plot as complete
 
-A complete plot is not drawn again, so a command that was stopped continues where it was; one that holds less of the truth
-than is asked for is.
+A complete plot is not rendered again, so an interrupted command continues where it stopped; a plot with less of the ground
+truth than requested is rendered again.
 """
 
 import dataclasses
@@ -37,7 +36,7 @@ from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS, StalkInView, stalks_in_vi
 
 Truth = Literal["all", "boxes", "none"]
 DISPARITY_SCALE = 64.0
-"""Disparity images are uint16: disparity in pixels times this, 0 where there is none."""
+"""Scale of disparity images: uint16 values are the disparity in pixels times this, or 0 if there is none."""
 SCHEMA = 1
 
 
@@ -52,18 +51,18 @@ def write_plots(
     """Write plots of a family.
 
     Args:
-        folder: Folder to write to; made if it is missing.
-        family: Family to draw from.
-        seeds: One plot each.
-        image_format: Format of the images of the cameras.
-        truth: ``all``; ``boxes``, without images of disparity and instance and without masks; or ``none``, but plot.json.
-        done: Called after each pair with the plot's seed and the number of pairs that it has so far.
+        folder: Folder to write to; created if missing.
+        family: Family to sample from.
+        seeds: Seeds, one per plot.
+        image_format: Format of the camera images.
+        truth: ``all``; ``boxes``, without masks and without disparity and instance images; or ``none``, only plot.json.
+        done: Called after each pair with the plot's seed and the number of its pairs written so far.
 
     Returns:
-        How many plots were there already.
+        The number of plots that already existed.
 
     Raises:
-        RequestError: The folder holds another family's plots.
+        RequestError: The folder holds plots of another family.
         OSError: A file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,27 +80,27 @@ def write_plots(
                 present += 1
                 done(seed, family.rig.frames)
                 continue
-            whole.unlink()  # until all is there again
+            whole.unlink()  # incomplete until it is written again
             for image in [*whole.parent.glob("left_*.*"), *whole.parent.glob("right_*.*")]:
-                image.unlink()  # they may be of another format
+                image.unlink()  # may have another format
         write_plot(folder / plot_name(seed), draw(family, seed), image_format, truth, done)
     return present
 
 
 def _holds(folder: Path, truth: Truth, frames: int) -> bool:
-    """Return True if a complete plot holds as much of the truth as is asked for, or more."""
+    """Return whether a complete plot holds at least the requested ground truth."""
     maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
     wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]
     return all(path.exists() for path in wanted)
 
 
 def plot_name(seed: int) -> str:
-    """Folder of the plot of a seed."""
+    """Return the folder name of the plot with a seed."""
     return f"plot_{seed:04d}"
 
 
 def write_plot(folder: Path, plot: Plot, image_format: ImageFormat, truth: Truth, done: Callable[[int, int], None]) -> None:
-    """Write one plot; see `write_plots`."""
+    """Write one plot to its own folder; see `write_plots`."""
     (folder / "truth").mkdir(parents=True, exist_ok=True)
     sequence = Sequence.of(plot)
     write_calibration(folder / "calibration.yaml", sequence.drive.stated)
@@ -161,7 +160,7 @@ def _odometry(sequence: Sequence, suffix: str) -> str:
 
 
 def _summary(sequence: Sequence, visible: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the contents of plot.json: lengths in metres, but diameters in millimetres."""
+    """Return the contents of plot.json: lengths in m, except those named ``_mm``."""
     plot, drive = sequence.plot, sequence.drive
     stalks = []
     for index, stalk in enumerate(plot.measured):
@@ -173,7 +172,7 @@ def _summary(sequence: Sequence, visible: list[dict[str, Any]]) -> dict[str, Any
                 "node_distance_mm": round(1e3 * stalk.node_distance(height), 2),
             }
         foot = {"stalk": index, "x": float(stalk.points[0, 0]), "y": float(stalk.points[0, 1])}
-        # Height after height, 5 cm apart: x and y of its middle, and its diameter.
+        # Centre line in steps of 5 cm.
         line = [
             [*np.round(stalk.at_height(height)[0], 5).tolist(), round(1e3 * stalk.diameter(height), 3)]
             for height in np.arange(0.0, stalk.points[:, 2].max(), 0.05)

@@ -1,8 +1,8 @@
-"""The thesis's methods on the same detections, to show what each of ours is worth.
+"""Baselines: the thesis's methods on the same detections, for comparison with ours.
 
-width     the largest minor axis of the ellipses fitted to a mask, and the disparity of the pixels in it by semi-global
-          matching; where the mask is, as the ground is not looked for; the mean over the pairs that show a stalk
-count     stalks per metre of image, by stereo, times the length of the plot: no stalk is followed from pair to pair
+width     the largest minor axis of ellipses fitted to a mask, with disparities by semi-global matching of the pixels in it;
+          at the height of the mask, as the ground is not detected; averaged over the pairs that show a stalk
+count     mean number of stalks per metre of image, by stereo, times the length of the plot; stalks are not tracked
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ _DEPTHS = (0.5, 1.3)  # m
 def measure_pair_as_thesis(
     detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration
 ) -> list[Sighting]:
-    """Measure what was found in a pair [H, W, 3] uint8, by ellipses and semi-global matching."""
+    """Measure the detections in a pair of images [H, W, 3] uint8 by ellipses and semi-global matching."""
     disparity = np.full(left.shape[:2], np.nan, np.float32)
     far, near = (float(calibration.disparity(np.array(depth))) for depth in reversed(_DEPTHS))
     for detection in detections:
@@ -29,10 +29,10 @@ def measure_pair_as_thesis(
 
 
 def count_by_length(frames: list[list[Sighting]], calibration: Calibration, length: float) -> float:
-    """Stalks of a plot by those that its images show on each metre.
+    """Estimate the number of stalks in a plot from their mean number per metre of image width at their median depth.
 
     Args:
-        frames: Sightings of each pair.
+        frames: Sightings of each pair; a pair without depths contributes 0.
         calibration: Calibration of the cameras.
         length: Length of the plot, m.
     """
@@ -48,7 +48,12 @@ def count_by_length(frames: list[list[Sighting]], calibration: Calibration, leng
 
 
 def mean_widths(frames: list[list[Sighting]], owners: list[list[int | None]]) -> dict[int, float]:
-    """Mean diameter in mm of each stalk, by its index, over the pairs in which it was identified and measured."""
+    """Compute the mean diameter in mm of each stalk, by index, over the pairs in which it was identified and measured.
+
+    Args:
+        frames: Sightings of each pair.
+        owners: Index of each sighting's stalk; None if unknown.
+    """
     widths: dict[int, list[float]] = {}
     for sightings, names in zip(frames, owners):
         for sighting, name in zip(sightings, names):

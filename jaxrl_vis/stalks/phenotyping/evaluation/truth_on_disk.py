@@ -1,4 +1,4 @@
-"""Detections from the truth that `phenotype synth` wrote beside its images, as perfect networks would make them."""
+"""Detections from the ground truth that `phenotype synth` writes beside its images."""
 
 import functools
 from pathlib import Path
@@ -16,7 +16,13 @@ _FARTHEST = 1e6  # pixels
 
 
 def find_truth(image: np.ndarray, density: float | None, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
-    """The stalks of a pair of a synthetic plot.
+    """Return the ground-truth detections in the left image of a pair of a synthetic plot, with a detector's signature.
+
+    Args:
+        image: The image, of which only the size is used.
+        density: Ignored.
+        plot: The plot.
+        pair: The pair.
 
     Raises:
         RequestError: The plot is not synthetic, or was written without masks.
@@ -35,7 +41,11 @@ def find_truth(image: np.ndarray, density: float | None, plot: PlotFolder, pair:
 
 @functools.lru_cache(maxsize=4)
 def _stalks_by_pair(folder: Path) -> dict[int, list[dict]]:
-    """Return the stalks of each pair from plot.json."""
+    """Read the stalks in view of each pair, by the pair's number, from plot.json.
+
+    Raises:
+        OSError, ValueError, KeyError, TypeError: The file is missing or malformed.
+    """
     of_pair: dict[int, list[dict]] = {}
     for stalk in read_json(folder / "plot.json")["seen"]:
         box = stalk["band_box"]

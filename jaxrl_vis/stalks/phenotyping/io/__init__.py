@@ -1,1 +1,1 @@
-"""Files of the phenotyping application: images, pairs, calibrations, annotations, odometry."""
+"""Input and output of the phenotyping application: images, pairs, calibrations, annotations, odometry."""

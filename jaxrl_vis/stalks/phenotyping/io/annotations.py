@@ -1,6 +1,6 @@
-"""Annotations: boxes, and masks as runs of pixels. Written in COCO's format, read in those of many programs.
+"""Annotations, boxes and run-length encoded masks: written in COCO format, read in the formats of many programs.
 
-Columns and lines of boxes and outlines are continuous: the first pixel spans from 0 to 1, with its middle at 0.5.
+Coordinates of boxes and outlines are continuous: the first pixel spans from 0 to 1, with its centre at 0.5.
 """
 
 import reprlib
@@ -18,18 +18,18 @@ from jaxrl_vis.stalks.phenotyping.io.masks import box_around_runs, covering, dec
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 
 STALK = 1
-"""Category of stalks."""
+"""COCO category id of stalks."""
 _FARTHEST = 1e7  # pixels
 
 
 def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
-    """A COCO data set of stalks.
+    """Return a COCO data set of stalks.
 
     Args:
-        images: With id, file_name, width and height.
-        annotations: With image_id, bbox (left, top, width, height in pixels), area and, where there is one, segmentation; ids
-            are added.
-        about: Description of the data set.
+        images: Images with id, file_name, width and height.
+        annotations: Annotations with image_id, bbox (left, top, width, height in pixels), area and, optionally, segmentation;
+            id, category_id and iscrowd are added.
+        about: The ``info`` of the data set.
     """
     numbered = [
         {"id": place + 1, "category_id": STALK, "iscrowd": 0, **annotation} for place, annotation in enumerate(annotations)
@@ -39,23 +39,23 @@ def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about:
 
 
 def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]:
-    """The annotations of a folder, in COCO's form whatever form they are in.
+    """Read and validate the annotations in a folder, in any supported format, and return them in COCO format.
 
-    ``annotations.json`` of COCO, or all of the files that are there: COCO's under any name, images in any folder below;
-    XML of Pascal VOC, roLabelImg or CVAT; JSON of LabelMe or Label Studio; texts of YOLO.
+    If the folder holds ``annotations.json`` (COCO), only that is read. Otherwise all annotation files in it and its subfolders
+    are: COCO under any name; XML of Pascal VOC, roLabelImg or CVAT; JSON of LabelMe or Label Studio; text files of YOLO.
 
     Args:
         folder: The folder.
-        labels: Names that stalks have, see `labels.choose`. What is called otherwise is left out.
+        labels: Labels that count as stalks, see `labels.choose`; annotations with other labels are left out.
 
     Returns:
-        ``images``, each with id, file_name, width and height; and ``annotations``, each with the image_id of one of them and a
-        bbox [4] (left, top, width, height in pixels) that shows in it, and, where there is a ``segmentation``, polygons (lists
-        of at least 3 corners) or runs of pixels that cover the image. Where ``iscrowd`` is 1, it is a region with stalks that
-        nobody told apart. ``summary`` says in one line what counts as a stalk.
+        ``images``, each with id, file_name, width and height; ``annotations``, each with an image_id, a bbox [4] (left, top,
+        width, height in pixels) that intersects the image, and a ``segmentation``: polygons of at least 3 corners, runs that
+        cover the image, or None. If ``iscrowd`` is 1, the annotation is a region of stalks that were not separated.
+        ``summary`` states in one line what counts as a stalk.
 
     Raises:
-        RequestError: There are none, they cannot be read, or one of them is not as above; the message says which.
+        RequestError: There are no annotations, they cannot be read, or one is invalid; the message says which.
     """
     images, annotations = [], []
     found = gather(folder)
@@ -70,7 +70,11 @@ def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]
 
 
 def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]) -> dict[str, Any]:
-    """Return the annotations that are stalks; checked."""
+    """Select and validate the annotations of stalks.
+
+    Raises:
+        RequestError: There are none, ids of images repeat, or an image or annotation is invalid.
+    """
     if not data["images"] or not data["annotations"]:
         raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
     stalks, summary = choose(data["annotations"], labels, str(path))
@@ -93,10 +97,14 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
 
 
 def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
-    """Return the entry of an image, with its width and height as whole numbers.
+    """Return the entry of an image, with its width and height as integers.
+
+    Args:
+        image: The entry as read.
+        place: Index of the entry, for messages.
 
     Raises:
-        RequestError: Something is missing.
+        RequestError: Its id, name or size is missing or invalid.
     """
     if not isinstance(image.get("id"), (int, str)) or not isinstance(image.get("file_name"), str):
         raise RequestError(f"{image['source']}: image number {place + 1} needs an id and a file_name")
@@ -116,21 +124,24 @@ def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
 
 
 def _is_inside(name: str) -> bool:
-    """Return whether a file's name, as it stands in annotations, leads to nowhere but into their folder, on any system."""
-    path = PureWindowsPath(name)  # which knows both separators
+    """Return whether a file name in annotations is a relative path within their folder on any operating system."""
+    path = PureWindowsPath(name)  # splits at both separators
     steps = path.parts
     return bool(steps) and not path.anchor and ".." not in steps and name == readable(name)
 
 
 def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple[int, int]]) -> dict[str, Any]:
-    """An annotation with a box and, where it has any, a segmentation that fit its image.
+    """Return an annotation with a validated ``bbox`` and ``segmentation`` (None if it has none).
+
+    A missing box is computed from the segmentation.
 
     Args:
-        annotation: As it was read.
-        sizes: Height and width of each image, by its id.
+        annotation: The annotation as read.
+        sizes: Height and width of each image, by id.
 
     Raises:
-        ValueError: They do not. The message continues after the annotation's name.
+        ValueError: The box or segmentation is missing, malformed or outside the image. The message is a predicate that follows
+            the annotation's name.
     """
     number = annotation.get("image_id")
     if not isinstance(number, (int, str)) or number not in sizes:
@@ -156,10 +167,10 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
 
 
 def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str, Any] | list[list[float]] | None:
-    """Runs, as numbers, that cover an image of ``size`` (height, width), or polygons; None where there is nothing.
+    """Return uncompressed runs that cover an image of ``size`` (height, width), or polygons; None if there is neither.
 
     Raises:
-        ValueError: It is neither.
+        ValueError: The segmentation is malformed, of another size or empty.
     """
     if not segmentation:
         return None
@@ -189,7 +200,7 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
 
 
 def _numbers(values: Any) -> list[float] | None:
-    """A list of finite numbers; None where it is anything else."""
+    """Return a list of finite numbers as floats; None if ``values`` is anything else."""
     try:
         numbers = np.asarray(values, float)
     except (ValueError, TypeError, OverflowError):
@@ -198,7 +209,7 @@ def _numbers(values: Any) -> list[float] | None:
 
 
 def _box_around(segmentation: dict[str, Any] | list[list[float]]) -> list[float]:
-    """The box (left, top, width, height) around what was checked."""
+    """Return the bounding box (left, top, width, height) of a validated segmentation."""
     if isinstance(segmentation, dict):
         return box_around_runs(np.array(segmentation["counts"], np.int64), segmentation["size"][0])
     corners = np.concatenate([np.reshape(outline, (-1, 2)) for outline in segmentation])

@@ -1,12 +1,13 @@
-"""Calibrations of a pair of rectified cameras, read from the files of many programs, and written for OpenCV.
+"""Calibrations of rectified stereo cameras: read in the formats of many programs, written in that of OpenCV.
 
-    OpenCV       P1 and P2 as cv2.stereoRectify returns them, in YAML, XML or JSON; extrinsics.yml of its sample stereo_calib
-    ROS 1 and 2  one file for each camera (left.yaml and right.yaml, cam0.yaml and cam1.yaml), from the calibrators or as
-                 camera_info is printed
-    others       RealSense's table, calib.txt of Middlebury and of KITTI; kalibr and ZED where the cameras stand rectified
+    OpenCV       P1 and P2 as returned by cv2.stereoRectify, in YAML, XML or JSON; extrinsics.yml of its sample stereo_calib
+    ROS 1 and 2  one file per camera (left.yaml and right.yaml, cam0.yaml and cam1.yaml), from the calibrators or as printed
+                 camera_info messages
+    others       RealSense's calibration table, calib.txt of Middlebury and of KITTI; kalibr and ZED if the cameras need no
+                 rectification
 
-Millimetres of stalk come from the focal length and the baseline, so a file without them is refused rather than guessed. The one
-thing that files do not say is the unit of the baseline: metres in ROS, and in OpenCV whatever the chessboard was measured in.
+Stalk diameters in millimetres depend on the focal length and the baseline, so a file without them is rejected rather than
+completed by guesses. Files do not state the unit of the baseline: metres in ROS, and in OpenCV that of the chessboard.
 """
 
 import dataclasses
@@ -25,8 +26,8 @@ from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis.stalks.phenotyping.io.units import baseline_in_metres
 from jaxrl_vis_envs.plants import Calibration
 
-_OFF_CENTRE = 0.25  # of an image's side: the principal point lies no further from its middle
-_DOWN = 0.02  # of the baseline: one camera stands no further above the other; 0.008 in KITTI's coloured pair
+_OFF_CENTRE = 0.25  # of an image's side: maximum distance of the principal point from the image centre
+_DOWN = 0.02  # of the baseline: maximum vertical offset between the cameras; 0.008 in KITTI's colour pair
 
 
 def read_calibration(path: Path, unit: str | None = None, image: Path | None = None) -> Calibration:
@@ -34,13 +35,13 @@ def read_calibration(path: Path, unit: str | None = None, image: Path | None = N
 
     Args:
         path: A file of any of these programs, or a folder that holds one for both cameras or one for each.
-        unit: Unit of the baseline, see `in_metres`; None for what the file says, or its program uses, and else metres.
-        image: A left image that was taken with the cameras: where a file is for several sizes or does not say for which, this
-            one's is taken.
+        unit: Unit of the baseline, see `in_metres`; None for the unit that the file states or its program uses, by default
+            metres.
+        image: A left image of the cameras, whose size is used if the file covers several sizes or states none.
 
     Raises:
-        RequestError: There is no such file, it does not describe a pair of rectified cameras, or its baseline cannot be in that
-            unit.
+        RequestError: There is no such file, it does not describe a pair of rectified cameras, or its baseline is implausible in
+            that unit.
     """
     cameras = read_cameras(path, image)
     pair = cameras.if_rectified() if isinstance(cameras, RawPair) else cameras
@@ -54,10 +55,15 @@ def read_calibration(path: Path, unit: str | None = None, image: Path | None = N
 
 
 def _size_by_image(path: Path, left: np.ndarray, image: Path | None) -> Size:
-    """Width and height of an image, for a calibration that does not say for which images it is.
+    """Return the width and height of an image, for a calibration that does not state the image size.
+
+    Args:
+        path: File of the calibration, for messages.
+        left: Projection matrix [3, 4] of the left camera.
+        image: A left image, if one is known.
 
     Raises:
-        RequestError: There is no image, or its middle is not where the calibration has it: it was cropped or resized.
+        RequestError: There is no readable image, or its centre is far from the principal point: it was cropped or resized.
     """
     if image is None:
         raise RequestError(f"{path} does not say for which images it is: add image_width and image_height")
@@ -76,7 +82,7 @@ def _size_by_image(path: Path, left: np.ndarray, image: Path | None) -> Size:
 
 
 def find_calibration(folder: Path) -> Path | None:
-    """Return the file of the calibration in a folder of images, or that of its left camera; None where there is none."""
+    """Return the calibration file in a folder of images, or that of the left camera; None if there is none."""
     files = files_in(folder)
     named = named_pair(files)
     if named is not None:
@@ -86,10 +92,15 @@ def find_calibration(folder: Path) -> Path | None:
 
 
 def check_size(calibration: Calibration, width: int, height: int, name: str) -> None:
-    """Check that an image is of the size that was calibrated.
+    """Check that an image has the size of the calibration.
+
+    Args:
+        calibration: The calibration.
+        width, height: Size of the image, pixels.
+        name: Name of the image, for messages.
 
     Raises:
-        RequestError: It is not.
+        RequestError: The sizes differ.
     """
     if (width, height) != (calibration.width, calibration.height):
         wanted = _times((calibration.width, calibration.height))
@@ -124,7 +135,7 @@ def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, i
         raise RequestError(
             f"{path}: the cameras differ in focal length or in lines, so they are not rectified: rectify the pair"
         )
-    # Each camera's last column is minus its place, times the focal length; OpenCV puts the left one at 0.
+    # The last column of a projection matrix is minus the camera's position times the focal length; OpenCV's left one is 0.
     across, down = (abs(float(left[row, 3] - right[row, 3])) for row in (0, 1))
     if down > _DOWN * across:
         raise RequestError(f"{path} has its cameras above each other: turn the pair, so that they stand side by side")

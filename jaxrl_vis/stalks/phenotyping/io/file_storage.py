@@ -1,7 +1,7 @@
-"""Files of OpenCV's FileStorage and of ROS, YAML, XML or JSON, as plain dictionaries, lists, numbers and texts.
+"""Parser of OpenCV FileStorage and ROS files (YAML, XML or JSON) to plain dictionaries, lists, numbers and strings.
 
-OpenCV's own reader is not asked: it recurses as deep as a file says and writes where it must not, so that a file can end the
-program without a word. These files need no more of YAML than tables, lists and numbers: no tags, no references.
+OpenCV's own parser is not used: it recurses without limit and writes out of bounds, so that a malformed file can crash the
+process. Of YAML, only mappings, sequences and scalars are supported: tags are ignored, and aliases are errors.
 """
 
 import math
@@ -19,10 +19,10 @@ _SPECIAL = {".nan": math.nan, ".inf": math.inf, "+.inf": math.inf, "-.inf": -mat
 
 
 def parse_storage(text: str) -> Any:
-    """Parse a file of OpenCV's storage: numbers are float, quoted values are text. A matrix is a table with ``data``.
+    """Parse the text of a FileStorage: numbers become float, quoted values str, and a matrix a dictionary with ``data``.
 
     Raises:
-        ValueError: It is neither YAML nor XML nor JSON as OpenCV and ROS write them.
+        ValueError: The text is neither YAML nor XML nor JSON as OpenCV and ROS write them.
     """
     begin = text.lstrip()
     if begin.startswith("<"):
@@ -31,12 +31,12 @@ def parse_storage(text: str) -> Any:
         try:
             return _floats(parse_json(begin))
         except ValueError:
-            pass  # a table of YAML
+            pass  # may be a YAML flow mapping
     return _yaml(begin.partition("\n")[2] if begin.startswith("%YAML") else text)
 
 
 def _floats(value: Any) -> Any:
-    """Numbers as YAML gives them."""
+    """Convert the integers of parsed JSON to float, as `_yaml` does."""
     if isinstance(value, dict):
         return {name: _floats(part) for name, part in value.items()}
     if isinstance(value, list):
@@ -45,14 +45,18 @@ def _floats(value: Any) -> Any:
 
 
 def _scalar(text: str) -> float | str | None:
-    """A number, a text, or nothing, by how it is written."""
+    """Convert an unquoted scalar to float, or else to str; None if it is empty."""
     if _NUMBER.fullmatch(text):
         return float(text)
     return _SPECIAL.get(text.lower(), text or None)
 
 
 def _yaml(text: str) -> Any:
-    """The first document of a file of YAML."""
+    """Parse the first document of a YAML text.
+
+    Raises:
+        ValueError: The text is not YAML, is nested too deeply, or holds aliases.
+    """
     root: list[Any] = []
     open_nodes: list[Any] = [root]
     keys: list[str | None] = [None]
@@ -69,7 +73,7 @@ def _yaml(text: str) -> Any:
             place[keys[-1]], keys[-1] = value, None
 
     try:
-        # Event by event: PyYAML's own way from there to values recurses.
+        # Built from events, since PyYAML's own constructor recurses.
         for event in yaml.parse(text, Loader=_LOADER):
             if isinstance(event, yaml.DocumentEndEvent):
                 break
@@ -94,7 +98,7 @@ def _yaml(text: str) -> Any:
 
 
 def _node(element: Element) -> Any:
-    """A node of OpenCV's XML: a table, a list if its parts have no names, or what its text says."""
+    """Convert a node of OpenCV's XML to a dictionary, a list if its children are unnamed, or the value(s) of its text."""
     if len(element):
         if all(part.tag == "_" for part in element):
             return [_node(part) for part in element]

@@ -1,10 +1,10 @@
-"""Folders of stereo pairs: which images belong together.
+"""Discovery of plots and pairing of stereo images by file name.
 
-left_000.png  right_000.png          or  anything with left and right, or L and R, as a word of its name
-left/000.png  right/000.png          or  the same in two folders, also called L and R, cam0 and cam1, image_02 and image_03, ...
-disparity_000.pfm, disparity/000.png optional: disparities of the left images, in place of our own
+left_000.png  right_000.png          or  any names with left and right, or L and R, as a separate word
+left/000.png  right/000.png          or  the same names in two folders, also L and R, cam0 and cam1, image_02 and image_03, ...
+disparity_000.pfm, disparity/000.png optional: disparities of the left images, used instead of our own
 
-Names that are times need not be the same on both sides: the nearest ones belong together.
+Names that are timestamps may differ between the sides: each image is paired with the nearest one.
 """
 
 import dataclasses
@@ -19,10 +19,10 @@ from jaxrl_vis.stalks.phenotyping.io.naming.stamps import nearest, seconds_in
 
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 SAMPLE = Path(__file__).parents[1] / "sample_row"
-"""A short synthetic row that comes with the package."""
-_DEPTH = 6  # folders in folders that may hold plots
+"""Folder of a short synthetic row that ships with the package."""
+_DEPTH = 6  # levels of nested folders searched for plots
 _MAX_FOLDERS = 20_000
-_LATEST = 0.005  # s between the two images of a pair: a robot at 0.3 m/s drives 1.5 mm
+_LATEST = 0.005  # s, maximum median delay between the images of a pair: a robot at 0.3 m/s drives 1.5 mm
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
@@ -31,12 +31,12 @@ _OTHER = {"left": "right", "right": "left", "l": "r", "r": "l"}
 
 @dataclasses.dataclass(frozen=True)
 class PairFiles:
-    """One pair; a side of which there is no file is None.
+    """Files of one stereo pair.
 
     Attributes:
-        name: Common to both, fit for a file name.
-        left, right: The images.
-        disparity: Disparities of the left image, if somebody computed them before; they are used in place of the right image.
+        name: Name of the pair, usable as a file name.
+        left, right: The images; None if missing.
+        disparity: Precomputed disparities of the left image, used instead of stereo matching; None if there are none.
     """
 
     name: str
@@ -47,12 +47,12 @@ class PairFiles:
 
 @dataclasses.dataclass(frozen=True)
 class PlotFolder:
-    """One plot.
+    """Folder of one plot.
 
     Attributes:
-        name: Name of its folder.
-        folder: Its path.
-        pairs: In the order of their names.
+        name: Name of the plot: that of its folder, or its path relative to the folder that was searched.
+        folder: Path of the folder.
+        pairs: Pairs in natural order of their names.
     """
 
     name: str
@@ -62,10 +62,10 @@ class PlotFolder:
 
 @dataclasses.dataclass(frozen=True)
 class Patterns:
-    """Patterns of the names of left and right images within the folder of a plot, as ``image_02/*.png``.
+    """Glob patterns of the left and right images within the folder of a plot, such as ``image_02/*.png``.
 
     Attributes:
-        left, right: Patterns as of a shell; what the stars stand for is the same for both images of a pair.
+        left, right: Glob patterns; the wildcards match the same text in both images of a pair.
     """
 
     left: str
@@ -73,14 +73,14 @@ class Patterns:
 
 
 def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolder]:
-    """The plots in a folder: the folder itself if it holds pairs, else the folders below that do, with the way to them as name.
+    """Find the plots in a folder: the folder itself if it holds pairs, else all subfolders that do, named by relative path.
 
     Args:
         folder: The folder.
-        patterns: Patterns of the images' names; None to tell by what the names say.
+        patterns: Patterns of the images' names; None to recognise the sides by name.
 
     Raises:
-        RequestError: There is no such folder, there are no pairs in it, or two files could be meant.
+        RequestError: There is no such folder, it holds no pairs, a pattern is invalid, or files or plot names are ambiguous.
     """
     if not folder.is_dir():
         raise RequestError(f"there is no folder {folder}: name one with stereo pairs")
@@ -103,7 +103,11 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
 
 
 def _below(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
-    """Pairs of all folders in a folder that hold some; what lies in those is theirs."""
+    """Return the pairs of all subfolders that hold some, depth first; folders inside those are not searched.
+
+    Raises:
+        RequestError: There are more than 20,000 folders.
+    """
     found: dict[Path, tuple[PairFiles, ...]] = {}
     waiting, count = [(path, 1) for path in _folders(folder)], 0
     while waiting:
@@ -124,7 +128,7 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def _no_pairs(folder: Path, patterns: Patterns | None) -> str:
-    """Message that a folder holds no pairs, with what may be the reason."""
+    """Return the message that a folder holds no pairs, with a hint at the likely reason."""
     if patterns is not None:
         return f"{folder} holds no images for --left {patterns.left!r} and --right {patterns.right!r}, nor do folders in it"
     for path in image_files(folder)[:1]:
@@ -144,7 +148,7 @@ def _no_pairs(folder: Path, patterns: Patterns | None) -> str:
 
 
 _Sides = dict[str, dict[str, Path]]
-"""Files by the name of their pair and what they are of it: left, right or disparity."""
+"""Files by name of their pair and role: left, right or disparity."""
 
 
 def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
@@ -172,10 +176,10 @@ def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
 
 
 def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
-    """Notes a file.
+    """Add a file to ``sides``, in place.
 
     Raises:
-        RequestError: There is another one in its place, or its name is too long.
+        RequestError: The pair has another file in this role, or the name is too long.
     """
     check_length(path)
     other = sides.setdefault(name, {}).setdefault(side, path)
@@ -186,7 +190,7 @@ def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
 
 
 def _by_patterns(folder: Path, patterns: Patterns) -> _Sides:
-    """Images whose names match two patterns, by what the stars of the patterns stand for."""
+    """Find the images that match two patterns; the text matched by the wildcards is the name of the pair."""
     sides: _Sides = {}
     for side, pattern in (("left", patterns.left), ("right", patterns.right)):
         stars = _stars(pattern)
@@ -199,14 +203,14 @@ def _by_patterns(folder: Path, patterns: Patterns) -> _Sides:
 
 
 def _stars(pattern: str) -> re.Pattern[str]:
-    """An expression whose groups are what the stars and question marks of a pattern stand for."""
+    """Compile a glob pattern to a regular expression with a group for each wildcard."""
     parts = {"**/": r"((?:.*/)?)", "*": r"([^/]*)", "?": r"([^/])"}
     words = re.split(r"(\*\*/|\*|\?|\[[^\]]*\])", pattern)
     return re.compile("".join(parts.get(word) or (f"({word})" if word.startswith("[") else re.escape(word)) for word in words))
 
 
 def _check_rectified(folder: Path, sides: _Sides) -> None:
-    """Raise a `RequestError` where names say of some images that they are raw and of others that they are rectified."""
+    """Raise a `RequestError` if some images are named raw and others rectified."""
     kinds = {kind: [name for name in sides if kind in re.split(r"[^a-z]+", name.lower())] for kind in ("raw", "rect")}
     if all(kinds.values()):
         raise RequestError(
@@ -216,10 +220,14 @@ def _check_rectified(folder: Path, sides: _Sides) -> None:
 
 
 def _by_times(folder: Path, sides: _Sides) -> _Sides:
-    """Images by their pairs where the names of a side's are times: the nearest ones belong together.
+    """Pair the images that have no partner of the same name by the timestamps in their names.
+
+    Args:
+        folder: The folder, for messages.
+        sides: Files by name of their pair; modified in place if all unpaired names are timestamps, unchanged otherwise.
 
     Raises:
-        RequestError: They are so far apart that the robot has moved in between.
+        RequestError: The images of a pair are so far apart in time that the robot has moved.
     """
     alone = {side: [name for name, files in sides.items() if set(files) == {side}] for side in ("left", "right")}
     times = {side: {name: seconds_in(sides[name][side].stem) for name in names} for side, names in alone.items()}
@@ -239,7 +247,7 @@ def _by_times(folder: Path, sides: _Sides) -> _Sides:
 
 
 def _by_folder(folder: Path) -> _Sides:
-    """Images in two folders, one for each side, by the name of their pair and their side.
+    """Find images in two subfolders, one per side; empty if there are none.
 
     Raises:
         RequestError: There are several pairs of such folders.
@@ -254,14 +262,14 @@ def _by_folder(folder: Path) -> _Sides:
             for side, other in partners(path.name)
             if other.lower() in names
         }
-        # A folder that holds whole pairs is a plot, and no side.
+        # A folder that holds whole pairs is a plot, not a side.
         pairs = sorted(pair for pair in found if not any(_whole_pairs(path) for path in pair))
     if len(pairs) > 1:
         both = " and of ".join(f"{readable(left.name)} and {readable(right.name)}" for left, right in pairs[:2])
         raise RequestError(f"{readable(str(folder))} holds pairs of {both}: say which with --left 'PATTERN' --right 'PATTERN'")
     sides: _Sides = {}
     for side, path in zip(("left", "right"), pairs[0] if pairs else ()):
-        # A folder L that holds whole pairs is a plot of that name, and no side.
+        # A folder L that holds whole pairs is a plot of that name, not a side.
         if _whole_pairs(path):
             return {}
         for image in nested[path]:
@@ -270,7 +278,7 @@ def _by_folder(folder: Path) -> _Sides:
 
 
 def _side_images(folder: Path) -> list[Path]:
-    """Images of one camera: those of a folder, or of its folder ``data`` as KITTI has it."""
+    """Return the images of one camera: those in a folder, or in its subfolder ``data`` as in KITTI."""
     images, inside = image_files(folder), folder / "data"
     return images or (image_files(inside) if inside.is_dir() else [])
 
@@ -280,7 +288,7 @@ def _whole_pairs(folder: Path) -> bool:
 
 
 def _by_name(folder: Path) -> _Sides:
-    """Images that say in their names which side they show, by the name of their pair and their side."""
+    """Find images whose names tell their side, by a word, a letter or a camera number."""
     images = {path: readable(path.stem) for path in image_files(folder)}
     images = {path: stem for path, stem in images.items() if "disparity" not in stem.lower()}
     stems = {stem.lower() for stem in images.values()}
@@ -292,16 +300,20 @@ def _by_name(folder: Path) -> _Sides:
             _put(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
         else:
             for side, other in _counted(stem, stems):
-                # What both names share, which is neither the number nor the letter.
+                # The characters common to both names, without the number or letter of the side.
                 same = "".join(one for one, two in zip(stem, other) if one == two)
                 _put(sides, same.strip("_-. ") or "pair", side, image)
     return sides
 
 
 def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
-    """The side that an image's name says by a last letter or a camera's number, with its partner's; none if that is not sure.
+    """Return the side given by a last letter or camera number of an image's name, with the partner's name; empty if ambiguous.
 
-    im0 and im1 are a pair, and im0 to im7 the images of one camera.
+    im0 and im1 are a pair, but im0 to im7 are the images of one camera.
+
+    Args:
+        stem: Stem of its name.
+        stems: Lower-case stems of all images in its folder.
     """
     found = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
     if len(found) != 1:
@@ -311,14 +323,15 @@ def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
 
 
 def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
-    """The word of an image's name that says which side it shows; None if there is none.
+    """Find the word or letter of an image's name that tells its side; None if there is none.
 
-    Names of rows and repetitions hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words go before letters, and
-    what makes another image's name, if exchanged, before what does not; of several the last, as plots are mostly named first.
+    Names of rows and repetitions may hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words take precedence over
+    letters, matches whose exchange gives the name of another image over those that do not, and later matches over earlier ones,
+    as names usually begin with the plot.
 
     Args:
         stem: Stem of its name.
-        stems: Those of all images of its folder, in small letters.
+        stems: Lower-case stems of all images in its folder.
     """
     words = list(_WORD.finditer(stem)) or list(_LETTER.finditer(stem))
     paired = [
@@ -328,17 +341,17 @@ def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
 
 
 def _find_folder(folder: Path, names: tuple[str, ...]) -> Path | None:
-    """The folder in a folder that has one of some names, whatever their case; the first name goes before the others."""
+    """Return the subfolder with one of ``names`` (lower case, in order of preference), in any case; None if there is none."""
     folders = [path for path in sorted(folder.iterdir()) if path.name.lower() in names and path.is_dir()]
     return min(folders, key=lambda path: names.index(path.name.lower()), default=None)
 
 
 def image_files(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
-    """Return the images of a folder, or its files with other suffixes, sorted by name."""
+    """Return the images of a folder, or its files with the given suffixes, sorted by name; hidden files are skipped."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
-    return [path for path in paths if not path.name.startswith(".")]  # beside each image, macOS leaves ._ and its name
+    return [path for path in paths if not path.name.startswith(".")]  # macOS leaves a file ._NAME beside each image
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Sort 2 before 10."""
+    """Return a key for natural sorting: 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]

@@ -1,4 +1,4 @@
-"""Sizes of images from the first bytes of their files, known before a decoder asks for memory."""
+"""Image sizes from file headers, to check them before a decoder allocates memory."""
 
 import re
 from typing import BinaryIO
@@ -9,18 +9,18 @@ PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 _PFM = re.compile(rb"P[Ff]\s+(\d{1,9})\s+(\d{1,9})\s")
 _PNM = re.compile(rb"P[56](?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s")
-_BITMAPS = (40, 52, 56, 64, 108, 124)  # bytes of a bitmap's second header
-_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of JPEG after which the size stands
-_ALONE = {0x01, *range(0xD0, 0xD9)}  # those without a length
-_WIDTH, _HEIGHT, _TILE_WIDTH, _TILE_HEIGHT = 256, 257, 322, 323  # tags of TIFF
-_FINEST_TILES = 1024  # pixels along the sides of tiles that are larger than their image
+_BITMAPS = (40, 52, 56, 64, 108, 124)  # bytes of a BMP's info header
+_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # JPEG start-of-frame markers, followed by the size
+_ALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers without a length
+_WIDTH, _HEIGHT, _TILE_WIDTH, _TILE_HEIGHT = 256, 257, 322, 323  # TIFF tags
+_FINEST_TILES = 1024  # pixels, maximum side of tiles that exceed their image
 
 
 def size_in(file: BinaryIO) -> tuple[int, int] | None:
-    """Height and width of the image in a file of PNG, JPEG, TIFF, BMP, PGM, PPM or PFM; None where it is none, or damaged.
+    """Return the height and width of a PNG, JPEG, TIFF, BMP, PGM, PPM or PFM image; None if it is none of these, or damaged.
 
     Args:
-        file: At its beginning, able to seek.
+        file: Seekable file, at its beginning.
     """
     begin = file.read(64)
     file.seek(0)
@@ -33,15 +33,15 @@ def size_in(file: BinaryIO) -> tuple[int, int] | None:
         return _tiff(file)
     if begin.startswith(b"BM") and len(begin) >= 26 and int.from_bytes(begin[14:18], "little") in _BITMAPS:
         width, height = (int.from_bytes(begin[place : place + 4], "little", signed=True) for place in (18, 22))
-        return (abs(height), width) if width > 0 and height else None  # lines may go upwards
+        return (abs(height), width) if width > 0 and height else None  # height is negative for top-down rows
     match = _PFM.match(begin) or _PNM.match(begin)
     return (int(match[2]), int(match[1])) if match and int(match[1]) and int(match[2]) else None
 
 
 def plain_png(data: bytes) -> bytes | None:
-    """A PNG with nothing in it but its pixels and their colours; None where it is damaged.
+    """Strip a PNG of all chunks but those of its pixels and their colours; return None if it is damaged.
 
-    OpenCV takes as much memory as a chunk says that it needs, and what other chunks hold is of no use here.
+    OpenCV allocates as much memory as any chunk claims to need, and the other chunks are not needed here.
     """
     parts, place = [PNG], len(PNG)
     while place + 12 <= len(data):
@@ -60,7 +60,7 @@ def plain_png(data: bytes) -> bytes | None:
 def _jpeg(data: bytes) -> tuple[int, int] | None:
     place = 2
     while True:
-        place = data.find(b"\xff", place)  # decoders pass over what is between markers
+        place = data.find(b"\xff", place)  # decoders skip garbage between markers
         while 0 <= place < len(data) - 1 and data[place + 1] == 0xFF:
             place += 1
         if place < 0 or place + 9 > len(data):
@@ -69,13 +69,13 @@ def _jpeg(data: bytes) -> tuple[int, int] | None:
         if marker in _FRAMES:
             sides = int.from_bytes(data[place + 5 : place + 7], "big"), int.from_bytes(data[place + 7 : place + 9], "big")
             return sides if min(sides) > 0 else None
-        if marker in (0xD9, 0xDA):  # the end, or pixels before anybody said how many
+        if marker in (0xD9, 0xDA):  # end of image, or start of scan before a frame header
             return None
         place += 2 if marker in _ALONE or marker == 0 else 2 + length
 
 
 def _tiff(file: BinaryIO) -> tuple[int, int] | None:
-    """The size in the first directory; None where it is not there once, or where tiles are much larger than the image."""
+    """Return the size in the first directory; None if it is missing or malformed, or if tiles are far larger than the image."""
     try:
         head = file.read(8)
         directory = ImageFileDirectory_v2(head + (file.read(8) if head[2:4] in (b"+\0", b"\0+") else b""))

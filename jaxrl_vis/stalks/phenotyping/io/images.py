@@ -1,4 +1,4 @@
-"""Reading and writing images of any bit depth that cameras deliver, and disparities."""
+"""Reading and writing of images with 8 or 16 bits per channel, and of disparities."""
 
 from pathlib import Path
 from typing import Literal
@@ -18,15 +18,19 @@ _OPTIONS: dict[str, list[int]] = {
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
 }
 MAX_PIXELS = 100_000_000
-"""Greatest number of pixels of an image that is read."""
-_MAX_BYTES, _MAX_BESIDES = 16, 1 << 26  # of a file, for each pixel and for what else cameras write down
+"""Maximum number of pixels of images that are read."""
+_MAX_BYTES, _MAX_BESIDES = 16, 1 << 26  # of a file: per pixel, and for metadata
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write an image: [H, W, 3] or [H, W], uint8 or uint16; the suffix says how. The file is complete whenever it can be read.
+    """Write an image atomically.
+
+    Args:
+        path: The file; its suffix (.png, .tiff or .jpg) selects the format.
+        image: [H, W, 3] (RGB) or [H, W], uint8 or uint16.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The image cannot be encoded or written.
     """
     suffix = path.suffix.lower()
     ordered = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
@@ -38,17 +42,17 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Height and width of an image as `read_image` gives it, from its header: nothing is decoded.
+    """Return the height and width of an image as returned by `read_image`, from its header, without decoding it.
 
     Raises:
-        OSError: It cannot be read, is no image, or one that no camera takes. One line that names it.
+        OSError: The file cannot be read, is not an image, or is too large. The message is one line that names the file.
     """
     size, orientation = _header(path)
     return (size[1], size[0]) if orientation > 4 else size
 
 
 def _header(path: Path) -> tuple[tuple[int, int], int]:
-    """Height and width of an image as it is stored, and its orientation; raises as `image_size` does."""
+    """Return the stored height and width of an image, and its EXIF orientation (1 to 8); raises as `image_size` does."""
     if not path.is_file():
         path.stat()
         raise _unreadable(path, "is no ordinary file")
@@ -67,27 +71,28 @@ def _header(path: Path) -> tuple[tuple[int, int], int]:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """An image as [H, W, 3] or [H, W], uint8 or uint16, turned as its EXIF says.
+    """Read an image as [H, W, 3] (RGB) or [H, W], uint8 or uint16, rotated by its EXIF orientation; alpha is dropped.
 
     Raises:
-        OSError: It cannot be read, or is no whole image. One line that names it.
+        OSError: The file cannot be read, is not a complete image, or has another pixel type. The message is one line that
+            names the file.
     """
     image = _decoded(path)
     if image is None:
         raise _unreadable(path, "is not an image, or only a part of one")
     if image.dtype not in (np.uint8, np.uint16):
-        # Which of such numbers is black and which is white, nobody has said.
+        # The value range of other types is undefined.
         raise _unreadable(path, f"holds {image.dtype} pixels: save it with 8 or 16 bits")
     if image.ndim == 2:
         return image
-    return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)  # OpenCV's decoders give 1, 3 or 4 channels
+    return cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2RGB)  # OpenCV's decoders return 1, 3 or 4 channels
 
 
 def rgb8(image: np.ndarray) -> np.ndarray:
-    """An image of any kind that `read_image` gives as [H, W, 3] uint8.
+    """Convert an image from `read_image` to RGB [H, W, 3] uint8.
 
-    Cameras of 10, 12 or 14 bits write them into files of 16, with what is above them empty: the depth is taken to be the least
-    of these in which all values fit.
+    Cameras with 10, 12 or 14 bits write 16-bit files with the upper bits zero: the bit depth is taken to be the lowest of
+    these that holds all values.
     """
     if image.dtype == np.uint16:
         bits = next(bits for bits in (10, 12, 14, 16) if int(image.max()) < 1 << bits)
@@ -96,17 +101,17 @@ def rgb8(image: np.ndarray) -> np.ndarray:
 
 
 def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
-    """Disparities from a file: PFM, floating-point TIFF, or 16-bit PNG or TIFF.
+    """Read disparities from a file: PFM, floating-point TIFF, or 16-bit PNG or TIFF.
 
     Args:
-        path: The file. In a PFM, infinity says that there is none; in the others, 0 does.
-        scale: Divisor of 16-bit numbers: 256 in KITTI's files, 64 in those of ``phenotype synth``.
+        path: The file. Non-finite values and values up to 0 mark missing disparities.
+        scale: Divisor of integer values: 256 in KITTI's files, 64 in those of ``phenotype synth``.
 
     Returns:
-        [H, W] float32, pixels; not a number where there is none.
+        [H, W] float32, pixels; NaN where missing.
 
     Raises:
-        OSError: It cannot be read, or holds no disparities. One line that names it.
+        OSError: The file cannot be read, or holds no disparities. The message is one line that names the file.
     """
     image = _decoded(path)
     if image is None or image.ndim != 2 or image.dtype.itemsize == 1:
@@ -116,10 +121,10 @@ def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
 
 
 def _decoded(path: Path) -> np.ndarray | None:
-    """Pixels of a file, [H, W] or [H, W, channels] of any type, blue first; None where OpenCV cannot decode it.
+    """Decode an image to [H, W] or [H, W, channels] (BGR order) of any dtype; return None if OpenCV cannot decode it.
 
     Raises:
-        OSError: The file cannot be read, is no image, or one that no camera takes.
+        OSError: The file cannot be read, is not an image, or is too large.
     """
     size, orientation = _header(path)
     data: bytes | None = path.read_bytes()
@@ -133,13 +138,13 @@ def _decoded(path: Path) -> np.ndarray | None:
         return None
     if image is None:
         return None
-    if data[:2] in (b"II", b"MM"):  # OpenCV turns TIFF by itself, in whatever way it is read
+    if data[:2] in (b"II", b"MM"):  # OpenCV always applies the orientation of TIFF itself
         size, orientation = image_size(path), 1
     return upright(image, orientation) if image.shape[:2] == size else None
 
 
 def _unreadable(path: Path, why: str) -> OSError:
-    """An error whose text names the file, and whose ``strerror`` does not, as those of the operating system."""
+    """Return an error whose message names the file and whose ``strerror`` does not, like errors of the operating system."""
     error = OSError(f"{path} {why}")
     error.strerror = f"it {why}"
     return error

@@ -1,6 +1,6 @@
-"""Masks as COCO keeps them: runs of pixels, as numbers or packed into text, and polygons.
+"""COCO masks: run-length encodings, uncompressed or compressed to text, and polygons.
 
-Columns and lines of outlines are continuous: the first pixel spans from 0 to 1, with its middle at 0.5.
+Coordinates of outlines are continuous: the first pixel spans from 0 to 1, with its centre at 0.5.
 """
 
 from collections.abc import Sequence
@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-_LARGEST = 1 << 48  # number of a run: more than there are pixels
-_AT_ONCE = 4_000_000  # pairs of a line and an edge of an outline
+_LARGEST = 1 << 48  # maximum run length, more than any image has pixels
+_AT_ONCE = 4_000_000  # pairs of an image row and a polygon edge that are processed together
 
 
 def encode_mask(mask: np.ndarray, corner: tuple[int, int], size: tuple[int, int]) -> dict[str, Any]:
-    """A mask as COCO's uncompressed runs, which go down the columns and begin with what is outside.
+    """Encode a mask as uncompressed COCO runs, which are column-major and start with the background.
 
     Args:
-        mask: [h, w] bool, of a part of the image.
-        corner: Line and column of its first pixel.
+        mask: Mask of a part of the image, [h, w] bool.
+        corner: Row and column of its first pixel in the image.
         size: Height and width of the image.
 
     Returns:
-        ``size`` and ``counts``; an image of which all is outside has one run.
+        ``size`` and ``counts``; an empty mask has one run.
     """
     height, width = size
     column, line = np.nonzero(mask.T)
@@ -37,7 +37,7 @@ def encode_mask(mask: np.ndarray, corner: tuple[int, int], size: tuple[int, int]
 
 
 def decode_mask(runs: dict[str, Any]) -> np.ndarray:
-    """The mask [H, W] bool that `encode_mask` wrote.
+    """Decode uncompressed COCO runs, as from `encode_mask`, to a mask [H, W] bool.
 
     Raises:
         ValueError: The runs do not cover the image.
@@ -48,10 +48,10 @@ def decode_mask(runs: dict[str, Any]) -> np.ndarray:
 
 
 def covering(counts: Sequence[float], height: int, width: int) -> np.ndarray:
-    """Runs [N] int64 that are known to cover the image.
+    """Validate the runs of an image and return them as [N] int64.
 
     Raises:
-        ValueError: They do not.
+        ValueError: They are not non-negative integers, or do not cover the image.
     """
     numbers = np.asarray(counts, np.float64)
     if numbers.ndim != 1 or (numbers < 0).any() or (numbers % 1 != 0).any() or numbers.sum() != height * width:
@@ -60,13 +60,13 @@ def covering(counts: Sequence[float], height: int, width: int) -> np.ndarray:
 
 
 def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndarray:
-    """The mask [H, W] bool of polygons: those pixels whose middle lies inside one of them.
+    """Rasterise polygons to a mask [H, W] bool: the pixels whose centre lies inside any of them (by the even-odd rule).
 
-    As many pixels belong to a strip as it is wide, on the mean over its lines; to fill up to and with the boundary, as OpenCV
-    does, would make it a pixel wider.
+    The mean number of mask pixels per row thus equals the width of a strip; filling the boundary, too, as OpenCV does, would
+    make it one pixel wider.
 
     Args:
-        outlines: Polygons: column, line, column, line, ... of their corners, which may lie beyond the image.
+        outlines: Polygons, each x, y, x, y, ... of its corners, which may lie outside the image.
         size: Height and width of the image.
     """
     height, width = size
@@ -77,24 +77,23 @@ def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndar
         first, last = np.clip(np.ceil([here[:, 1].min() - 0.5, here[:, 1].max() - 0.5]), 0, height).astype(int)
         middles = np.arange(first, last) + 0.5
         crossings = np.zeros((len(middles), width + 1), np.int32)
-        some = max(_AT_ONCE // max(len(middles), 1), 1)  # edges at a time: an outline may have millions
+        some = max(_AT_ONCE // max(len(middles), 1), 1)  # edges per batch: an outline may have millions
         for start in range(0, len(here), some):
             one, other = here[start : start + some], ahead[start : start + some]
             edge, line = np.nonzero((one[:, 1:] <= middles) != (other[:, 1:] <= middles))
             share = (middles[line] - one[edge, 1]) / (other[edge, 1] - one[edge, 1])
             crossing = one[edge, 0] + share * (other[edge, 0] - one[edge, 0])
-            # Right of an odd number of crossings is inside.
+            # A pixel is inside if the number of crossings to its left is odd.
             np.add.at(crossings, (line, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
         mask[first:last] |= np.cumsum(crossings[:, :width], axis=1) % 2 == 1
     return mask
 
 
 def decode_counts(text: str) -> list[int]:
-    """The runs that COCO's tools write as text: five bits a character, and from the third run on the difference to the last but
-    one.
+    """Decode COCO's compressed runs: 5 bits per character, and from the fourth run on the difference to the run two before.
 
     Raises:
-        ValueError: The text ends in the middle of a number, or holds what is no number of pixels.
+        ValueError: The text ends within a number, or is malformed.
     """
     counts: list[int] = []
     value, shift = 0, 0
@@ -118,17 +117,17 @@ def decode_counts(text: str) -> list[int]:
 
 
 def box_around_runs(counts: np.ndarray, height: int) -> list[float]:
-    """The box (left, top, width, height) around a mask, from its runs [N] int64 alone: the image need not fit into memory.
+    """Return the bounding box (left, top, width, height) of a mask from its runs alone, without decoding it.
 
     Args:
-        counts: As `covering` gives them; at least one of what is inside is longer than 0.
+        counts: Runs [N] int64 from `covering`, at least one foreground run of which is not empty.
         height: Height of the image.
     """
     ends = np.cumsum(counts)[1::2]
     starts = ends - counts[1::2]
     starts, ends = starts[ends > starts], ends[ends > starts]
     first, last = starts // height, (ends - 1) // height  # columns
-    over = last > first  # what goes on in the next column reaches the last line of its first, and the first of its last
+    over = last > first  # runs over several columns touch both the first and the last row
     top = np.where(over, 0, starts % height).min()
     bottom = np.where(over, height - 1, (ends - 1) % height).max()
     left = first.min()

@@ -1,7 +1,7 @@
-"""Names of files as text, and texts as names of files.
+"""Conversion between file names and printable text.
 
-Systems keep names as bytes. Where these are no UTF-8 (as of files that an old archive held), or where the system's language is
-not set, Python gives lone surrogates, which can be neither printed nor written, and which OpenCV does not survive.
+File systems store names as bytes. If these are not UTF-8 (as from old archives), or if no locale is set, Python decodes them
+with lone surrogates, which can be neither printed nor written, and which crash OpenCV.
 """
 
 import os
@@ -11,11 +11,11 @@ from pathlib import Path
 from jaxrl_vis.errors import RequestError
 
 _UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")  # control characters, surrogates, ends of lines and paragraphs
-_LONGEST = 200  # bytes; systems allow 255, of which what is added to it needs some
+_LONGEST = 200  # bytes; file systems allow 255, and names derived from it are longer
 
 
 def readable(name: str) -> str:
-    """A file's name as text that can be printed, in one line: as UTF-8, or else as Latin-1."""
+    """Return a file name as printable text on one line: as UTF-8, or else as Latin-1, with ``_`` for unprintable characters."""
     try:
         raw = name.encode("utf-8", "surrogateescape")
     except UnicodeEncodeError:
@@ -28,12 +28,12 @@ def readable(name: str) -> str:
 
 
 def file_name(text: str) -> str:
-    """The name of a file that is called so, whatever the system's language."""
+    """Return the file name that a text is stored as in UTF-8, independent of the locale."""
     return os.fsdecode(text.encode("utf-8", "replace"))
 
 
 def check_length(path: Path) -> None:
-    """Raise a `RequestError` where a file's name is so long that files that are called after it cannot be written."""
+    """Raise a `RequestError` if a file name is so long that files named after it could not be written."""
     name = readable(path.name)
     length = len(name.encode())
     if length > _LONGEST:

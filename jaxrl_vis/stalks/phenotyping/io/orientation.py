@@ -1,7 +1,7 @@
-"""Orientation of images that cameras stored turned, by the tag of EXIF: 1 as they are, 3 upside down, 6 and 8 on their side.
+"""EXIF orientation of images: 1 is upright, 3 upside down, 6 and 8 rotated by 90 degrees.
 
-Viewers and annotation programs show images turned, so that is how they are read here. A calibration is for images as OpenCV
-reads them, which is turned, too.
+Viewers and annotation programs apply the orientation, so it is applied here. Calibrations are for images as read by OpenCV,
+which applies it, too.
 """
 
 from typing import BinaryIO
@@ -13,14 +13,14 @@ from jaxrl_vis.stalks.phenotyping.io.image_headers import PNG
 
 _TAG = 0x0112
 _EXIF = b"Exif\0\0"
-_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers of JPEG without a length
+_ALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers without a length
 
 
 def read_orientation(file: BinaryIO) -> int:
-    """Read the orientation of the image in a file of JPEG, PNG or TIFF, 1 to 8; 1 where nothing is said, or nothing sensible.
+    """Read the EXIF orientation, 1 to 8, of a JPEG, PNG or TIFF image; 1 if it is missing or invalid.
 
     Args:
-        file: At its beginning, able to seek.
+        file: Seekable file, at its beginning.
     """
     begin = file.read(8)
     file.seek(0)
@@ -40,7 +40,7 @@ def read_orientation(file: BinaryIO) -> int:
 
 
 def upright(image: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn an image [H, W, ...] of an orientation as it is meant to be seen."""
+    """Undo an EXIF orientation: rotate and flip an image [H, W, ...] to upright, as a contiguous copy if necessary."""
     if orientation > 4:
         image = np.swapaxes(image, 0, 1)
     if orientation in (3, 4, 7, 8):
@@ -51,7 +51,7 @@ def upright(image: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _of_jpeg(file: BinaryIO) -> bytes:
-    """EXIF of a JPEG, empty where it has none before its pixels."""
+    """Return the EXIF data of a JPEG; empty if there are none before its pixels."""
     file.seek(2)
     while len(head := file.read(4)) == 4 and head[0] == 0xFF and head[1] not in (0xD9, 0xDA):
         if head[1] in _ALONE or head[1] == 0xFF:
@@ -66,7 +66,7 @@ def _of_jpeg(file: BinaryIO) -> bytes:
 
 
 def _of_png(file: BinaryIO) -> bytes:
-    """EXIF of a PNG, empty where it has none."""
+    """Return the EXIF data of a PNG; empty if there are none."""
     file.seek(len(PNG))
     while len(head := file.read(8)) == 8 and head[4:] != b"IEND":
         length = int.from_bytes(head[:4], "big")

@@ -1,4 +1,4 @@
-"""Reading the two images of a pair and what is known of their disparities, and why some cannot be used."""
+"""Reading and validation of the images of a stereo pair and of precomputed disparities."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,22 +16,22 @@ T = TypeVar("T")
 
 
 class Unusable(Exception):
-    """A pair that cannot be used. The message says why."""
+    """Raised for a pair that cannot be used; the message states the reason."""
 
 
 def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Both images of a pair, [H, W, 3] uint8.
+    """Read the left and right image of a pair, RGB [H, W, 3] uint8.
 
     Args:
-        pair: Its files.
-        calibration: For which it must be; None if nothing is known of the cameras.
-        right_needed: If not, the left image stands in for a right one that is missing.
+        pair: Files of the pair.
+        calibration: Calibration whose size the images must have; None to accept any size.
+        right_needed: If false, the left image is also returned for a missing right one.
 
     Raises:
-        Unusable: They are not a pair of images that can be used.
+        Unusable: An image is missing, unreadable or black, or the sizes do not match.
     """
     sides: tuple[Side, ...] = ("left",) if pair.right is None and not right_needed else ("left", "right")
-    # Before anything is decoded: a small file may hold more pixels than there is memory for.
+    # Checked before decoding: a small file may hold more pixels than fit into memory.
     sizes = [_of_side(pair, side, image_size) for side in sides]
     if sizes[0] != sizes[-1]:
         raise Unusable(f"the left image has {_size(sizes[0])} pixels and the right one {_size(sizes[-1])}")
@@ -40,7 +40,7 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
         raise Unusable(f"the images have {_size(sizes[0])} pixels, but the calibration is for {wanted}")
     images = [read_side(pair, side) for side in sides]
     left, right = images[0], images[-1]
-    if left.shape != right.shape:  # replaced meanwhile
+    if left.shape != right.shape:  # the file was replaced in the meantime
         raise Unusable(f"the left image has {_size(left.shape)} pixels and the right one {_size(right.shape)}")
     if min(int(left.max()), int(right.max())) < 8:
         raise Unusable(f"the {'left' if left.max() < 8 else 'right'} image is black")
@@ -48,19 +48,19 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
 
 
 def read_side(pair: PairFiles, side: Side) -> np.ndarray:
-    """One image of a pair, [H, W, 3] uint8.
+    """Read one image of a pair, RGB [H, W, 3] uint8.
 
     Raises:
-        Unusable: It cannot be used.
+        Unusable: It is missing or unreadable.
     """
     return rgb8(_of_side(pair, side, read_image))
 
 
 def _of_side(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T:
-    """Result of ``read`` for one image of a pair.
+    """Return the result of ``read`` for the file of one image of a pair.
 
     Raises:
-        Unusable: There is none, or it cannot be used.
+        Unusable: There is no file, or ``read`` raises an `OSError`.
     """
     path = pair.left if side == "left" else pair.right
     if path is None:
@@ -72,15 +72,15 @@ def _of_side(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T:
 
 
 def known_disparity(pair: PairFiles, left: np.ndarray, scale: float) -> np.ndarray | None:
-    """Disparities of the left image [H, W, 3] that somebody computed, [H, W] float32 in pixels; None if there is no such file.
+    """Read precomputed disparities of the left image, [H, W] float32 in pixels, NaN where missing; None if there is no file.
 
     Args:
-        pair: Its files.
-        left: Its left image.
-        scale: Divisor of numbers of 16 bits.
+        pair: Files of the pair.
+        left: Left image, [H, W, 3].
+        scale: Divisor of 16-bit values, see `read_disparity`.
 
     Raises:
-        Unusable: They cannot be read, or are those of another image.
+        Unusable: The file cannot be read, or its size is not that of the image.
     """
     if pair.disparity is None:
         return None

@@ -1,10 +1,10 @@
-"""Recordings of robots, taken apart into a plot's folder: bags of ROS 1 (.bag) and ROS 2 (metadata.yaml, .mcap, .db3).
+"""Extraction of ROS recordings to the folder of a plot: bags of ROS 1 (.bag) and ROS 2 (metadata.yaml, .mcap, .db3).
 
-    left/1608946479.473160331.png   images of both cameras, named by their times
-    left.yaml, right.yaml           the first camera_info of each
-    odometry.csv                    positions of nav_msgs/Odometry, or of sensor_msgs/NavSatFix where there is none
+    left/1608946479.473160331.png   images of both cameras, named by timestamp in s
+    left.yaml, right.yaml           first camera_info message of each camera
+    odometry.csv                    positions from nav_msgs/Odometry, or else from sensor_msgs/NavSatFix
 
-Reading needs the package rosbags (the extra ``bags``).
+Requires the package rosbags (extra ``bags``).
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ _IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CAMERA = "sensor_msgs/msg/CameraInfo"
 _ODOMETRY = ("nav_msgs/msg/Odometry", "sensor_msgs/msg/NavSatFix")
 _PLAIN = {"mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1, "rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3}
-"""Encodings of images with their numbers of channels."""
+"""Number of channels by image encoding."""
 _MOSAICS = {
     "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
     "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
@@ -43,14 +43,14 @@ _SHOWN = 8
 
 @dataclasses.dataclass(frozen=True)
 class Topics:
-    """Names of the topics of left and right images."""
+    """Topics of the left and right images."""
 
     left: str
     right: str
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a path is a recording, by its name."""
+    """Return whether a path is a recording: a file with the suffix of a bag, or the folder of a ROS 2 bag."""
     if path.is_file():
         return path.suffix.lower() in _SUFFIXES
     about = path / "metadata.yaml"
@@ -58,18 +58,20 @@ def is_recording(path: Path) -> bool:
 
 
 def take_apart(path: Path, out: Path, topics: Topics | None = None) -> Path:
-    """Write what a recording holds of a stereo pair into a folder, once: a folder that holds it already stays as it is.
+    """Extract the stereo images, calibrations and odometry of a recording to the folder of a plot.
+
+    A folder that is complete, of the same recording and topics, is left alone; any other folder of this name is replaced.
 
     Args:
         path: The recording.
-        out: Folder to make the plot's folder in.
-        topics: Topics of the images; None where there is but one pair of them.
+        out: Parent of the plot's folder.
+        topics: Topics of the images; None if the recording has only one stereo pair.
 
     Returns:
-        The plot's folder, which is called as the recording.
+        The plot's folder, named after the recording.
 
     Raises:
-        RequestError: rosbags is not installed, it cannot read the recording, or there is no pair of rectified images in it.
+        RequestError: rosbags is not installed or cannot read the recording, or there is no unique pair of rectified images.
         OSError: The folder cannot be written.
     """
     if importlib.util.find_spec("rosbags") is None:
@@ -87,7 +89,7 @@ def take_apart(path: Path, out: Path, topics: Topics | None = None) -> Path:
         _write_all(path, folder, topics)
     except (RequestError, OSError, MemoryError):
         raise
-    except Exception as error:  # of any of the readers of rosbags
+    except Exception as error:  # the readers of rosbags raise errors of many types
         words = " ".join(str(error).split())[:200] or type(error).__name__
         raise RequestError(f"{path} cannot be read as a recording of ROS: {words}") from error
     write_atomically(done, json.dumps(origin))
@@ -119,15 +121,19 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
 
 
 def _pair_of(kinds: dict[str, str], path: Path) -> Topics:
-    """The topics of left and right images.
+    """Find the topics of the left and right images.
+
+    Args:
+        kinds: Message type by topic.
+        path: The recording, for messages.
 
     Raises:
-        RequestError: There are none, or several.
+        RequestError: There is no pair of topics, or several.
     """
     images = [topic for topic, kind in kinds.items() if kind in _IMAGE and "depth" not in topic]
     pairs = {Topics(topic, other) for topic in images for side, other in partners(topic) if side == "left" and other in images}
     for word in ("rect", "compressed"):
-        # Rectified ones before raw ones, and whole images before those that were compressed on the way.
+        # Prefer rectified to raw images, then uncompressed to compressed ones.
         best = {pair for pair in pairs if (word in pair.left) == (word == "rect")}
         pairs = best or pairs
     if len(pairs) != 1:
@@ -143,10 +149,11 @@ def _listed(kinds: dict[str, str]) -> str:
 
 
 def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) -> None:
-    """Write the first camera_info that belongs to a topic of images, if there is one.
+    """Write the first camera_info message that belongs to an image topic, if there is one.
 
     Raises:
         RequestError: The images are not rectified.
+        OSError: The file cannot be written.
     """
     parts = topic.split("/")
     named = ["/".join([*parts[:length], "camera_info"]) for length in range(len(parts) - 1, 0, -1)]
@@ -165,7 +172,7 @@ def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) 
 
 
 def _either(message: Any, name: str) -> Any:
-    """A field that has a large letter in ROS 1 and a small one in ROS 2."""
+    """Return a field whose name is upper case in ROS 1 and lower case in ROS 2."""
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
 
 
@@ -189,10 +196,14 @@ def _write_message(folder: Path, message: Any, source: str) -> None:
 
 
 def _pixels(message: Any, source: str) -> np.ndarray:
-    """An image [H, W, 3] or [H, W], uint8 or uint16, red first.
+    """Decode an Image message to [H, W, 3] (RGB) or [H, W], uint8 or uint16.
+
+    Args:
+        message: The message.
+        source: Recording and topic, for messages.
 
     Raises:
-        RequestError: It is of another kind, or its data do not fit its size.
+        RequestError: The encoding is not supported, or the data do not match the size.
     """
     encoding, height, width, step = str(message.encoding), int(message.height), int(message.width), int(message.step)
     channels, deep = _PLAIN.get(encoding, 1), "16" in encoding
@@ -213,7 +224,7 @@ def _pixels(message: Any, source: str) -> np.ndarray:
 
 
 def _write_odometry(path: Path, kinds: dict[str, str], messages: Any) -> None:
-    """Write positions of the robot by their times; nothing where there is no such topic."""
+    """Write the robot's positions with timestamps in ns; nothing if there is no topic with finite ones."""
     for kind, columns in zip(_ODOMETRY, ("x_m,y_m,z_m", "latitude,longitude")):
         topics = sorted((topic for topic, of in kinds.items() if of == kind), key=lambda topic: (len(topic), topic))
         if not topics:

@@ -1,4 +1,4 @@
-"""Unit of a baseline: that of the chessboard with which the cameras were calibrated, or one of its squares."""
+"""Unit of a stereo baseline: that of the calibration chessboard, or the side of one of its squares."""
 
 import re
 from pathlib import Path
@@ -6,17 +6,17 @@ from pathlib import Path
 from jaxrl_vis.errors import RequestError
 
 METRES: dict[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-_BASELINES = (0.008, 2.0)  # m: of stereo pairs that look at plants from a robot
-_USUAL = (0.03, 0.6)  # m: of most of them
+_BASELINES = (0.008, 2.0)  # m: plausible for stereo cameras that look at plants from a robot
+_USUAL = (0.03, 0.6)  # m: typical
 _SQUARES = re.compile(r"(\d{1,6}(?:\.\d{1,6})?) ?(m|cm|mm)")
 _ASKED = "--calibration-unit"
 
 
 def in_metres(unit: str) -> float:
-    """Return a unit in metres: m, cm or mm, or the side of a square of the chessboard, as 24mm.
+    """Return the length of a unit in metres: m, cm or mm, or the side of a chessboard square, such as 24mm.
 
     Raises:
-        RequestError: It is none of these.
+        RequestError: The unit is none of these.
     """
     if unit in METRES:
         return METRES[unit]
@@ -29,15 +29,15 @@ def in_metres(unit: str) -> float:
 
 
 def baseline_in_metres(path: Path, length: float, unit: str) -> float:
-    """Return a baseline in metres.
+    """Convert a baseline to metres.
 
     Args:
-        path: File of the calibration.
+        path: File of the calibration, for messages.
         length: Baseline, in ``unit``.
-        unit: See `in_metres`.
+        unit: Unit, see `in_metres`.
 
     Raises:
-        RequestError: No stereo pair has such a baseline; the message asks for the unit.
+        RequestError: The baseline is implausible for a stereo pair; the message asks for the unit.
     """
     baseline = length * in_metres(unit)
     if _BASELINES[0] <= baseline <= _BASELINES[1]:

@@ -1,9 +1,9 @@
-"""Results of plots in the forms that breeders' programs read, joined with what is known of the plots.
+"""Export of the plots' results, joined with the field plan, in formats of breeding software.
 
-plain     traits.csv: names of the columns, their units, their terms, and a row for each plot
-brapi     brapi/*.json: variables, observation units and observations, as BrAPI 2.1 takes them by POST
+plain     traits.csv: names, units and ontology terms of the columns, then one row per plot
+brapi     brapi/*.json: variables, observation units and observations, as POST bodies of BrAPI 2.1
 miappe    miappe/*.csv: observed variables, observation units and data, in the fields of MIAPPE 1.1
-plantcv   plantcv.json: as plantcv-run-workflow writes it, for plantcv-utils json2csv
+plantcv   plantcv.json: as written by plantcv-run-workflow, for plantcv-utils json2csv
 """
 
 import dataclasses
@@ -18,20 +18,20 @@ from jaxrl_vis.host.spreadsheets import to_csv
 
 Format = Literal["plain", "brapi", "miappe", "plantcv"]
 Plan = Mapping[str, Mapping[str, str]]
-"""Columns of a field plan: plot -> column -> value."""
+"""Field plan: plot -> column -> value."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Trait:
-    """A column of plots.csv as a variable: a trait, how it was measured, and on what scale.
+    """Observed variable, a column of plots.csv: trait, method and scale.
 
     Attributes:
-        column: Its name in plots.csv and in all forms.
-        trait: What is measured.
-        unit: Unit of the numbers, as UCUM writes it; ``1`` for counts.
-        statistic: What the number is of the stalks of a plot.
-        term: Identifier of the trait in an ontology; empty where none is known.
-        whole: If true, the numbers are whole.
+        column: Name of the column in plots.csv and in all formats.
+        trait: Name of the measured trait.
+        unit: UCUM unit of the values; ``1`` for counts.
+        statistic: Statistic over the stalks of a plot, in words.
+        term: Identifier of the trait in an ontology; empty if none is known.
+        whole: If true, the values are integers.
     """
 
     column: str
@@ -42,9 +42,9 @@ class Trait:
     whole: bool = False
 
 
-# The term of diameters is that of the Plant Trait Ontology for the thickness of stems. Numbers of stalks have none: the Crop
-# Ontology of sorghum (CO_324) counts plants, hills, panicles and the tillers of a plant, and the Plant Trait Ontology tillers
-# (TO:0000346), but neither main stems and tillers of a plot together. `--term` names what a programme uses.
+# Diameters have the Plant Trait Ontology's term for stem thickness. Stalk numbers have none: the Crop Ontology of sorghum
+# (CO_324) counts plants, hills, panicles and the tillers of a plant, and the Plant Trait Ontology tillers (TO:0000346), but
+# neither counts main stems and tillers of a plot together. `--term` sets the term that a breeding programme uses.
 _DIAMETER = "TO:0000339"
 TRAITS = (
     Trait("stalks", "stalk number", "1", "count in the plot", whole=True),
@@ -58,18 +58,18 @@ TRAITS = (
     Trait("stalks_measured", "stalk number", "1", "count of the stalks whose diameter was measured", whole=True),
 )
 _ABOUT = ("flag", "method", "version")
-"""Columns of plots.csv that say something of the numbers beside them."""
+"""Columns of plots.csv that describe the values in the same row."""
 _METHOD = "stereo images of a robot that drives along the row; stalks found and outlined by networks (jaxrl-vis phenotype)"
 
 
 def with_terms(terms: Sequence[str]) -> tuple[Trait, ...]:
-    """The traits, some of them with terms of one's own.
+    """Return the traits, with some ontology terms replaced.
 
     Args:
-        terms: ``column=term``, as ``stalks=CO_324:0000999``.
+        terms: Items ``column=term``, such as ``stalks=CO_324:0000999``.
 
     Raises:
-        RequestError: One is not so, or names no column.
+        RequestError: An item has another format, or names an unknown column.
     """
     own: dict[str, str] = {}
     for words in terms:
@@ -84,21 +84,21 @@ def with_terms(terms: Sequence[str]) -> tuple[Trait, ...]:
 def write_exchange(
     out: Path, form: Format, rows: Sequence[Mapping[str, Any]], columns: Sequence[str], plan: Plan, traits: Sequence[Trait]
 ) -> str:
-    """Write results of plots in one form.
+    """Write the results of the plots in one format.
 
     Args:
         out: Folder of the results.
-        form: The form.
+        form: The format.
         rows: Rows of plots.csv.
-        columns: Columns of the plan, in their order.
-        plan: What is known of the plots.
+        columns: Columns of the field plan, in order. Those named like a column of plots.csv get the prefix ``field_``.
+        plan: Field plan; plots may be missing.
         traits: The traits, see `with_terms`.
 
     Returns:
-        Name of what was written, in ``out``.
+        Name of the file or folder written, relative to ``out``.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: A file cannot be written.
     """
     taken = {"plot", *_ABOUT, *(trait.column for trait in traits)}
     own = {name: f"field_{name}" if name in taken else name for name in columns}
@@ -229,7 +229,7 @@ def _write_plantcv(
 ) -> str:
     about = ["plot", *columns, *_ABOUT]
     kinds = {trait.column: "<class 'int'>" if trait.whole else "<class 'float'>" for trait in traits}
-    # What is no number in any plot is no variable: json2csv would write "NA" into a column of numbers.
+    # A trait without a value in any plot is left out: json2csv would write "NA" into a numeric column.
     there = [trait for trait in traits if any(row.get(trait.column, "") != "" for row in rows)]
     variables = {name: {"category": "metadata", "datatype": "<class 'str'>"} for name in about}
     variables |= {trait.column: {"category": "observations", "datatype": kinds[trait.column]} for trait in there}
@@ -277,7 +277,7 @@ def _genotype(about: Mapping[str, str]) -> str:
 
 
 def _position(about: Mapping[str, str]) -> dict[str, str]:
-    """Return the position of a plot in its field, by BrAPI's names."""
+    """Return the position of a plot in the field as BrAPI's fields; empty values if unknown."""
     small = {name.lower(): value for name, value in about.items()}
     x, y = (next((name for name in names if small.get(name)), "") for names in (_X, _Y))
     y = "" if y == x else y

@@ -1,7 +1,7 @@
-"""Figures 3.4 and 3.5 and Table 3.1 of the thesis, of synthetic plots: from the file that ``phenotype eval --json`` writes.
+"""Figures 3.4 and 3.5 and Table 3.1 of the thesis, for synthetic plots, from the file written by ``phenotype eval --json``.
 
-What people did is the thesis's: their times are quoted, and their measurements are simulated with the spread that it states.
-Everything says so.
+Human times are quoted from the thesis, and human measurements are simulated with the standard deviation that it reports. All
+figures and tables state this.
 """
 
 from pathlib import Path
@@ -16,18 +16,18 @@ from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PERSON_SD
 from jaxrl_vis_envs.documents import read_json
 
 _INK, _GREY, _GREEN, _ORANGE = "#222222", "#9a9a9a", "#1a7f37", "#d1720c"
-_MAX_SHOWN = 60  # stalks of figure 3.5, as many as can be told apart
+_MAX_SHOWN = 60  # stalks in figure 3.5: more would overlap
 HUMAN_MINUTES = {"count": (3.33, 3.66), "width": (29.0, 30.0)}
-"""Minutes of two people for a plot of 33 stalks; quoted from Table 3.1 of the thesis."""
+"""Minutes that two people took for a plot of 33 stalks; quoted from Table 3.1 of the thesis."""
 THESIS_SECONDS = 6.5
-"""Seconds of the thesis's own pipeline for the same plot, quoted."""
+"""Seconds that the thesis's pipeline took for the same plot; quoted from the same table."""
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:
-    """Figures of synthetic plots.
+    """Read an evaluation of synthetic plots.
 
     Raises:
-        RequestError: The file is not what ``phenotype eval --json`` writes.
+        RequestError: The file cannot be read, or was not written by ``phenotype eval --json``.
     """
     try:
         data = read_json(path)
@@ -43,7 +43,12 @@ def read_evaluation(path: Path) -> dict[str, Any]:
 
 
 def draw_counts(data: dict[str, Any], out: Path) -> None:
-    """Figure 3.4: stalks that were counted against stalks that are there, plot by plot."""
+    """Draw figure 3.4, counted against true number of stalks per plot, and write its data beside it as .md and .csv.
+
+    Args:
+        data: Result of `read_evaluation`.
+        out: File of the figure.
+    """
     import matplotlib.pyplot as plt
 
     true = np.array([plot["true"] for plot in data["each"]], float)
@@ -72,7 +77,11 @@ def draw_counts(data: dict[str, Any], out: Path) -> None:
 
 
 def draw_widths(data: dict[str, Any], out: Path) -> None:
-    """Figure 3.5: widths by two simulated people and by the cameras, stalk by stalk.
+    """Draw figure 3.5, widths by two simulated people and by the cameras per stalk, and write its data as .md and .csv.
+
+    Args:
+        data: Result of `read_evaluation`.
+        out: File of the figure.
 
     Raises:
         RequestError: No width was measured.
@@ -112,11 +121,11 @@ def draw_widths(data: dict[str, Any], out: Path) -> None:
 
 
 def write_times(data: dict[str, Any], out: Path) -> None:
-    """Table 3.1: minutes of two people, quoted, beside ours.
+    """Write table 3.1: times per plot of two people and of the thesis's robot, quoted, and ours.
 
     Args:
         data: Result of `read_evaluation`.
-        out: The table, .md; the same as .csv goes beside it.
+        out: File of the table, .md; a .csv is written beside it.
 
     Raises:
         RequestError: The evaluation holds no times.
@@ -150,7 +159,7 @@ def write_times(data: dict[str, Any], out: Path) -> None:
 
 
 def _write_tables(out: Path, note: str, rows: list[dict[str, Any]]) -> None:
-    """Rows as Markdown and as CSV beside a figure."""
+    """Write rows, with a note above, as .md and (without the note) as .csv beside a figure."""
     columns = list(rows[0])
     lines = [note, "", "| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(str(row[column]) for column in columns) + " |" for row in rows]

@@ -1,4 +1,4 @@
-"""An image with what was found in it: the picture behind every number."""
+"""Overlays: images annotated with the detections and measurements in them."""
 
 import math
 
@@ -9,24 +9,24 @@ from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
 COUNTED, REJECTED, MEASURED = (70, 235, 100), (255, 105, 75), (255, 225, 60)
-"""Colours: outlines of stalks that count, of what does not count, and where widths were taken."""
+"""RGB colours: outlines of counted and of rejected detections, and marks where widths were measured."""
 _WIDEST = 1688
 _LEGEND = (("counted", COUNTED), ("not counted", REJECTED), ("width was taken here", MEASURED))
 
 
 def overlay_scale(width: int) -> float:
-    """Return the scale of the overlay of an image ``width`` pixels wide."""
+    """Return the scale factor of the overlay of an image ``width`` pixels wide; at most 1."""
     return min(_WIDEST / width, 1.0)
 
 
 def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str | None], title: str = "") -> np.ndarray:
-    """The image [H, W, 3] uint8, at most 1688 pixels wide, brightened, with outlines and widths.
+    """Draw outlines and widths on a brightened copy of an image, at most 1688 pixels wide, RGB [h, w, 3] uint8.
 
     Args:
-        image: The left one.
-        sightings: In it.
-        labels: Number of each sighting's stalk; None for what does not count.
-        title: Written into a corner.
+        image: Left image, RGB [H, W, 3] uint8.
+        sightings: Sightings in the image.
+        labels: Label of each sighting's stalk; empty to omit it, None for sightings that do not count.
+        title: Title in the lower left corner.
     """
     scale = overlay_scale(image.shape[1])
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
@@ -46,21 +46,21 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
 
 
 def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thick: int) -> None:
-    """The two edges of a stalk in the band, and bars where its widths were taken."""
+    """Draw the two edges of a stalk in the band, and bars where its widths were measured."""
 
     def at(column: float, line: float) -> tuple[int, int]:
         return round((column + 0.5) * scale - 0.5), round((line + 0.5) * scale - 0.5)
 
     left, top, right, bottom = sighting.box
     lean = math.radians(sighting.lean_deg or 0.0)
-    # The width is taken across the axis, the edges stand further apart along a line.
+    # The width is perpendicular to the axis; along a row, the edges are further apart.
     half = 0.5 * (
         sighting.width_px / math.cos(lean)
         if sighting.width_px
         else max(right - left - abs(sighting.axis[1] - sighting.axis[0]), 2.0)
     )
     slope = (sighting.axis[1] - sighting.axis[0]) / max(bottom - top, 1.0)
-    # The outline goes through the middle that was measured.
+    # The outline passes through the measured centre.
     middle = [sighting.column + slope * (line - sighting.line) for line in (top, bottom)]
     for side in (-half, half):
         cv2.line(canvas, at(middle[0] + side, top), at(middle[1] + side, bottom), colour, thick, cv2.LINE_AA)
@@ -72,14 +72,20 @@ def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int
 
 
 class _Writer:
-    """Writes on an image so that no word covers another."""
+    """Writer of non-overlapping text on an image, in place.
+
+    Args:
+        canvas: Image [H, W, 3] uint8.
+        letters: Font scale of OpenCV.
+        thick: Line thickness of the letters, pixels.
+    """
 
     def __init__(self, canvas: np.ndarray, letters: float, thick: int) -> None:
         self._canvas, self._letters, self._thick = canvas, letters, thick
         self._taken: list[tuple[int, int, int, int]] = []
 
     def above(self, place: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
-        """Write above a place, as near to it as there is room, with a thread down to it."""
+        """Write text above a point (column, row), as close as there is free space, with a line down to the point."""
         wide, tall = self._size(text)
         left = min(max(place[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
         bottom = place[1] - tall // 2
@@ -89,7 +95,7 @@ class _Writer:
         self._write((left, bottom), text, colour)
 
     def legend(self, title: str) -> None:
-        """Title and meaning of the colours, in the lower left corner."""
+        """Write a title and the meaning of the colours in the lower left corner."""
         left, bottom = self._size("0")[1] // 2, self._canvas.shape[0] - self._size("0")[1] // 2
         for text, colour in [*([(title, (255, 255, 255))] if title else []), *_LEGEND]:
             self._write((left, bottom), text, colour)
@@ -100,7 +106,7 @@ class _Writer:
         return wide + base, tall + 2 * base
 
     def _write(self, corner: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
-        """On a darkened box whose lower left corner is given."""
+        """Write text on a darkened box with the given lower left corner (column, row)."""
         left, bottom = corner
         wide, tall = self._size(text)
         part = self._canvas[max(bottom - tall, 0) : bottom, left : left + wide]

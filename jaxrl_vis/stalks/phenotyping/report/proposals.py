@@ -1,4 +1,4 @@
-"""Writes finds as annotations that labelling programs open, to be corrected by a person."""
+"""Export of detections as annotations for manual correction in labelling programs."""
 
 import json
 from collections.abc import Sequence
@@ -12,13 +12,14 @@ from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.io.annotations import coco
 
-_TOLERANCE = 0.8  # pixels by which an outline of few corners differs from the mask
+_TOLERANCE = 0.8  # pixels, maximum deviation of the simplified outline from the mask
 
 
 def outline(detection: Detection) -> list[float]:
-    """Return the outline of a find's mask within its box: column, line, ... of its corners, where the first pixel is 0 to 1.
+    """Return the outline of a detection's mask within its box as x, y, x, y, ..., where the first pixel spans from 0 to 1.
 
-    It goes around the outermost pixels of each line, as a stalk is one strip; the box where the mask shows nothing.
+    It encloses the outermost pixels of each row, as a stalk is a single strip. If the mask has fewer than two rows there, it is
+    the box.
     """
     left, top, right, bottom = (edge + 0.5 for edge in detection.box)
     lines = np.arange(detection.mask.shape[0]) + detection.corner[0] + 0.5
@@ -29,7 +30,7 @@ def outline(detection: Detection) -> list[float]:
     first = mask[rows].argmax(axis=1) + detection.corner[1]
     last = mask.shape[1] - mask[rows][:, ::-1].argmax(axis=1) + detection.corner[1]
     sides = [_simplified(np.stack([side, lines[rows]], axis=1)) for side in (first, last)]
-    # Outer corners of the first and the last pixels, not their middles.
+    # Use the outer corners of the first and the last pixels instead of their centres.
     for side in sides:
         side[0, 1] -= 0.5
         side[-1, 1] += 0.5
@@ -37,20 +38,20 @@ def outline(detection: Detection) -> list[float]:
 
 
 def _simplified(points: np.ndarray) -> np.ndarray:
-    """Return points [K, 2] with those left out that lie on a line between others."""
+    """Simplify a polyline [K, 2] by the Douglas-Peucker algorithm."""
     return cv2.approxPolyDP(points.astype(np.float32)[:, None], _TOLERANCE, closed=False)[:, 0].astype(float)
 
 
 def write_coco(path: Path, found: Sequence[tuple[Path, tuple[int, int], list[Detection]]], about: str) -> None:
-    """Write the finds of several images as COCO.
+    """Write the detections in several images in COCO format.
 
     Args:
-        path: The file; images are named from its folder.
-        found: File, size (height, width) and finds of each image.
+        path: The file; images are named relative to its folder.
+        found: File, size (height, width) and detections of each image.
         about: Description of the data set.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     images, annotations = [], []
     for number, (image, (height, width), detections) in enumerate(found, start=1):
@@ -75,15 +76,15 @@ def write_coco(path: Path, found: Sequence[tuple[Path, tuple[int, int], list[Det
 
 
 def write_labelme(image: Path, size: tuple[int, int], detections: list[Detection]) -> None:
-    """Write the finds of one image as LabelMe's .json beside it.
+    """Write the detections in one image as a LabelMe .json file beside it.
 
     Args:
-        image: Its file.
+        image: File of the image.
         size: Height and width, pixels.
-        detections: The finds.
+        detections: The detections.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     shapes = [
         {

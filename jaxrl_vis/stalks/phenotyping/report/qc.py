@@ -1,7 +1,7 @@
-"""A page to check the results by: sortable tables, a picture for every stalk, and what was rejected and why. It is one file.
+"""Quality-control page: sortable tables, an image of every stalk, and rejected detections with reasons, as one HTML file.
 
-Pictures are cut out of the overlays that `pipeline.run` wrote. Plots are added one by one and wait in a file, so that memory
-does not grow with their number; pictures of whole pairs are limited to about 200 in all.
+Images are cropped from the overlays written by `pipeline.run`. Plots are added one by one and buffered in a temporary file, so
+that memory use does not grow with their number; images of whole pairs are limited to about 200 in total.
 """
 
 import base64
@@ -28,9 +28,9 @@ from jaxrl_vis.stalks.phenotyping.report.tables import NO_GROUND
 from jaxrl_vis.stalks.phenotyping.track.follow import Track
 from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
-_WHOLE = 200  # pictures of whole pairs in a page
-_MAX_WHOLE, _MIN_WHOLE = 8, 1  # of a plot
-_THUMB = 844  # pixels: width of those
+_WHOLE = 200  # images of whole pairs on the page
+_MAX_WHOLE, _MIN_WHOLE = 8, 1  # per plot
+_THUMB = 844  # pixels, maximum width of these
 _STALK_COLUMNS = {
     "stalk": "stalk",
     "position_m": "position, m",
@@ -66,7 +66,7 @@ _DIGITS = {
     **dict.fromkeys(("width_mm", "width_24in_mm", "width_mean_mm", "width_sd_mm", "width_24in_mean_mm", "stalks_per_m"), 1),
     "confidence": 2,
 }
-"""Digits of numbers in the page; the files have more."""
+"""Decimal places of numbers on the page; the tables have more."""
 _ERRORS = (
     "± is the standard error of a width: scatter between pairs, masks that err alike in all of them, hidden edges, and a good "
     "calibration. Twice that covers the truth of about 95 % of synthetic stalks. "
@@ -80,14 +80,14 @@ class PlotResult:
 
     Attributes:
         row: Row of plots.csv.
-        stalks: Rows of stalks.csv.
+        stalks: Rows of stalks.csv, one per counted track.
         pairs: Names of the pairs that were used.
-        frames: Sightings of each.
-        tracks: Stalks, and what does not count; empty where pairs could not be put together.
-        start: Place of the first pair, which positions count from, m.
-        image_width: Width of its images, pixels.
-        why: More words than its flag has on why it has no count; empty where there is one, or no more to say.
-        strange: Words on why its images are unlike those that the networks know; empty where they are not.
+        frames: Sightings in each of these pairs.
+        tracks: Counted and rejected tracks; empty if the pairs could not be linked.
+        start: Position of the first pair, the origin of the stalks' positions, m.
+        image_width: Width of the images, pixels.
+        why: Reason that there is no count, beyond the flag; empty if there is a count or nothing to add.
+        strange: Description of how the images differ from those that the networks know; empty if they do not.
     """
 
     row: dict[str, Any]
@@ -102,11 +102,11 @@ class PlotResult:
 
 
 class Page:
-    """The page in the making. A context manager.
+    """Builder of the page; a context manager that owns the temporary file.
 
     Args:
-        about: Lines of text under the title.
-        overlays: Folder with a folder of overlays for each plot.
+        about: Lines of text below the title.
+        overlays: Folder with a subfolder of overlays for each plot.
         plots: Number of plots that will be added.
     """
 
@@ -168,14 +168,14 @@ class Page:
         write("<h3>Pairs</h3>" + "".join(pictures.whole(self._whole)) + "</details>\n")
 
     def write(self, path: Path, skipped: list[dict[str, Any]]) -> None:
-        """Write the page. The file is complete whenever it can be read.
+        """Write the page atomically.
 
         Args:
             path: The file, .html.
-            skipped: The rows of skipped.csv.
+            skipped: Rows of skipped.csv.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: The file cannot be written.
         """
         rows = [{**row, "plot": _Html(f'<a href="#{_safe(row["plot"])}">{_safe(row["plot"])}</a>')} for row in self._rows]
         with replacing(path) as encoded:
@@ -196,7 +196,7 @@ class Page:
 
 
 class _Html(str):
-    """Text that is HTML already."""
+    """HTML that must not be escaped again."""
 
 
 def _safe(value: Any) -> str:
@@ -211,7 +211,7 @@ def _headline(row: dict[str, Any]) -> str:
 
 
 def _grouped(reasons: Counter[str]) -> Counter[str]:
-    """Reasons, with those together that differ in a distance only."""
+    """Merge the counts of reasons that differ only in a distance."""
     groups: Counter[str] = Counter()
     for reason, count in reasons.items():
         groups["it stands too near or too far away" if reason.startswith("it stands ") else reason] += count
@@ -219,11 +219,11 @@ def _grouped(reasons: Counter[str]) -> Counter[str]:
 
 
 def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
-    """A sortable table as HTML.
+    """Return a sortable HTML table.
 
     Args:
-        columns: Title of each column, by its name in the rows.
-        rows: Their values; a flag that is not ``ok`` is marked.
+        columns: Column name in the rows -> title.
+        rows: Values by column name; flags other than ``ok`` are highlighted.
     """
     head = "".join(
         f'<th aria-sort="none"><button>{_safe(title)}</button></th>' if title else "<th></th>" for title in columns.values()
@@ -242,11 +242,19 @@ def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
 
 
 class _Pictures:
-    """Pictures of a plot, cut out of its overlays; one overlay is in memory at a time."""
+    """Images of a plot, cropped from its overlays, of which only one is in memory at a time.
+
+    Args:
+        folder: Folder of the plot's overlays.
+        plot: The plot.
+
+    Raises:
+        OSError: An overlay cannot be read.
+    """
 
     def __init__(self, folder: Path, plot: PlotResult) -> None:
         self._folder, self._plot = folder, plot
-        # The clearest sighting of each track, from pair to pair, so that each overlay is read once.
+        # The best sighting of each track, grouped by pair, so that each overlay is read once.
         wanted: dict[int, list[tuple[int, int]]] = {}
         for place, track in enumerate(plot.tracks):
             frame, sighting = max(track.sightings, key=lambda indices: self._clear(*indices))
@@ -277,11 +285,11 @@ class _Pictures:
         )
 
     def of(self, track: Track) -> _Html:
-        """The picture of a track."""
+        """Return the image of a track's best sighting."""
         return self._found[next(place for place, other in enumerate(self._plot.tracks) if other is track)]
 
     def whole(self, most: int) -> Iterable[str]:
-        """Pictures of whole pairs, spread over the plot."""
+        """Yield images of at most ``most`` whole pairs, spread evenly over the plot."""
         pairs = self._plot.pairs
         for place in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round()).astype(int):
             overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))
@@ -292,7 +300,13 @@ class _Pictures:
 
 
 def picture(image: np.ndarray, name: str, kind: str) -> _Html:
-    """An image [H, W, 3] uint8 as HTML, with the image itself in it."""
+    """Return an HTML element with an image (RGB [H, W, 3] uint8) embedded as JPEG.
+
+    Args:
+        image: The image.
+        name: Alternative text and tooltip.
+        kind: CSS class, ``stalk`` or ``pair``.
+    """
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 75])
     source = base64.b64encode(data.tobytes()).decode()
     return _Html(
@@ -301,7 +315,7 @@ def picture(image: np.ndarray, name: str, kind: str) -> _Html:
 
 
 def _chart(plot: PlotResult, rejected: list[Track]) -> str:
-    """Widths along the row, with their standard errors, and where something was rejected, as SVG."""
+    """Plot widths with standard errors, and rejected tracks, along the row as SVG; empty if no width was measured."""
     points = [
         (float(row["position_m"]), float(row["width_mm"]), float(row["width_se_mm"] or 0), row)
         for row in plot.stalks

@@ -1,4 +1,4 @@
-"""Style of the page of `qc`, and the script that sorts its tables."""
+"""Style sheet of the page of `qc`, and its script, which sorts tables and opens plots."""
 
 STYLE = """
 :root { color-scheme: light dark; --line: #8884; --good: #1a7f37; --doubt: #c2570c; --no: #cf222e; }

@@ -1,4 +1,4 @@
-"""Tables of plots: one row per stalk, one row per plot, tidy, with units in the header."""
+"""Tidy result tables: one row per stalk and one row per plot, with units in the column names."""
 
 import dataclasses
 import math
@@ -51,27 +51,27 @@ PLOT_COLUMNS = (
     "version",
 )
 Row = dict[str, Any]
-_LEAST_SEEN = 0.95  # of the row, that pairs must show before its stalks are counted
-_MAX_ERROR = 0.08  # of a width: what its pairs disagree about by more is no measurement
+_LEAST_SEEN = 0.95  # minimum fraction of the row that pairs must show for a count
+_MAX_ERROR = 0.08  # of a width: maximum scatter between pairs before it is uncertain
 NO_GROUND = "no visible ground"
-"""Flag of widths at a height that is not known."""
+"""Flag of widths at an unknown height, as the ground was not seen."""
 NO_ROW = "nothing like a row seen"
-"""Flag of a plot in which no stalk was seen: it is empty, or its images are not such as networks know."""
+"""Flag of a plot without counted stalks: it is empty, or its images differ from those that the networks know."""
 PARTLY_SEEN = "part of the row not seen"
-"""Flag of a plot of which no pair shows some part, so that nobody knows how many stalks stand there."""
+"""Flag of a plot without a count, as no pair shows some part of the row."""
 FEW_FRAMES = "few frames"
-"""Flag of a width that fewer than three pairs measured, and of plots in which most are so."""
+"""Flag of a width measured in fewer than three pairs, and of a plot in which most widths are."""
 SKIPPED = "pairs skipped"
-"""Flag of a plot of which some pairs could not be used."""
+"""Flag of a plot with pairs that could not be used."""
 NO_WIDTHS = "no widths"
-"""Flag of a plot whose stalks were counted, but none of them measured."""
+"""Flag of a plot with stalks, none of which could be measured."""
 UNFAMILIAR = "unlike what the networks know"
-"""Flag of a plot of which the gate doubts that most images were read rightly."""
+"""Flag of a plot for which the gate doubts the detections in most images."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """Values of every row: plot, method of the widths and version of the software."""
+    """Values common to all rows of a plot: its name, the method of the widths, and the software version."""
 
     plot: str
     method: str
@@ -81,7 +81,15 @@ class Origin:
 def plot_rows(
     frames: list[list[Sighting]], tracks: list[Track], path: Driven, skipped: int, origin: Origin
 ) -> tuple[list[Row], Row]:
-    """Rows of the stalks of one plot, from its beginning to its end, and the plot's own row."""
+    """Compute the rows of the counted stalks of one plot, in the order of ``tracks``, and the plot's own row.
+
+    Args:
+        frames: Sightings of each pair.
+        tracks: Tracks of the plot; only counted ones give rows.
+        path: Path of the robot.
+        skipped: Number of pairs that could not be used.
+        origin: Values common to all rows.
+    """
     stalks: list[Row] = []
     counted = [track for track in tracks if track.counted]
     for track, widths in zip(counted, stalk_widths(frames, counted)):
@@ -114,7 +122,7 @@ def plot_rows(
 
 
 def _flag(widths: StalkWidths, confidence: float) -> str:
-    """Return the flag of a stalk: what a reader should know before trusting its width; ``ok`` if nothing."""
+    """Return the flag of a stalk, the main reservation about its width; ``ok`` if there is none."""
     if widths.lower is None:
         return "no width"
     if not widths.height_known:
@@ -128,7 +136,7 @@ def _flag(widths: StalkWidths, confidence: float) -> str:
 
 def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin: Origin) -> Row:
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
-    # Networks that know none of what images show find nothing in them, so that nothing is not a count.
+    # In unfamiliar images the networks detect nothing, so no detections do not mean a count of 0.
     count = len(stalks) if path.seen >= _LEAST_SEEN and stalks else ""
     doubts = [PARTLY_SEEN] if stalks and count == "" else []
     doubts += [NO_WIDTHS] if stalks and not widths.size else []
@@ -153,14 +161,14 @@ def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin:
 def rows_without_path(
     frames: list[list[Sighting]], skipped: int, origin: Origin, why: str, metric: bool = True
 ) -> tuple[list[Row], Row]:
-    """The plot's row where pairs cannot be put together: no count, no rows of stalks.
+    """Compute the row of a plot whose pairs cannot be linked: there is no count, and there are no rows of stalks.
 
     Args:
         frames: Sightings of each pair.
         skipped: Number of pairs that could not be used.
-        origin: Values of every row.
+        origin: Values common to all rows.
         why: Flag of the plot.
-        metric: The mean width of detections is stated; not where the unit of the calibration is in doubt.
+        metric: If true, state the mean width of the detections; false if the unit of the calibration is in doubt.
     """
     sightings = [sighting for frame in frames for sighting in frame] if metric else []
     measured = [sighting.diameter_mm for sighting in sightings if sighting.diameter_mm is not None]
@@ -176,12 +184,12 @@ def rows_without_path(
         "method": origin.method,
         "version": origin.version,
     }
-    # The same stalk is seen many times: a standard error would claim too much.
+    # Detections of the same stalk are not independent: a standard error would be too small.
     return [], {**row, "width_se_mm": "", "width_24in_mean_mm": "", "taper_mean_mm_per_in": "", "stalks_measured": ""}
 
 
 def _higher(stalks: list[Row]) -> Row:
-    """Means over the stalks that were measured at 24 inches, too."""
+    """Return mean width and taper over the stalks that were also measured at 24 inches."""
     means = {"width_24in_mean_mm": "width_24in_mm", "taper_mean_mm_per_in": "taper_mm_per_in"}
     values = {name: [float(row[column]) for row in stalks if row[column] != ""] for name, column in means.items()}
     return {name: _text(float(np.mean(numbers)), 3) if numbers else "" for name, numbers in values.items()}
@@ -202,9 +210,9 @@ def _text(value: float, digits: int) -> str:
 
 
 def write_rows(path: Path, columns: tuple[str, ...], rows: list[Row]) -> None:
-    """Write a table as CSV. The file is complete whenever it can be read.
+    """Write a table as CSV atomically.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     write_atomically(path, to_csv(rows, columns))

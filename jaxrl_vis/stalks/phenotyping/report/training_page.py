@@ -1,4 +1,4 @@
-"""A page that compares networks before and after a training, on images that were held out. It is one file."""
+"""Page that compares networks before and after training on held-out images, as one HTML file."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ from jaxrl_vis.stalks.phenotyping.training.examples import Example
 from jaxrl_vis.stalks.phenotyping.training.held_out import LEAST_SCORE, Finds, Score
 
 _ANNOTATED, _RIGHT, _FALSE = (255, 225, 60), (70, 235, 100), (255, 105, 75)
-_MOST = 60  # pictures
+_MOST = 60  # images shown
 _COLUMNS = {
     "weights": "weights",
     "images": "images",
@@ -43,14 +43,14 @@ def write_page(
 
     Args:
         path: The file, .html.
-        facts: Lines about the training.
-        examples: The images.
-        finds: Finds in each image, by the name of the weights.
-        scores: Scores of these, by the same name.
-        overlaps: Overlap of masks, by the same name; not a number, or missing, where unknown.
+        facts: Lines of HTML about the training.
+        examples: Held-out images; the first 60 are shown.
+        finds: Detections in each image, by name of the weights.
+        scores: Scores of these detections, by name of the weights.
+        overlaps: Mean overlap of masks, by name of the weights; NaN or missing if unknown.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     rows = []
     for name, each in scores.items():
@@ -77,7 +77,7 @@ def write_page(
 
 
 def draw_finds(example: Example, finds: Finds) -> np.ndarray:
-    """Return a reduced image [h, w, 3] uint8 with its annotations and finds."""
+    """Draw the annotations and the detections of at least `LEAST_SCORE` on a copy of an example's image, [h, w, 3] uint8."""
     canvas = example.image.copy()
     for stalk in example.stalks[example.kinds == STALK]:
         _box(canvas, stalk, _ANNOTATED)

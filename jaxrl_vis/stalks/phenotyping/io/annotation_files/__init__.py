@@ -1,1 +1,1 @@
-"""Readers of annotations, one file a form: from what a program exports to images and what is annotated in them."""
+"""Annotation readers, one module per format: each parses the export of a labelling program into annotated images."""

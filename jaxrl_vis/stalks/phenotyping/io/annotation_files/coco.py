@@ -1,4 +1,4 @@
-"""Annotations in COCO's format, as CVAT, Roboflow, Label Studio and others export it under names of their own."""
+"""Annotations in COCO format, as exported by CVAT, Roboflow, Label Studio and others under various file names."""
 
 from pathlib import Path
 from typing import Any
@@ -7,15 +7,25 @@ from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, A
 
 
 def is_coco(data: Any) -> bool:
-    """Return whether a file of JSON is COCO's."""
+    """Return whether parsed JSON is a COCO data set."""
     return isinstance(data, dict) and "images" in data and "annotations" in data
 
 
 def read_coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
-    """Images with their ids; those of annotations without an image are left to an image of no name.
+    """Convert a parsed COCO data set.
+
+    Annotations whose ``image_id`` no image has are marked ``orphan`` and added to the first image; if there are no images, they
+    are dropped.
+
+    Args:
+        path: The file, for messages.
+        data: Its parsed contents.
+
+    Returns:
+        Id and contents of each image, in the order of the file.
 
     Raises:
-        ValueError, KeyError, TypeError, AttributeError: The data are not COCO's.
+        ValueError, KeyError, TypeError, AttributeError: The data are not valid COCO.
     """
     names = {category["id"]: str(category["name"]) for category in data.get("categories", [])}
     images = [

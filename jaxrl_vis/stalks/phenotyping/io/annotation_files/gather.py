@@ -1,4 +1,4 @@
-"""All annotations of a folder, whatever they were written with, and the images that they are of."""
+"""Collection of all annotations in a folder, in any supported format, with their images."""
 
 import itertools
 from collections.abc import Iterator
@@ -12,21 +12,25 @@ from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis_envs.documents import parse_json, parse_xml, read_bytes, read_json, read_text
 
-_MAX_BYTES = 10_000_000  # of a file of one image
-_DEPTH = 4  # folders in folders
+_MAX_BYTES = 10_000_000  # of the annotation file of one image
+_DEPTH = 4  # levels of nested folders searched
 _MAX_FILES = 200_000
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm"}
 _HELD_BACK = {"valid", "val", "test", "testing", "validation"}
-"""Folders that hold what is kept from training, where there is one called train."""
+"""Names of folders of held-out data, skipped if there is a sibling folder ``train``."""
 _WRONG = (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError)
-"""Errors that reading a file of another form raises."""
+"""Errors raised by a reader given a file in another format."""
 
 
 def gather(folder: Path) -> list[tuple[Any, Annotated]]:
-    """Images of a folder with their ids and annotations, and with names that lead from the folder to them.
+    """Collect the annotated images of a folder.
+
+    Returns:
+        Id and contents of each image. The names of images that exist are paths relative to the folder, missing sizes are read
+        from the image files, and polygons of one group are merged (see `together`).
 
     Raises:
-        RequestError: There are none, or a file cannot be read.
+        RequestError: There are no annotations, a file cannot be read, or an image is ambiguous or annotated twice.
     """
     found = _read(folder)
     index = _Index(folder)
@@ -59,7 +63,7 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
         found += read or []
         others += [file] if read is None else []
     broken = next((file for file in others if file.stem in images), None)
-    if broken is not None:  # another one, as of a calibration, may lie there
+    if broken is not None:  # files with other names, such as a calibration, are allowed
         kinds = "Pascal VOC" if broken.suffix.lower() == ".xml" else "LabelMe"
         raise RequestError(f"{broken} is no annotation of {kinds}, but called as an image is")
     if not found:
@@ -72,10 +76,15 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
 
 
 def _one(file: Path, read: Any, kind: str) -> Any:
-    """Read a file by ``read``.
+    """Call ``read``, converting errors of the readers to a `RequestError`.
+
+    Args:
+        file: The file that it reads, for messages.
+        read: Reader without arguments.
+        kind: Name of the expected format, for messages.
 
     Raises:
-        RequestError: It cannot be read, or is of another kind.
+        RequestError: The file cannot be read, or has another format.
     """
     try:
         return read()
@@ -89,7 +98,7 @@ def _one(file: Path, read: Any, kind: str) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """Message of a reader's error, where it has one in words."""
+    """Return the message of a `ValueError` in parentheses, shortened; empty for other errors."""
     words = " ".join(str(error).split()) if isinstance(error, ValueError) else ""
     return f" ({words[:200]})" if words else ""
 
@@ -101,11 +110,11 @@ def _coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
 
 
 def _json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
-    """Images of a file of JSON: COCO's, LabelMe's or Label Studio's; None if it is another one."""
+    """Read the images of a COCO, LabelMe or Label Studio JSON file; return None if it has another format."""
     data = _one(file, lambda: parse_json(read_text(file)), "LabelMe")
     if coco.is_coco(data):
         read = _one(file, lambda: _coco(file, data), "COCO")
-        # Of several such files, ids may be the same.
+        # Ids may repeat across files.
         return [((str(file), number) if isinstance(number, (int, str)) else number, image) for number, image in read]
     if label_studio.is_label_studio(data):
         return list(zip(numbers, _one(file, lambda: label_studio.read_label_studio(file, data), "Label Studio")))
@@ -115,7 +124,7 @@ def _json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | N
 
 
 def _xml(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
-    """Images of a file of XML: Pascal VOC's or CVAT's; None if it is another one."""
+    """Read the images of a Pascal VOC or CVAT XML file; return None if it has another format."""
     root = _one(file, lambda: parse_xml(read_bytes(file)), "Pascal VOC")
     if root.tag not in ("annotation", "annotations"):
         return None
@@ -131,7 +140,7 @@ def _yolo(file: Path, image: Path, names: list[str]) -> list[Annotated]:
 
 
 def _class_names(folder: Path) -> list[str]:
-    """Names of YOLO's classes, from the first of the files that name them; none where there is no such file."""
+    """Read the names of the YOLO classes from the first file in `yolo.NAMES` that exists; empty if there is none."""
     for name in yolo.NAMES:
         for path in (folder / name, folder.parent / name, *sorted(folder.glob(f"*/{name}"))):
             if path.is_file():
@@ -140,10 +149,12 @@ def _class_names(folder: Path) -> list[str]:
 
 
 def _files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
-    """Files of a folder and of what lies in it, in order; without what is held back from training.
+    """Yield the files with some suffixes in a folder and its subfolders, sorted by name, except those of held-out data.
+
+    Hidden files and folders, folders called ``truth`` and unreadable folders are skipped.
 
     Raises:
-        RequestError: There are too many.
+        RequestError: There are more than 200,000.
     """
     count, waiting = 0, [(folder, 0)]
     while waiting:
@@ -165,7 +176,7 @@ def _files(folder: Path, suffixes: set[str]) -> Iterator[Path]:
 
 
 class _Index:
-    """Images of a folder by their names, in small letters, with and without what follows the last point."""
+    """Index of the images in a folder by lower-case file name, with and without suffix."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -176,10 +187,12 @@ class _Index:
             self._by_name.setdefault(path.stem.lower() + "\0", []).append(path)
 
     def settle(self, image: Annotated) -> None:
-        """Write the way from the folder to an image's file into it, and its size where that is missing.
+        """Set ``image.name`` to the path of its file relative to the folder, and its width and height if they are missing.
+
+        Modifies ``image`` in place; it is unchanged if no such file exists.
 
         Raises:
-            RequestError: Several files could be meant, or another annotation is of the same one.
+            RequestError: Several files match, the file is annotated elsewhere, too, or its size cannot be read.
         """
         path = self._locate(image.name, image.source)
         if path is None:

@@ -1,4 +1,4 @@
-"""Annotations of Label Studio in its own JSON: a list of tasks, with rectangles and polygons in per cent of the image."""
+"""Annotations in Label Studio's native JSON: a list of tasks, with rectangles and polygons in percent of the image size."""
 
 import urllib.parse
 from pathlib import Path
@@ -10,15 +10,19 @@ from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, A
 
 
 def is_label_studio(data: Any) -> bool:
-    """Return whether a file of JSON is Label Studio's, whole or in its short form (JSON-MIN)."""
+    """Return whether parsed JSON is an export of Label Studio, as JSON or JSON-MIN."""
     return isinstance(data, list) and bool(data) and all(isinstance(task, dict) and _image(task) for task in data[:20])
 
 
 def read_label_studio(path: Path, data: Any) -> list[Annotated]:
-    """Images of all tasks.
+    """Convert the parsed tasks of Label Studio: one image per task, with the last annotation that was not cancelled.
+
+    Args:
+        path: The file, for messages.
+        data: Its parsed contents.
 
     Raises:
-        ValueError, KeyError, TypeError, AttributeError: The data are not Label Studio's.
+        ValueError, KeyError, TypeError, AttributeError: The data are not a valid export.
     """
     images = []
     for number, task in enumerate(data):
@@ -34,14 +38,14 @@ def read_label_studio(path: Path, data: Any) -> list[Annotated]:
 
 
 def _image(task: dict[str, Any]) -> str:
-    """The name of a task's image: its address ends with it, after a path or a query."""
+    """Return the file name of a task's image: the end of its URL, after the path or the query ``?d=``."""
     values = task["data"] if isinstance(task.get("data"), dict) else task
     address = next((str(values[name]) for name in ("image", "img", "image_url") if isinstance(values.get(name), str)), "")
     return urllib.parse.unquote(address).replace("\\", "/").rpartition("/")[2].rpartition("?d=")[2]
 
 
 def _short(task: dict[str, Any]) -> list[dict[str, Any]]:
-    """Results of a task in the short form."""
+    """Return the results of a JSON-MIN task in the structure of the full export."""
     shapes = [shape for value in task.values() if isinstance(value, list) for shape in value if isinstance(shape, dict)]
     return [{**shape, "value": shape} for shape in shapes]
 
@@ -57,7 +61,7 @@ def _shapes(result: dict[str, Any], source: str) -> list[Annotation]:
         elif kind == "rectanglelabels":
             box = np.array([float(value[part]) for part in ("x", "y", "width", "height")]).reshape(2, 2) * scale
             corners = turned_box((box[1, 0] / 2, box[1, 1] / 2), (box[1, 0], box[1, 1]), 0.0)
-            turn = np.radians(float(value.get("rotation") or 0.0))  # about the corner
+            turn = np.radians(float(value.get("rotation") or 0.0))  # about the top left corner
             turned = corners @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
             shapes.append(outlined(name, box[0] + turned, source))
         elif kind == "brushlabels":

@@ -1,4 +1,4 @@
-"""Annotations of LabelMe and X-AnyLabeling: one JSON an image, with polygons, rectangles, turned rectangles and masks."""
+"""Annotations of LabelMe and X-AnyLabeling: one JSON file per image, with polygons, (rotated) rectangles and masks."""
 
 import base64
 import binascii
@@ -18,19 +18,23 @@ _CORNERS = {"polygon": 3, "rectangle": 2, "rotation": 4}
 
 
 def is_labelme(data: Any) -> bool:
-    """Return whether a file of JSON is LabelMe's."""
+    """Return whether parsed JSON is a LabelMe file."""
     return isinstance(data, dict) and "shapes" in data
 
 
 def read_labelme(path: Path, data: Any) -> list[Annotated]:
-    """The image of a file.
+    """Convert a parsed LabelMe file to a list of its one image.
+
+    Args:
+        path: The file, for messages.
+        data: Its parsed contents.
 
     Raises:
-        ValueError, KeyError, TypeError, AttributeError: The data are not LabelMe's.
+        ValueError, KeyError, TypeError, AttributeError: The data are not a valid LabelMe file.
     """
     size = int(data["imageWidth"]), int(data["imageHeight"])
     annotations = [_shape(shape, size, f"{path}: annotation {place + 1}") for place, shape in enumerate(data["shapes"])]
-    # The path is as its writer's machine spelled it.
+    # The path may have Windows separators.
     return [Annotated(str(data["imagePath"]).replace("\\", "/").rpartition("/")[2], *size, path, annotations)]
 
 
@@ -50,7 +54,11 @@ def _shape(shape: dict[str, Any], size: tuple[int, int], source: str) -> Annotat
 
 
 def _mask(shape: dict[str, Any], points: np.ndarray, size: tuple[int, int]) -> dict[str, Any]:
-    """The mask that is kept as a PNG of the box between two points, both of which belong to it."""
+    """Decode a mask, stored as a base64 PNG of the box between two corner pixels (inclusive), to COCO runs.
+
+    Raises:
+        ValueError: The mask is not a PNG, or reaches beyond the image.
+    """
     if len(points) != 2 or not np.isfinite(points).all() or np.abs(points).max() > 1e7:
         raise ValueError("a mask without its box")
     left, top = (int(edge) for edge in points[0])

@@ -1,4 +1,4 @@
-"""Choice of the annotations that are stalks, by what they are called."""
+"""Selection of the annotations that are stalks, by their labels."""
 
 import re
 from collections import Counter
@@ -14,19 +14,19 @@ _SHOWN = 6
 
 
 def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str) -> tuple[list[dict[str, Any]], str]:
-    """The annotations that are called a stalk.
+    """Select the annotations whose label denotes a stalk.
 
     Args:
-        annotations: With a ``name`` each, which may be empty.
-        labels: Names that are taken for stalks; if there are none, ``stalk``, with a crop's name and a number or without. Where
-            nothing has a name, everything is a stalk.
+        annotations: Annotations with a label ``name`` each, which may be empty.
+        labels: Labels that count as stalks, in any case; if empty, ``stalk`` and ``stalks``, optionally with the name of a crop
+            and a number. If all annotations are unnamed, all are stalks.
         source: Name of the annotations, for messages.
 
     Returns:
-        The annotations, and a line that says what was taken and what was left out.
+        The selected annotations, and a one-line summary of the labels that were taken and left out.
 
     Raises:
-        RequestError: Nothing is called so.
+        RequestError: No annotation has such a label.
     """
     names = Counter(_tidy(annotation.get("name", "")) for annotation in annotations)
     if labels:
@@ -52,7 +52,7 @@ def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str
 
 
 def _says_stalk(name: str) -> bool:
-    """Return whether a name says stalk and nothing else: ``stalk_2`` and ``sorghum stalk`` do, ``not stalk`` does not."""
+    """Return whether a label means stalk and nothing else: ``stalk_2`` and ``sorghum stalk`` do, ``not stalk`` does not."""
     words = {word for word in re.split(r"[^a-z]+", name.casefold()) if word}
     return bool(words & _STALKS) and words <= _STALKS | _CROPS
 

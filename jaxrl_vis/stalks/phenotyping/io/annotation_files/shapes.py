@@ -1,4 +1,4 @@
-"""Annotations as readers hand them over, before they are checked: boxes, outlines, and what is neither."""
+"""Common representation of annotations that the readers return, not yet validated: boxes, outlines and unusable shapes."""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 Annotation = dict[str, Any]
-"""``name``, ``source``, and ``bbox`` and ``segmentation`` as in COCO; or ``problem``: why a stalk may not be like that."""
+"""``name``, ``source``, and ``bbox`` and ``segmentation`` as in COCO; or ``problem``: why the shape cannot be a stalk."""
 
 
 @dataclasses.dataclass
 class Annotated:
-    """One image and what is annotated in it.
+    """An image with its annotations.
 
     Attributes:
-        name: Of the image's file, as the annotations have it.
-        width, height: Pixels; None where they do not say it.
-        source: The file that says so.
-        annotations: Of it.
+        name: Name of the image file, as written in the annotations.
+        width, height: Size in pixels; None if the annotations do not state it.
+        source: The annotation file.
+        annotations: Annotations of the image.
     """
 
     name: str
@@ -30,12 +30,12 @@ class Annotated:
 
 
 Reader = Callable[[Path, Any], list[Annotated]]
-"""From a file and what was parsed of it to images."""
+"""Convert the parsed contents of a file to images: called with the path and the contents."""
 _NO_WIDTH = "which has no width: draw it as a polygon or a rectangle"
 
 
 def outlined(name: str, points: np.ndarray, source: str, group: Any = None) -> Annotation:
-    """An annotation by its corners [N, 2], or more than two numbers that are none."""
+    """Return a polygon annotation with corners [N, 2] in pixels and their bounding box; nothing is checked."""
     low, high = points.min(axis=0), points.max(axis=0)
     with np.errstate(over="ignore", invalid="ignore"):
         box = [*map(float, low), *map(float, high - low)]
@@ -43,24 +43,27 @@ def outlined(name: str, points: np.ndarray, source: str, group: Any = None) -> A
 
 
 def boxed(name: str, box: list[float], source: str, group: Any = None) -> Annotation:
-    """An annotation by its box (left, top, width, height)."""
+    """Return a box annotation (left, top, width, height), pixels."""
     return {"name": name, "bbox": box, "source": source, "group": group}
 
 
 def without_width(name: str, kind: str, source: str) -> Annotation:
-    """An annotation of a kind of shape that says nothing of widths."""
+    """Return an unusable annotation: a shape such as a point or a line, which has no width."""
     return {"name": name, "problem": f"is a {kind[:40]}, {_NO_WIDTH}", "source": source, "group": None}
 
 
 def turned_box(centre: tuple[float, float], size: tuple[float, float], angle: float) -> np.ndarray:
-    """Corners [4, 2] of a box of some width and height that is turned clockwise about its centre, radians."""
+    """Return the corners [4, 2] of a box (width, height) rotated clockwise about its centre by ``angle``, radians."""
     across, down = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size
     return np.array(centre) + half[:, :1] * across + half[:, 1:] * down
 
 
 def together(annotations: list[Annotation]) -> list[Annotation]:
-    """Annotations in which polygons of one name and one group are one: the parts of what is partly hidden."""
+    """Merge polygons with the same name and group into one annotation: the visible parts of a partially occluded object.
+
+    Modifies the annotations in place: ``group`` is removed, and the ``bbox`` of merged ones is None.
+    """
     joined: dict[tuple[str, Any], Annotation] = {}
     result = []
     for annotation in annotations:
@@ -73,5 +76,5 @@ def together(annotations: list[Annotation]) -> list[Annotation]:
             result.append(annotation)
         else:
             whole["segmentation"] = whole["segmentation"] + outlines
-            whole["bbox"] = None  # the one around all of them
+            whole["bbox"] = None  # computed later from all parts
     return result

@@ -1,4 +1,4 @@
-"""Annotations in XML: Pascal VOC's of one image, as labelImg and Roboflow write it, roLabelImg's turned boxes, and CVAT's."""
+"""Annotations in XML: Pascal VOC (labelImg, Roboflow), the rotated boxes of roLabelImg, and CVAT for images."""
 
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,14 @@ _EDGES = ("xmin", "ymin", "xmax", "ymax")
 
 
 def read_xml(path: Path, root: Element) -> list[Annotated]:
-    """Images of a file of Pascal VOC or of CVAT.
+    """Convert a parsed Pascal VOC or CVAT file.
+
+    Args:
+        path: The file, for messages.
+        root: Root element; ``annotations`` for CVAT.
 
     Raises:
-        ValueError: It is neither.
+        ValueError: The file is neither, or holds tracks of a video.
     """
     if root.tag == "annotations":
         if root.find("track") is not None:
@@ -50,7 +54,7 @@ def _voc_image(path: Path, root: Element) -> Annotated:
                 raise ValueError("robndbox")
             annotations.append(outlined(name, turned_box((x, y), (wide, high), angle), source))
         else:
-            # Pixels count from 1, and the last ones belong to the box.
+            # Pixel indices start at 1, and the last ones are inclusive.
             left, top, right, bottom = (float(_text(element, f"bndbox/{edge}")) for edge in _EDGES)
             annotations.append(boxed(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
     width, height = (_whole(root.findtext(f"size/{side}")) for side in ("width", "height"))
@@ -58,7 +62,7 @@ def _voc_image(path: Path, root: Element) -> Annotated:
 
 
 def _whole(text: str | None) -> int | None:
-    """A number of pixels; None where labelImg did not know it, and wrote 0."""
+    """Parse a number of pixels; return None if it is missing or 0, as labelImg writes an unknown size."""
     return int(text) or None if text is not None and text.strip() else None
 
 
@@ -102,7 +106,16 @@ def _cvat_shape(shape: Element, size: tuple[int, int], name: str, source: str, g
 
 
 def _cvat_mask(runs: str, box: tuple[int, int, int, int], size: tuple[int, int]) -> dict[str, Any]:
-    """The mask of CVAT's runs, which go along the lines of its box and begin with what is outside."""
+    """Decode CVAT's run-length encoding, which is row-major within the box and starts with the background, to COCO runs.
+
+    Args:
+        runs: Run lengths, separated by commas.
+        box: Left, top, width and height of the box, pixels.
+        size: Width and height of the image.
+
+    Raises:
+        ValueError: The box reaches beyond the image, or the runs do not cover it.
+    """
     left, top, wide, high = box
     if not 0 < size[0] * size[1] <= MAX_PIXELS or min(left, top) < 0 or left + wide > size[0] or top + high > size[1]:
         raise ValueError("a mask that reaches beyond its image")

@@ -1,4 +1,4 @@
-"""Annotations of YOLO: a text for each image, one line a box, a turned box or an outline, in shares of the image."""
+"""Annotations of YOLO: a text file per image, with one box, rotated box or outline per line, normalised by the image size."""
 
 import math
 import re
@@ -12,17 +12,17 @@ from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis_envs.documents import read_text
 
 NAMES = ("data.yaml", "data.yml", "dataset.yaml", "dataset.yml", "classes.txt", "obj.names", "_darknet.labels")
-"""Files that name the classes."""
+"""Names of files that list the classes, in order of preference."""
 _MAX_BYTES = 1_000_000  # of such a file
-_BEYOND = 0.02  # of the image: as far as roundings and hasty hands go
+_BEYOND = 0.02  # of the image: tolerance for rounding and imprecise annotation beyond its border
 
 
 def read_names(path: Path) -> list[str]:
-    """Names of the classes, in their order.
+    """Read the names of the classes, in order, from one of the files in `NAMES`.
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: It names nothing.
+        ValueError: It holds no names, or is of key points.
     """
     text = read_text(path, _MAX_BYTES)
     if path.suffix not in (".yaml", ".yml"):
@@ -40,22 +40,22 @@ def read_names(path: Path) -> list[str]:
 
 
 def is_yolo(text: str) -> bool:
-    """Return whether a text is such a file: lines of numbers, of which the first is a class."""
+    """Return whether a text is in YOLO format: lines of at least five words, the first of which is a class number."""
     lines = [line.split() for line in text.splitlines() if line.strip()]
     return all(len(words) >= 5 and re.fullmatch(r"\d{1,4}", words[0]) is not None for words in lines)
 
 
 def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) -> list[Annotation]:
-    """Annotations of one image.
+    """Parse the annotations of one image.
 
     Args:
         path: The file, for messages.
         text: Its contents.
-        names: Of the classes.
+        names: Names of the classes; the number of a class is its name if it is not listed.
         size: Width and height of the image.
 
     Raises:
-        ValueError: A line is none of YOLO's.
+        ValueError: A line is not in YOLO format, or has coordinates outside the image.
     """
     annotations = []
     for place, words in enumerate(line.split() for line in text.splitlines() if line.strip()):
@@ -63,7 +63,7 @@ def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) ->
         name = names[number] if number < len(names) else str(number)
         values = [float(word) for word in words[1:]]
         if len(values) in (4, 5):
-            shares: list[Any] = values[:4]  # the fifth is a score
+            shares: list[Any] = values[:4]  # the fifth is a confidence
         elif len(values) >= 6 and len(values) % 2 == 0:
             shares = values
         else:

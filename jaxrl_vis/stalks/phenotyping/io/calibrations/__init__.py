@@ -1,1 +1,1 @@
-"""Readers of calibrations, one file a program: from what it writes to projection matrices or to cameras as they were built."""
+"""Calibration readers, one module per program: they return projection matrices or unrectified camera parameters."""

@@ -1,4 +1,4 @@
-"""Contents of calibrations before they are checked: pairs of rectified cameras, and pairs as they were built."""
+"""Contents of calibrations before validation: rectified and unrectified camera pairs."""
 
 import dataclasses
 import math
@@ -14,8 +14,8 @@ Unit = Literal["m", "cm", "mm"]
 Size = tuple[int, int]
 """Width and height of an image, pixels."""
 MAX_SIDE = 100_000
-"""Greatest width or height of an image that was calibrated, pixels."""
-_SAME = 1e-6  # of rotations and distortions, and of focal lengths relative to each other
+"""Maximum width or height of a calibrated image, pixels."""
+_SAME = 1e-6  # tolerance: absolute for rotations and distortions, relative for focal lengths and translations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,9 +23,9 @@ class RectifiedPair:
     """Projection matrices of two rectified cameras.
 
     Attributes:
-        left, right: [3, 4] float64.
-        size: Width and height of the images; None where the file does not say it.
-        unit: Unit of the last column; None where the file does not say it.
+        left, right: Projection matrices [3, 4] float64.
+        size: Width and height of the images; None if the file does not state it.
+        unit: Unit of the baseline; None if the file does not state it.
     """
 
     left: np.ndarray
@@ -36,16 +36,16 @@ class RectifiedPair:
 
 @dataclasses.dataclass(frozen=True)
 class RawPair:
-    """Two cameras as they are, whose images must be rectified before depths can be had from them.
+    """Two unrectified cameras, whose images must be rectified before stereo matching.
 
     Attributes:
         matrices: Camera matrices, [2, 3, 3] float64.
-        distortions: Coefficients of each camera, [2, N] float64, in OpenCV's order.
+        distortions: Distortion coefficients of each camera, [2, N] float64, in OpenCV's order.
         fisheye: If true, the coefficients are those of OpenCV's fisheye model (equidistant).
-        rotation, translation: [3, 3] and [3] float64: from coordinates of the left camera to those of the right one.
-        size: Width and height of the images; None where the file does not say it.
-        unit: Unit of the translation; None where the file does not say it.
-        program: Name of the program or make of camera that the file is of.
+        rotation, translation: Transform from the left to the right camera's frame, [3, 3] and [3] float64.
+        size: Width and height of the images; None if the file does not state it.
+        unit: Unit of the translation; None if the file does not state it.
+        program: Name of the program or camera make that wrote the file.
     """
 
     matrices: np.ndarray
@@ -58,7 +58,10 @@ class RawPair:
     program: str
 
     def if_rectified(self) -> RectifiedPair | None:
-        """Return the projection matrices where the cameras are rectified as they stand; None where they are not."""
+        """Return the projection matrices if the cameras are rectified as mounted; None otherwise.
+
+        They are if they have no distortion, equal focal lengths, no rotation, and a translation along x only.
+        """
         one, other = self.matrices
         focal = one[0, 0]
         equal = [one[1, 1], other[0, 0], other[1, 1]]
@@ -72,17 +75,17 @@ class RawPair:
 
 
 def camera_matrix(focal_x: float, focal_y: float, x: float, y: float) -> np.ndarray:
-    """The camera matrix [3, 3] float64 of focal lengths and a principal point, pixels."""
+    """Return the camera matrix [3, 3] float64 of focal lengths and a principal point (x, y), pixels."""
     return np.array([[focal_x, 0.0, x], [0.0, focal_y, y], [0.0, 0.0, 1.0]])
 
 
 def projection(focal: float, x: float, y: float, shift: float = 0.0) -> np.ndarray:
-    """The projection matrix [3, 4] float64 of a rectified camera; ``shift`` is minus its focal length times the baseline."""
+    """Return the projection matrix [3, 4] float64 of a rectified camera; ``shift`` is minus the focal length times baseline."""
     return np.array([[focal, 0.0, x, shift], [0.0, focal, y, 0.0], [0.0, 0.0, 1.0, 0.0]])
 
 
 def numbers(value: Any, count: int) -> np.ndarray | None:
-    """Exactly ``count`` finite numbers [count] float64, in a list, in lists of them, or under ``data``; None if not so."""
+    """Convert a list, nested list, or table with ``data`` to float64 [count]; None unless it holds ``count`` finite floats."""
     data = value.get("data") if isinstance(value, dict) else value
     rows = data if isinstance(data, list) else []
     flat = [number for row in rows for number in row] if rows and all(isinstance(row, list) for row in rows) else rows
@@ -92,10 +95,14 @@ def numbers(value: Any, count: int) -> np.ndarray | None:
 
 
 def named_size(store: Mapping[str, Any], path: Path) -> Size | None:
-    """Width and height under one of the names that programs give them; None where there are none.
+    """Return the image size under any of the names that programs use; None if there is none.
+
+    Args:
+        store: Contents of the file.
+        path: The file, for messages.
 
     Raises:
-        RequestError: They are there, but are no numbers of pixels.
+        RequestError: The size is invalid.
     """
     for names in (("image_width", "image_height"), ("width", "height")):
         values = [store.get(name) for name in names]
@@ -110,10 +117,15 @@ def named_size(store: Mapping[str, Any], path: Path) -> Size | None:
 
 
 def whole(values: list[Any], path: Path, names: str) -> Size:
-    """Two numbers of pixels.
+    """Convert a width and height to integers.
+
+    Args:
+        values: The two values as parsed.
+        path: The file, for messages.
+        names: Names of the values, for messages.
 
     Raises:
-        RequestError: They are none.
+        RequestError: They are not floats with integer values from 1 to `MAX_SIDE`.
     """
     if not all(isinstance(value, float) and 1 <= value <= MAX_SIDE and value.is_integer() for value in values):
         raise RequestError(f"{path}: {names} must be numbers of pixels, without quotation marks")
@@ -121,10 +133,10 @@ def whole(values: list[Any], path: Path, names: str) -> Size:
 
 
 def plain_numbers(text: str) -> list[float]:
-    """Numbers of a text that are parted by white space or commas.
+    """Parse numbers separated by white space or commas.
 
     Raises:
-        ValueError: One is none, or not finite.
+        ValueError: One is not a number, or not finite.
     """
     found = [float(word) for word in text.replace(",", " ").split()]
     if not all(map(math.isfinite, found)):

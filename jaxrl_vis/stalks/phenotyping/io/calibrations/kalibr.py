@@ -1,4 +1,4 @@
-"""Calibrations of kalibr: camchain.yaml, with the cameras as they are."""
+"""Calibrations of kalibr: camchain.yaml, with unrectified cameras."""
 
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,19 @@ _MODELS = {"radtan": False, "plumb_bob": False, "equidistant": True, "none": Fal
 
 
 def is_chain(store: dict[str, Any]) -> bool:
-    """Return whether a file's contents are those of kalibr."""
+    """Return whether parsed YAML is a kalibr camera chain."""
     return isinstance(store.get("cam0"), dict) and "intrinsics" in store["cam0"]
 
 
 def read_chain(store: dict[str, Any], path: Path) -> RawPair:
-    """The first two cameras of a chain; lengths are in metres.
+    """Convert the first two cameras of a chain; lengths are in metres.
+
+    Args:
+        store: Contents of the file.
+        path: The file, for messages.
 
     Raises:
-        RequestError: There are no two pinhole cameras, or something of them is missing.
+        RequestError: There are no two pinhole cameras of the same size and distortion model, or a parameter is missing.
     """
     cameras = [store.get(name) for name in ("cam0", "cam1")]
     if not all(isinstance(camera, dict) for camera in cameras):

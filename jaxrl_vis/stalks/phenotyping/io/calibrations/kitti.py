@@ -1,6 +1,6 @@
-"""Calibrations of KITTI: calib.txt of the odometry and object data, and calib_cam_to_cam.txt of the raw data; metres.
+"""Calibrations of KITTI: calib.txt of the odometry and object data, and calib_cam_to_cam.txt of the raw data, in metres.
 
-Cameras 0 and 1 are the grey pair, 2 and 3 the coloured one; images lie in folders that bear their numbers (image_2, image_02).
+Cameras 0 and 1 are the greyscale pair, 2 and 3 the colour pair; image folders are named by camera (image_2, image_02).
 """
 
 import re
@@ -11,26 +11,26 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, plain_numbers, whole
 
-# Numbers without brackets: what is in brackets, or alone, is YAML.
+# Two or more numbers without brackets: a list in brackets or a single number is YAML.
 _LINE = re.compile(r"^(P|P_rect_0|S_rect_0)([0-3]):[ \t]*([-+.\d]\S*[ \t]+\S.*)$", re.MULTILINE)
 _FOLDER = re.compile(r"image_?0?([0-3])$")
 
 
 def is_kitti(text: str) -> bool:
-    """Return whether a text is such a file."""
+    """Return whether a text is a KITTI calibration."""
     return any(name != "S_rect_0" for name, _, _ in _LINE.findall(text))
 
 
 def read_kitti(text: str, path: Path, image: Path | None) -> RectifiedPair:
-    """The rectified pair that the images are of.
+    """Parse the rectified pair that belongs to the images.
 
     Args:
         text: Contents of the file.
         path: The file, for messages.
-        image: A left image, whose folders say which pair it is; None where none is known.
+        image: A left image, whose parent folders tell which pair it belongs to; None if unknown.
 
     Raises:
-        RequestError: The pair is not there, or nobody knows which one is meant.
+        RequestError: The pair is missing or ambiguous, or a matrix or size is invalid.
     """
     matrices: dict[int, np.ndarray] = {}
     sizes: dict[int, Size] = {}

@@ -1,4 +1,4 @@
-"""Calibrations of the Middlebury stereo data sets (2014 and 2021): calib.txt; millimetres."""
+"""Calibrations of the Middlebury stereo data sets (2014 and 2021): calib.txt, in millimetres."""
 
 import re
 from pathlib import Path
@@ -12,15 +12,19 @@ _LINE = re.compile(r"^\s*([A-Za-z]\w*)\s*=\s*(.*?)\s*$", re.MULTILINE)
 
 
 def is_middlebury(text: str) -> bool:
-    """Return whether a text is such a file."""
+    """Return whether a text is a Middlebury calibration."""
     return re.search(r"^\s*cam0\s*=\s*\[", text, re.MULTILINE) is not None
 
 
 def read_middlebury(text: str, path: Path) -> RectifiedPair:
-    """The rectified pair.
+    """Parse the rectified pair.
+
+    Args:
+        text: Contents of the file.
+        path: The file, for messages.
 
     Raises:
-        RequestError: Something is missing.
+        RequestError: A value is missing or invalid, or ``doffs`` contradicts the principal points.
     """
     values = dict(_LINE.findall(text))
     try:

@@ -1,6 +1,6 @@
-"""Calibrations of OpenCV: P1 and P2 as ``cv2.stereoRectify`` returns them, or camera matrices with R and T.
+"""Calibrations of OpenCV: P1 and P2 as returned by ``cv2.stereoRectify``, or camera matrices with R and T.
 
-OpenCV's sample ``stereo_calib`` writes both into two files, intrinsics.yml and extrinsics.yml, and no size of images.
+OpenCV's sample ``stereo_calib`` writes both to two files, intrinsics.yml and extrinsics.yml, without the image size.
 """
 
 import reprlib
@@ -18,10 +18,14 @@ _MOST_COEFFICIENTS = 14
 
 
 def read_projections(store: dict[str, Any], path: Path) -> RectifiedPair:
-    """The rectified pair of a file that holds P2.
+    """Convert P1 and P2 to a rectified pair.
+
+    Args:
+        store: Contents of the file.
+        path: The file, for messages.
 
     Raises:
-        RequestError: A matrix is none.
+        RequestError: A matrix is missing or malformed, or the image size or unit is invalid.
     """
     matrices = []
     for name, side in (("P1", "left"), ("P2", "right")):
@@ -35,7 +39,15 @@ def read_projections(store: dict[str, Any], path: Path) -> RectifiedPair:
 
 
 def read_raw(store: dict[str, Any], path: Path) -> RawPair | None:
-    """The cameras before rectification; None where the file does not hold both of them, R and T."""
+    """Return the unrectified cameras; None unless there are two camera matrices, R and T. Distortions may be missing.
+
+    Args:
+        store: Contents of the file.
+        path: The file, for messages.
+
+    Raises:
+        RequestError: The image size or unit is invalid.
+    """
     matrices = [numbers(store.get(name), 9) for name in _present(store, _MATRICES)]
     distortions = [_coefficients(store.get(name)) for name in _present(store, _DISTORTIONS)]
     rotation, translation = numbers(store.get("R"), 9), numbers(store.get("T"), 3)

@@ -1,7 +1,6 @@
-"""Calibrations of Intel's RealSense cameras: the table that the viewer and the calibration tool export as JSON; millimetres.
+"""Calibrations of Intel RealSense cameras: the table that the viewer and the calibration tool export as JSON, in millimetres.
 
-The two infrared images leave the camera rectified. The table holds their focal length and principal point, the same for both,
-for each size that they may have.
+The camera outputs rectified infrared images. The table holds their common focal length and principal point for each image size.
 """
 
 import math
@@ -15,20 +14,20 @@ _MODES = 64
 
 
 def is_table(store: dict[str, Any]) -> bool:
-    """Return whether a file's contents are such a table."""
+    """Return whether parsed JSON is a RealSense calibration table."""
     return "baseline" in store and any(name.startswith(("rectified.", "intrinsic_left.")) for name in store)
 
 
 def read_table(store: dict[str, Any], path: Path, size: Size | None) -> RectifiedPair:
-    """The pair of infrared cameras at one size of images.
+    """Convert the entry of the infrared pair for one image size.
 
     Args:
         store: Contents of the file.
         path: The file, for messages.
-        size: Width and height of the images; None where they are not known, and the table holds but one size.
+        size: Width and height of the images; may be None if the table holds only one size.
 
     Raises:
-        RequestError: The size is not there, or something else is missing.
+        RequestError: The size is not in the table, or a value is missing or invalid.
     """
     modes: dict[Size, tuple[float, float, float]] = {}
     for mode in range(_MODES):

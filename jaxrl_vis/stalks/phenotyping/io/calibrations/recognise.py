@@ -1,4 +1,4 @@
-"""Recognition of calibrations by what they hold, whatever their names."""
+"""Detection of the format of calibrations from their contents, and of the files that belong together."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from jaxrl_vis_envs.documents import read_text
 _MAX_BYTES = 2_000_000  # of a file
 _SUFFIXES = (".yaml", ".yml", ".xml", ".json", ".txt", ".conf", ".ini")
 _NAMES = ("calibration", "extrinsics", "calib", "calib_cam_to_cam", "camchain", "stereo")
-"""Stems of files that hold a pair, the first of which goes before the others."""
+"""Stems of files with the calibration of a pair, in order of preference."""
 _KINDS = "OpenCV, ROS, kalibr, ZED, RealSense, Middlebury or KITTI"
 _NO_PAIR = (
     "holds neither P1 and P2 of OpenCV nor one side of a ROS camera_info (left.yaml and right.yaml): "
@@ -24,14 +24,15 @@ _NO_PAIR = (
 
 
 def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPair:
-    """The cameras of a calibration.
+    """Read the cameras of a calibration in any supported format.
 
     Args:
-        path: A file, or a folder that holds one, or one for each camera.
-        image: A left image, of whose size the calibration must be where a file holds several; None where none is known.
+        path: A file, or a folder with one file, or with one for each camera. For the file of one camera, that of the other one
+            is found by its name.
+        image: A left image, which selects among several sizes or pairs in a file; None if unknown.
 
     Raises:
-        RequestError: There is none, or it cannot be read.
+        RequestError: There is no calibration, or it cannot be read.
     """
     if path.is_dir():
         return _in_folder(path, image)
@@ -54,12 +55,12 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPa
 
 
 def files_in(folder: Path) -> list[Path]:
-    """Files of a folder that may be calibrations by what their names end with, in order."""
+    """Return the files of a folder whose suffix is that of a calibration, sorted."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES and path.is_file())
 
 
 def named_pair(files: list[Path]) -> Path | None:
-    """The file whose name says that it is the calibration of a pair; None if there is none."""
+    """Return the file named as the calibration of a pair, or else a .conf file of ZED; None if there is none."""
     stems = {path: path.stem.lower() for path in files}
     zed_files = [path for path in files if path.suffix.lower() == ".conf"]
     for name in _NAMES:
@@ -86,7 +87,7 @@ def _in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
 
 
 def both_sides(path: Path) -> tuple[Path, Path] | None:
-    """The files of the left and of the right camera, one of which is ``path``; None where there is no other."""
+    """Return the files of the left and the right camera, one of which is ``path``; None if there is no matching other file."""
     try:
         there = {file.name.lower(): file for file in path.parent.iterdir()}
     except OSError:
@@ -103,7 +104,7 @@ def _of_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> Rectif
     for file in pair:
         found = _read(file, image)
         if not isinstance(found, list):
-            return found  # one file of both, beside another one
+            return found  # this file holds both cameras by itself
         if len(found) != 1:
             raise RequestError(f"{file} {_NO_PAIR}")
         cameras += found
@@ -111,7 +112,11 @@ def _of_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> Rectif
 
 
 def _read(path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
-    """The pair of a file, or what it says of one or two cameras of ROS."""
+    """Read a file: a pair, or the contents of one or two ROS cameras.
+
+    Raises:
+        RequestError: The file cannot be read, or is not a calibration.
+    """
     try:
         text = read_text(path, _MAX_BYTES)
         if middlebury.is_middlebury(text):
@@ -164,7 +169,7 @@ def _of_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | Raw
 
 
 def _intrinsics(path: Path) -> dict[str, Any]:
-    """Contents of the other file of OpenCV's sample, where ``path`` is its extrinsics.yml."""
+    """Return the contents of intrinsics.yml beside extrinsics.yml of OpenCV's sample; empty if it does not exist."""
     beside = path.with_name(path.name.replace("extrinsics", "intrinsics"))
     if beside == path or not beside.is_file():
         return {}
@@ -176,7 +181,7 @@ def _intrinsics(path: Path) -> dict[str, Any]:
 
 
 def _size(image: Path | None) -> tuple[int, int] | None:
-    """Width and height of an image; None where it cannot be read, which is told elsewhere."""
+    """Return the width and height of an image; None if it cannot be read, which is reported elsewhere."""
     try:
         size = None if image is None else image_size(image)
     except OSError:

@@ -1,10 +1,10 @@
-"""Calibrations of ROS 1 and 2: one file a camera, as the calibrators write it or as a message of camera_info is printed.
+"""Calibrations of ROS 1 and 2: one file per camera, from the calibrators or a printed camera_info message.
 
 camera_calibration, image_pipeline   left.yaml and right.yaml: image_width, image_height, projection_matrix
-the same in the older form           ost.txt, left.ini and right.ini: sections with a camera's name
+the same in the older format         ost.txt, left.ini and right.ini: one section per camera name
 rostopic echo, ros2 topic echo       width, height, P or p, binning and region of interest, one or more messages
-rostopic echo -p                     a table whose columns are field.width, ..., field.P0, ...
-ros2 topic echo --csv                a line without names of columns
+rostopic echo -p                     a table with columns field.width, ..., field.P0, ...
+ros2 topic echo --csv                rows without column names
 print() of a message in Python       CameraInfo(header=..., p=array([...]), ...)
 """
 
@@ -21,7 +21,7 @@ from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, 
 
 _MATRIX_NAMES = ("projection_matrix", "P", "p")
 _SIDES = (("left", "right"), ("LEFT", "RIGHT"), ("Left", "Right"), ("cam0", "cam1"))
-"""Names of the two cameras in files that hold both."""
+"""Keys of the two cameras in files that hold both."""
 _HEADER = re.compile(r"^header:", re.MULTILINE)
 _PRINTED = re.compile(r"CameraInfo\(.*?\bheight=(\d{1,9}), ?width=(\d{1,9})", re.DOTALL)
 _PRINTED_MATRIX = re.compile(r"\bp=array\(\[([^\]]*)\]")
@@ -31,15 +31,15 @@ _CSV_END = ("binning_x", "binning_y", *_REGION, "do_rectify")
 
 
 def read_pair(stores: list[dict[str, Any]], files: list[Path], path: Path) -> RectifiedPair:
-    """The rectified pair of two cameras' files.
+    """Combine two cameras into a rectified pair.
 
     Args:
-        stores: Contents of the left and of the right camera's file.
-        files: The files.
-        path: Name of both, for messages.
+        stores: Contents of the left and the right camera's file.
+        files: The two files, for messages.
+        path: File or folder of the pair, for messages.
 
     Raises:
-        RequestError: They are no rectified cameras, or of images of two sizes.
+        RequestError: A camera has no valid projection matrix, or the image sizes differ.
     """
     sides = ("left", "right")
     (left, size), (right, other) = (_camera(store, file, side) for store, file, side in zip(stores, files, sides))
@@ -49,18 +49,18 @@ def read_pair(stores: list[dict[str, Any]], files: list[Path], path: Path) -> Re
 
 
 def message(text: str) -> str:
-    """Text without what programs print before the first message."""
+    """Remove everything that programs print before the first message."""
     match = _HEADER.search(text)
     return text if match is None else text[match.start() :]
 
 
 def is_camera(store: dict[str, Any]) -> bool:
-    """Return whether a file's contents are those of one camera of ROS."""
+    """Return whether the contents of a file are those of one ROS camera."""
     return any(store.get(name) is not None for name in _MATRIX_NAMES)
 
 
 def both_in_one(store: dict[str, Any]) -> list[dict[str, Any]] | None:
-    """Both cameras of a file with a table for each, or with ``LEFT.P`` and ``RIGHT.P`` as of ORB-SLAM; None if not so."""
+    """Return both cameras of a file with a table for each, or with ``LEFT.P`` and ``RIGHT.P`` as in ORB-SLAM; else None."""
     for left, right in _SIDES:
         cameras = [store.get(left), store.get(right)]
         if not all(isinstance(camera, dict) for camera in cameras):
@@ -76,10 +76,10 @@ def _beginning_with(store: dict[str, Any], begin: str) -> dict[str, Any]:
 
 
 def from_print(text: str) -> dict[str, Any] | None:
-    """Contents of a message that Python printed; None where it is none.
+    """Parse a message printed by Python; return None if the text is not one.
 
     Raises:
-        ValueError: Its matrix holds no numbers.
+        ValueError: Its matrix holds something other than finite numbers.
     """
     size, matrix = _PRINTED.search(text), _PRINTED_MATRIX.search(text)
     if size is None or matrix is None:
@@ -93,10 +93,10 @@ def from_print(text: str) -> dict[str, Any] | None:
 
 
 def from_table(text: str) -> dict[str, Any] | None:
-    """Contents of a message that was printed as a table, with names of its columns (ROS 1) or without (ROS 2); None if not so.
+    """Parse a message printed as CSV, with column names (ROS 1) or without (ROS 2); return None if the text is not one.
 
     Raises:
-        ValueError: Its cells are no numbers.
+        ValueError: A cell is not a number.
     """
     lines = [line for line in text[:200_000].splitlines() if line.strip()]
     try:
@@ -123,10 +123,10 @@ def from_table(text: str) -> dict[str, Any] | None:
 
 
 def from_sections(text: str) -> list[dict[str, Any]] | None:
-    """Cameras of the older form of the calibrator's files (oST), one or two; None where it is none of them.
+    """Parse the cameras of a file in the calibrator's older format (oST); return None if the text is not one.
 
     Raises:
-        ValueError: Something stands where numbers should.
+        ValueError: A size or matrix holds something other than finite numbers.
     """
     if not re.search(r"^\[image\]", text, re.MULTILINE):
         return None
@@ -152,7 +152,16 @@ def from_sections(text: str) -> list[dict[str, Any]] | None:
 
 
 def _camera(store: dict[str, Any], path: Path, side: str) -> tuple[np.ndarray, Size | None]:
-    """Projection matrix [3, 4] and size of a camera's images as they leave it: its region of interest, binned."""
+    """Return a camera's projection matrix [3, 4] and image size (None if not stated) after cropping to its ROI and binning.
+
+    Args:
+        store: Contents of the camera's file.
+        path: The file, for messages.
+        side: ``left`` or ``right``, for messages.
+
+    Raises:
+        RequestError: The matrix is missing, malformed or all zero, or a size is invalid.
+    """
     name = next((name for name in _MATRIX_NAMES if store.get(name) is not None), None)
     if name is None:
         raise RequestError(

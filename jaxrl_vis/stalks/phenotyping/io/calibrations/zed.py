@@ -1,4 +1,4 @@
-"""Calibrations of ZED cameras of Stereolabs: SN1234.conf, with the cameras as they are, at several sizes; millimetres."""
+"""Calibrations of Stereolabs ZED cameras: SN1234.conf, with unrectified cameras at several image sizes, in millimetres."""
 
 import configparser
 import math
@@ -28,15 +28,15 @@ def is_settings(text: str) -> bool:
 
 
 def read_settings(text: str, path: Path, size: Size | None) -> RawPair:
-    """The cameras at one size of images.
+    """Parse the cameras at one image size.
 
     Args:
         text: Contents of the file.
         path: The file, for messages.
-        size: Width and height of the images; None where they are not known, and the file holds but one size.
+        size: Width and height of the images; may be None if the file holds only one size.
 
     Raises:
-        RequestError: The size is not there, or something else is missing.
+        RequestError: The size is not in the file, or a value is missing or invalid.
     """
     settings = configparser.ConfigParser(interpolation=None, strict=False)
     try:

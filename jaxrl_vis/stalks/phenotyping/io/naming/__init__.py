@@ -1,1 +1,1 @@
-"""Names of files and folders: which camera they are of, and when an image was taken."""
+"""Camera side and time of an image from the names of files and folders."""

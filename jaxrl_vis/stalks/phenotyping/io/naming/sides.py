@@ -1,4 +1,4 @@
-"""Names that say which of two cameras something is of: left and right, L and R, cam0 and cam1, infra1 and infra2, ..."""
+"""Names that tell the camera of a stereo pair: left and right, L and R, cam0 and cam1, infra1 and infra2, ..."""
 
 import re
 from collections.abc import Iterator
@@ -15,11 +15,11 @@ _OTHER = {"left": "right", "right": "left", "l": "r", "r": "l"}
 
 
 def partners(name: str, files: bool = False) -> Iterator[tuple[Side, str]]:
-    """Sides that a name may say, each with the name that the other camera's would have; the likeliest first.
+    """Yield the possible sides of a name, each with the corresponding name of the other camera; the most likely first.
 
     Args:
-        name: Stem of a file, or name of a folder.
-        files: If true, the name is that of one image of many: only numbers of cameras and letters at its end are looked at.
+        name: Stem of a file, or name of a folder or topic.
+        files: If true, the name is that of one image of many: only camera numbers and a capital L or R after a letter count.
     """
     for pattern in (_LAST_LETTER,) if files else (_WORD, _LETTER, _LAST_LETTER):
         for match in reversed(list(pattern.finditer(name))):

@@ -1,4 +1,4 @@
-"""Times in names of files, as robots write them, and pairs of images whose times differ a little."""
+"""Timestamps in file names, and pairing of images whose times differ slightly."""
 
 import re
 import statistics
@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 _WHOLE = re.compile(r"(?:^|[^\d.])(\d{10}|\d{13}|\d{16}|\d{19})$")  # s, ms, us, ns since 1970
 _PARTS = re.compile(r"(?:^|[^\d.])(\d{1,10}\.\d{2,9})$")
-_SPLIT = re.compile(r"(?:^|[^\d.])(\d{10})[_-](\d{9})$")  # seconds and nanoseconds, as rosbag's tools part them
+_SPLIT = re.compile(r"(?:^|[^\d.])(\d{10})[_-](\d{9})$")  # seconds and nanoseconds, as separated by rosbag's tools
 _DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 
 
 def seconds_in(stem: str) -> float | None:
-    """Seconds that the stem of a file's name ends with; None where it does not say a time.
+    """Return the time in s at the end of a file name's stem; None if there is none.
 
-    Of seconds since 1970, a float64 keeps 0.2 microseconds.
+    A float64 resolves 0.2 microseconds of seconds since 1970.
     """
     split = _SPLIT.search(stem)
     if split is not None:
@@ -26,10 +26,13 @@ def seconds_in(stem: str) -> float | None:
 
 
 def nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, str]:
-    """Names on the left with those on the right whose time is nearest, where each is the other's nearest.
+    """Match left to right names by time: mutual nearest neighbours, at most half the median interval apart.
 
     Args:
-        left, right: Times by name, s. What is further apart than half of the usual interval on either side has no partner.
+        left, right: Times by name, s. The smaller of the median intervals of the two sides counts.
+
+    Returns:
+        Left name -> right name; names without a partner are missing.
     """
     if not left or not right:
         return {}
@@ -50,6 +53,6 @@ def _nearest_of(names: Mapping[str, float], others: Mapping[str, float]) -> dict
 
 
 def _interval(times: list[float]) -> float:
-    """The usual time between two images, s; a tenth of a second where there is but one."""
+    """Return the median interval between images, s; 0.1 s if there is only one."""
     ordered = sorted(times)
     return statistics.median(b - a for a, b in zip(ordered, ordered[1:])) if len(ordered) > 1 else 0.1

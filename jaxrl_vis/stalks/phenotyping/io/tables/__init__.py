@@ -1,1 +1,1 @@
-"""Tables from outside: odometries and plans of fields."""
+"""Input tables: odometry and field plans."""

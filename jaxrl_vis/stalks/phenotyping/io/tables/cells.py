@@ -1,4 +1,4 @@
-"""Tables as spreadsheets, robots and field programs save them: parted by commas, semicolons, tabs or spaces."""
+"""Parser of tables from spreadsheets, robots and field programs, separated by commas, semicolons, tabs or spaces."""
 
 import csv
 import io
@@ -11,14 +11,14 @@ from jaxrl_vis_envs.documents import read_bytes
 
 
 def read_table_text(path: Path, max_bytes: int) -> str:
-    """Text of a table.
+    """Read the text of a table.
 
     Raises:
-        RequestError: It cannot be read, is larger, or is neither UTF-8 nor UTF-16.
+        RequestError: The file cannot be read, is larger than ``max_bytes``, or is neither UTF-8 nor UTF-16.
     """
     try:
         data = read_bytes(path, max_bytes)
-        # Spreadsheets write a mark of the byte order before the first column's name.
+        # Spreadsheets write a byte order mark before the name of the first column.
         return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except OSError as error:
         raise RequestError(f"cannot read {path}: {error.strerror or error}") from error
@@ -29,19 +29,26 @@ def read_table_text(path: Path, max_bytes: int) -> str:
 
 
 def cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[str]]], bool]:
-    """Names of the columns; rows that are not empty, with the numbers of their lines; and whether commas are decimal points.
+    """Split a table into cells.
 
-    Lines before the table that begin with ``#`` are passed over, but for one that names the columns.
+    Lines that begin with ``#`` before the table are skipped, except one that names the columns.
+
+    Args:
+        path: The file, for messages.
+        text: Its contents.
+
+    Returns:
+        Names of the columns; the non-empty rows with their line numbers; and whether commas in numbers are decimal separators.
 
     Raises:
-        RequestError: The text is no table.
+        RequestError: The text is not a table.
     """
     lines = text.splitlines()
     first = next((place for place, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), len(lines))
     comment = next((line.lstrip("# ") for line in reversed(lines[:first]) if line.strip(" #")), "")
     head = lines[first] if first < len(lines) else ""
     if re.match(r"\s*[-+.\d]", head) and comment:
-        first, head = first - 1, comment  # as in trajectories of TUM: the columns are named in a comment
+        first, head = first - 1, comment  # the columns are named in a comment, as in TUM trajectories
     counts = {mark: head.count(mark) for mark in ("\t", ";", ",")}
     mark = max(counts, key=lambda mark: counts[mark]) if any(counts.values()) else None
     if mark is None and len(head.split()) > 1 and "(" not in head and "[" not in head:

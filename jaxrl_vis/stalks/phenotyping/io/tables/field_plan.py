@@ -1,4 +1,4 @@
-"""Plans of fields: what is known of each plot (range, row, genotype, replicate, ...), from a CSV or an export of Field Book."""
+"""Field plans: metadata of each plot (range, row, genotype, replicate, ...) from a CSV or an export of Field Book."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -25,25 +25,27 @@ _IDS = (
     "plot_number",
     "plotnumber",
 )
-"""Columns that name plots, in small letters; the first that names plots of the run is taken."""
+"""Lower-case names of columns that may identify plots; the one that matches the most plots is used, the first of equals."""
 _SHOWN = 3
 _OBSERVED = {"trait", "uservalue", "value", "timetaken", "time_taken", "person", "location", "number", "rep_number", "photo"}
-"""Columns of Field Book's export of observations, one a row, that say nothing of the plot."""
+"""Columns of Field Book's export (one observation per row) that do not describe the plot."""
 
 
 def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[str, dict[str, str]]]:
-    """Read the plan of a field: the columns of a table, by plot.
+    """Read a field plan: the values of a table's columns, by plot.
 
     Args:
-        path: A CSV with a row for each plot, or, as Field Book exports observations, several that say the same of it.
-        plots: Names of the plots, which are ways in folders: the last part or all of one is what the table calls the plot, with
-            or without the word plot and zeros before its number; or it holds the numbers of its range and its row or column.
+        path: A CSV with one row per plot, or several consistent ones, as in Field Book's export of observations.
+        plots: Names of the plots (relative paths of folders). They are matched with identifiers in the table by whole name, by
+            last component, or by the last number in that, whichever works first; or else by the numbers of range and row or
+            column in them.
 
     Returns:
-        Names of the columns in their order, without the one that names plots; and by plot, the texts in them.
+        Names of the columns in order, without the identifier; and the values in them, by plot. Plots that are not in the table
+        are missing.
 
     Raises:
-        RequestError: The table cannot be read, names no plot of these, or says two things of one.
+        RequestError: The table cannot be read, names none of the plots, or has contradictory rows for one.
     """
     columns, rows, _ = cells(path, read_table_text(path, _MAX_BYTES))
     small = [name.lower().replace(" ", "_") for name in columns]
@@ -76,7 +78,12 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
 
 
 def _matched(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[int]]:
-    """Numbers of rows by the plot that they are of, by the first way of comparing names that tells the plots apart."""
+    """Return the row indices of each plot, by the first method of comparing names that matches and tells the plots apart.
+
+    Args:
+        names: Identifier in each row.
+        plots: Names of the plots.
+    """
     for way in (str, _last, _number):
         rows: dict[str, list[int]] = {}
         for number, name in enumerate(names):
@@ -93,13 +100,13 @@ def _last(name: str) -> str:
 
 
 def _number(name: str) -> str:
-    """The last number of a name of a plot, without zeros before it."""
+    """Return the last number in a plot's name, without leading zeros; empty if there is none."""
     found = re.findall(r"\d+", _last(name))
     return str(int(found[-1])) if found and len(found[-1]) < 20 else ""
 
 
 def _by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plots: Sequence[str]) -> dict[str, list[int]]:
-    """Numbers of rows by the plot whose name holds the numbers of its range and of its row or column."""
+    """Return the row indices of the plots whose names hold the numbers of their range and of their row or column."""
     places = {name: columns.index(name) for name in ("range", "row", "column", "col", "pass") if name in columns}
     across = [name for name in places if name != "range"]
     if "range" not in places or not across:
@@ -129,7 +136,7 @@ def _none_there(path: Path, columns: Sequence[str], names: Sequence[str], plots:
 
 
 def missing_plots(plan: Mapping[str, object], plots: Sequence[str]) -> str | None:
-    """A line that says which plots a plan does not name; None if there are none."""
+    """Return a line that lists the plots missing from a plan; None if there are none."""
     missing = [readable(plot) for plot in plots if plot not in plan]
     if not missing:
         return None

@@ -1,8 +1,8 @@
-"""Odometry of plots: how far the robot had driven at each pair, from tables, from what ROS prints, and from GPS.
+"""Odometry of plots: the distance driven at each pair, from tables, printed ROS messages or GPS fixes.
 
 odometry.csv     distance_m (_cm, _mm), or time_s (_ms, _us, _ns) with --speed, or positions (x, y), or latitude and longitude;
-                 with the name of the left image (left), or in order, or with the times that images have in their names
-odometry.txt     the same, parted by tabs, semicolons or spaces; or what rostopic echo or ros2 topic echo prints
+                 matched to the pairs by name of the left image (left), by order, or by timestamps in the image names
+odometry.txt     the same, separated by tabs, semicolons or spaces; or the output of rostopic echo or ros2 topic echo
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ _POSITIONS = (
 )
 _GLOBE = (("latitude", "longitude"), ("lat", "lon"), ("lat", "lng"), ("field.latitude", "field.longitude"))
 _EARTH = 6_371_000.0  # m, radius
-_MOST_SECONDS = 1e11  # of time_s: larger numbers are in another unit
+_MOST_SECONDS = 1e11  # maximum of time_s: larger numbers are in another unit
 _NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 _PRINTED_STAMP = re.compile(r"\bsecs?: *(\d{1,12})\s+n(?:ano)?secs?: *(\d{1,9})\b")
 _PRINTED_PLACE = re.compile(rf"\bposition:\s+x: *{_NUMBER}\s+y: *{_NUMBER}\s+z: *{_NUMBER}")
@@ -49,14 +49,14 @@ _PRINTED_GLOBE = re.compile(rf"\blatitude: *{_NUMBER}\s+longitude: *{_NUMBER}")
 
 @dataclasses.dataclass(frozen=True)
 class _Table:
-    """Odometry as a file holds it, one entry a row.
+    """Odometry as stored in a file, with one entry per row.
 
     Attributes:
         path: The file.
-        names: Names of left images; None where there is no such column.
-        times: Times, s from the first one; None where there are none.
-        start: The first of them, s.
-        distances: Distances, m; None where there are only times.
+        names: Names of left images; None if there is no such column.
+        times: Times relative to the first one, s; None if there are none, or if they are not needed.
+        start: The first time, s.
+        distances: Distances driven, m; None if there are only times.
     """
 
     path: Path
@@ -67,15 +67,15 @@ class _Table:
 
 
 def odometry_file(folder: Path) -> Path:
-    """The file with a plot's odometry, whether it is there or not."""
+    """Return the odometry file in a plot's folder; ``odometry.csv`` if there is none."""
     return next((folder / name for name in _NAMES if (folder / name).exists()), folder / _NAMES[0])
 
 
 def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[str, dict[str, float] | None]:
-    """Read the odometry of each plot with `read_odometry`: a dictionary by the plot's name.
+    """Read the odometry of each plot, by the plot's name, see `read_odometry`.
 
     Raises:
-        RequestError: A file cannot be used, or none of them needs the speed.
+        RequestError: A file cannot be used, or a speed is given but none of the files needs it.
     """
     tables = {plot.name: _read(odometry_file(plot.folder)) for plot in plots}
     if speed is not None and not any(table and table.distances is None for table in tables.values()):
@@ -84,11 +84,14 @@ def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[st
 
 
 def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
-    """Read the distance that the robot had driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
+    """Read the distance driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
 
     Args:
-        plot: With ``odometry.csv``, or a file of one of the other names.
-        speed: Speed of the robot, m/s: for files that hold times only.
+        plot: Plot, whose folder may hold ``odometry.csv`` or one of the alternatives, see `odometry_file`.
+        speed: Speed of the robot, m/s, for files that hold only times.
+
+    Returns:
+        Pair -> distance; pairs that no row matches are missing. None if there is no file, or only times but no speed.
 
     Raises:
         RequestError: The file cannot be read, states neither distances nor times, or its rows cannot be matched with the pairs.
@@ -97,12 +100,12 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
 
 
 def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
-    """Say in words what is missing to know the distance that the robot had driven; None if nothing is.
+    """Return a message that states why the distance driven is unknown; None if it is known.
 
     Args:
         plot: The plot.
         driven: Its odometry, from `read_odometry`.
-        pairs: Those of its pairs for which it must be known.
+        pairs: The pairs for which it must be known.
     """
     path = odometry_file(plot.folder)
     if driven is None:
@@ -137,7 +140,7 @@ def _of_pairs(plot: PlotFolder, table: _Table | None, speed: float | None) -> di
 
 
 def _by_name(plot: PlotFolder, names: list[str], values: np.ndarray) -> dict[str, float]:
-    """Distances of rows that name a left image, with its path or without, whatever the case, with what ends it or without."""
+    """Return the distances of rows that name a left image, with or without its path and suffix, in any case if unambiguous."""
     exact: dict[str, str] = {}
     loose: dict[str, set[str]] = {}
     for pair in plot.pairs:
@@ -157,7 +160,10 @@ def _by_name(plot: PlotFolder, names: list[str], values: np.ndarray) -> dict[str
 
 
 def _by_time(plot: PlotFolder, table: _Table, values: np.ndarray) -> dict[str, float] | None:
-    """Distances at the times that left images have in their names, between those of the rows; None where there are no times."""
+    """Interpolate distances at the timestamps in the names of the left images; None if there are none, or no usable times.
+
+    Images more than the median interval before the first or after the last row are left out.
+    """
     taken = {pair.name: seconds_in(readable(pair.left.stem)) for pair in plot.pairs if pair.left}
     times = table.times
     if times is None or len(times) < 2 or (np.diff(times) < 0).any() or not taken or None in taken.values():
@@ -169,10 +175,10 @@ def _by_time(plot: PlotFolder, table: _Table, values: np.ndarray) -> dict[str, f
 
 
 def _read(path: Path) -> _Table | None:
-    """The odometry of a file; None where there is no such file.
+    """Read the odometry in a file; return None if there is no such file.
 
     Raises:
-        RequestError: It cannot be read, or holds something else.
+        RequestError: The file cannot be read, or holds no odometry.
     """
     if not path.exists():
         return None
@@ -181,7 +187,11 @@ def _read(path: Path) -> _Table | None:
 
 
 def _printed(path: Path, text: str) -> _Table | None:
-    """Odometry, or fixes of GPS, as ROS prints them; None where the text is none."""
+    """Parse printed ROS messages with odometry or GPS fixes; return None if the text holds none.
+
+    Raises:
+        RequestError: A position is not finite.
+    """
     messages = re.split(r"^---\s*$", text, flags=re.MULTILINE)
     for pattern in (_PRINTED_PLACE, _PRINTED_GLOBE):
         found = [(_PRINTED_STAMP.search(message), pattern.search(message)) for message in messages]
@@ -199,7 +209,7 @@ def _printed(path: Path, text: str) -> _Table | None:
 
 
 def _tabled(path: Path, text: str) -> _Table:
-    """Odometry of a table.
+    """Parse odometry from a table.
 
     Raises:
         RequestError: A column or a number is missing.
@@ -237,7 +247,16 @@ def _time_column(columns: list[str]) -> int | None:
 
 
 def _seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, float]:
-    """Times from the first one on, and the first one, s."""
+    """Convert times to s; return them relative to the first one, and the first one.
+
+    Args:
+        values: Times, [N].
+        name: Name of their column, which may state the unit; otherwise it is inferred from the magnitude.
+        path: The file, for messages.
+
+    Raises:
+        RequestError: The name states s, but the numbers are too large for that.
+    """
     match = _TIME.fullmatch(name)
     largest = float(np.abs(values).max(initial=0.0))
     if match and match[1] == "s" and largest > _MOST_SECONDS:
@@ -254,13 +273,16 @@ def _seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, flo
 
 
 def _on_plane(degrees: np.ndarray) -> np.ndarray:
-    """Positions [N, 2], m, of latitudes and longitudes [N, 2]."""
+    """Project latitudes and longitudes [N, 2], degrees, to positions [N, 2] in m relative to the first one."""
     turned = np.radians(degrees - degrees[:1])
     return _EARTH * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
 
 
 def _along(places: np.ndarray) -> np.ndarray:
-    """Distances [N] along the straight line that positions [N, 2 or 3] follow: what they stray to its sides is no way."""
+    """Return distances [N] along the straight line fitted to positions [N, 2 or 3], from the first one; NaN if any is invalid.
+
+    Lateral deviations from the line do not count. The direction of travel is positive.
+    """
     if not np.isfinite(places).all() or np.abs(places).max(initial=0.0) > 1e9:
         return np.full(len(places), np.nan)
     centred = places - places.mean(axis=0)
