@@ -35,9 +35,9 @@ class _Nodes(NamedTuple):
 
 @jax.jit  # traced once for all programs that contain it
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute poses as `mjx.kinematics` does, in a fraction of the operations, and the poses of cameras on bodies.
+    """Compute poses as `mjx.kinematics` does, in a fraction of the operations, and also those of cameras on bodies.
 
-    Descendants of a mocap body move with it, as in MuJoCo (in MJX they stay). Models with ball joints are left to MJX.
+    Descendants of a mocap body move with it, as in MuJoCo (in MJX they do not). Models with ball joints are delegated to MJX.
     """
     if not np.isin(model.jnt_type, _SUPPORTED).all():
         return _place_cameras(model, mjx.kinematics(model, data))

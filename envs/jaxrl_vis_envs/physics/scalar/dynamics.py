@@ -186,7 +186,7 @@ class _LinkMotion:
         return _LinkMotion(add(spin, own), add(change, cross(spin, own)), lift)
 
     def wrench(self, link: Link) -> tuple[Vector, Vector]:
-        """Return the force, and the torque about the frame's origin, that this motion of the link requires."""
+        """Return the force, and the torque about the frame's origin, that produce this motion of the link."""
         moment, inertia = _vector(link.moment), _symmetric(link.inertia)
         force = add(scale(self._lift, link.mass), combine(self._acceleration_columns, moment))
         turning = add(symmetric_times(inertia, self._change), cross(self._spin, symmetric_times(inertia, self._spin)))

@@ -177,7 +177,7 @@ def _has_simple_equalities(model: mjx.Model) -> bool:
 
 
 def _has_joint_above(model: mjx.Model, bodies: tuple[int, int]) -> bool:
-    """Return True if joints move at least one of two bodies."""
+    """Return True if any joint moves at least one of two bodies."""
     for body in map(int, bodies):
         while body:
             if model.body_jntnum[body]:
@@ -219,7 +219,7 @@ def build_scalar_model(model: mjx.Model) -> ScalarModel:
 
 
 def _disabling(flag: mujoco.mjtDisableBit) -> int:
-    """Return the flags of which any disables a kind of constraint."""
+    """Return the mask of the flags each of which disables a kind of constraint."""
     return int(flag | _FLAG.mjDSBL_CONSTRAINT)
 
 
@@ -321,7 +321,7 @@ def _welds(model: mjx.Model, tree: list[Link], frames: list[FixedFrame]) -> list
 
 
 def fingerprint(part: Any) -> Hashable:
-    """Return the contents of a `ScalarModel` or of a part of it in hashable form, equal for equal contents."""
+    """Convert a `ScalarModel` or a part of it to a hashable value that is equal for equal contents."""
     if isinstance(part, np.ndarray):
         return part.shape, part.tobytes()
     if isinstance(part, dict):
@@ -330,9 +330,9 @@ def fingerprint(part: Any) -> Hashable:
 
 
 def base_link(constants: ScalarModel) -> int:
-    """Return the link in whose frame constraints are computed: the last one that carries all contacts, or the world.
+    """Return the link in whose frame constraints are computed: the last common ancestor of all contacts, or the world.
 
-    Friction has its axes, and mocap bodies and welds have their poses, in the world.
+    It is the world for models with friction, mocap bodies or welds, whose axes and poses are defined there.
     """
     if constants.welds or constants.mocaps or any(contact.cone or contact.pyramid for contact in constants.contacts):
         return WORLD
