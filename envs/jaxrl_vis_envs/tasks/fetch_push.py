@@ -182,7 +182,7 @@ class FetchPush(FetchArm):
         return self._draw is None or super().converts_goals
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
-        """Return the observation of the goal that the box in ``frame`` meets: the box there, and the arm at rest as in goal images.
+        """Return the goal observation that the box in ``frame`` meets: the box there, and the arm at rest as in goal images.
 
         A policy that observes states thus learns only where the box should be from a goal, as in the original.
         """

@@ -8,9 +8,9 @@ those here in the camera pose (``view``) and the fingertip markers (``tip_marks`
     VisualHandReach   observes RGB-D from above the palm; each fingertip has its own colour
     HandReach         observes joint angles and velocities, and fingertip positions
 
-State: positions in the world of the tips of the first, middle, ring and little finger and the thumb, m; the distance is over all
-15 coordinates. Action: a target angle for each of the 20 actuators, with -1 and 1 at the ends of its range. The distal joints of
-the four fingers have no actuator; a tendon couples each to the joint before it.
+State: positions in the world of the tips of the first, middle, ring and little finger and the thumb, m; the distance is that of
+all 15 coordinates. Action: a target angle for each of the 20 actuators, with -1 and 1 at the ends of its range. The distal
+joints of the four fingers have no actuator; a tendon couples each to the joint before it.
 """
 
 import dataclasses
