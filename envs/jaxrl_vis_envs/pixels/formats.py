@@ -107,5 +107,5 @@ joint positions, physics data or a state. None: no goal images."""
 
 
 def goal_poses(goal_image: GoalImage, state: Any) -> Any:
-    """Return the source of the goal's poses for an episode that starts in ``state``: ``goal_image`` or its result if callable."""
+    """Return the source of the goal's poses for an episode that starts in ``state``: ``goal_image``, or its result."""
     return goal_image(state) if callable(goal_image) else goal_image
