@@ -85,7 +85,7 @@ class GoalEnv(abc.ABC):
     metric_names: tuple[str, ...] = ("success", "goal_distance")  # keys of `State.metrics` logged at the last step, as means
     frame_stack: int = 1  # F, number of most recent images stacked in an observation
 
-    if not TYPE_CHECKING:  # hidden from type checkers, which would accept any attribute
+    if not TYPE_CHECKING:  # with this method, type checkers would accept any attribute
 
         def __getattr__(self, name: str) -> NoReturn:
             message = f"{type(self).__name__!r} object has no attribute {name!r}"

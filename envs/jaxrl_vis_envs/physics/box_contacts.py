@@ -16,7 +16,7 @@ from jaxrl_vis_envs.physics import rotations
 
 _CONTACTS = 4  # of a pair
 _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]], np.float32)
-_FAR = 1.0  # distance that stands for no contact, m
+_FAR = 1.0  # distance that represents no contact, m
 
 
 def supports(model: mjx.Model) -> bool:

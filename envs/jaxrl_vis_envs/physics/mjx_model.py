@@ -171,7 +171,7 @@ def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
 
     def stage(carry: tuple[mjx.Data, jax.Array, jax.Array], row: jax.Array) -> tuple[Any, None]:
         data, mean_velocity, mean_acceleration = carry
-        fraction, weight = row  # elapsed share of the step, and weight in the mean
+        fraction, weight = row  # elapsed fraction of the step, and weight in the mean
         velocity = start.qvel + fraction * timestep * data.qacc
         position = start.qpos + fraction * timestep * data.qvel
         data = data.replace(qpos=position, qvel=velocity, time=start.time + fraction * timestep)

@@ -1,7 +1,7 @@
 """Dynamics of a tree of links in scalars (`partial_arithmetic`): poses, mass matrix and bias forces.
 
 All quantities are expressed in the links' own frames (`links`), where joint axes and inertias are constants and most operations
-fold away. Float32 also loses the least precision there: nothing is a small difference of large numbers.
+fold away. This also minimizes the loss of precision in float32: no quantity is a small difference of large numbers.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms": recursive Newton-Euler, 5.3, and composite rigid bodies, 6.2.
 """

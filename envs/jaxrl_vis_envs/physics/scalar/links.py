@@ -15,7 +15,7 @@ import numpy as np
 from mujoco import mjx
 
 WORLD = -1
-"""Index of the fixed link. Mocap bodies, which stand still during a step, have indices below it (`mocap_link`)."""
+"""Index of the fixed link. Mocap bodies, which do not move during a step, have indices below it (`mocap_link`)."""
 _ROUNDING = 1e-9  # relative to the largest entry: smaller entries are rounding errors of zeros
 
 

@@ -59,7 +59,7 @@ class StepInputs(NamedTuple):
 
 
 class _ConstraintRow(NamedTuple):
-    """Row of a `scalar_newton.Problem`; ``max_friction`` is None except for dry friction."""
+    """Row of a `scalar_newton.Problem`, with its fields; ``max_friction`` is None except for dry friction."""
 
     entries: Row
     stiffness: Any

@@ -125,7 +125,7 @@ def drawing_order(mj_model: mujoco.MjModel, types: np.ndarray, ids: np.ndarray, 
     """Return the objects ``ids`` in the reverse of MuJoCo's drawing order. Of coincident objects, the one drawn last is
     visible.
 
-    MuJoCo draws objects in the order of declaration, except that the first reflecting one comes before all others, even if
+    MuJoCo draws objects in the order of declaration, except that the first reflecting one precedes all others, even if
     reflections are disabled. This exception does not apply to segmentation.
 
     Args:

@@ -19,7 +19,7 @@ NONE, FLAT, CUBE, UNWRAPPED = range(4)
 
 
 class Image(NamedTuple):
-    """Texture in the atlas: its first level, number of levels, and number of faces (1, or 6 of a cube)."""
+    """Texture in the atlas: index of its first level, number of levels, and number of faces (6 for a cube map, else 1)."""
 
     first_level: int
     levels: int

@@ -18,7 +18,21 @@ COLUMNS = 20
 
 
 class Light(NamedTuple):
-    """Light in the camera's frame. Vectors are arrays [3] or three scalars; all other values are scalars."""
+    """Light in the camera's frame. Vectors are arrays [3] or three scalars; all other values are scalars.
+
+    Attributes:
+        directional: True for a directional light.
+        highlights: True if the light can cause specular highlights.
+        shadows: True if the light casts shadows.
+        position: Position, m; None for a directional light.
+        direction: Unit vector along which the light shines.
+        ambient: Ambient colour.
+        diffuse: Diffuse colour.
+        specular: Specular colour.
+        attenuation: Constant, linear (1/m) and quadratic (1/m^2) attenuation; None for a directional light.
+        cosine_cutoff: Cosine of the cone's half-angle; None except for a spot light.
+        exponent: Exponent of the falloff from the cone's axis; None except for a spot light.
+    """
 
     directional: bool
     highlights: bool
@@ -85,7 +99,7 @@ def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_ro
 
 
 class LightFacts(NamedTuple):
-    """Static properties of a light."""
+    """Static properties of a light: three as in `Light`, and ``cone``, True for a spot light."""
 
     directional: bool
     highlights: bool
