@@ -79,7 +79,7 @@ class GoalEnv(abc.ABC):
     distance_unit: str = "m"
     control_period: float  # simulated seconds of one control step
     action_meaning: str = ""  # meaning and units of an action's components, for builders of the real robot
-    # Difficulty of the task before learning, measured by benchmarks/tasks/task_difficulty.py; None: not measured.
+    # Difficulty of the task before learning, measured by benchmarks/tasks/task_difficulty.py; None if not measured.
     chance: float | None = None  # success rate of uniformly random actions
     difficulty: float | None = None  # mean distance from start to goal, in multiples of `threshold`
     metric_names: tuple[str, ...] = ("success", "goal_distance")  # keys of `State.metrics` logged at the last step, as means

@@ -25,7 +25,7 @@ class Format:
             [H, W, C], the channels of all images in order, then those of all goal images.
         dtype: ``float32``: colours from 0 to 1. ``uint8``: colours from 0 to 255. Depths follow if there is a
             ``depth_range``.
-        depth_range: Depths (m) encoded as the ends of the dtype's range, linear in between. None: depths in m, float32.
+        depth_range: Depths (m) encoded as the ends of the dtype's range, linear in between. If None, depths are in m, float32.
     """
 
     layout: Layout = "dict"
@@ -103,7 +103,7 @@ def _name(camera: str, output: str) -> str:
 
 GoalImage = Callable[[Any], Any] | jax.Array | np.ndarray | None
 """Source of goal images: joint positions [nq], or a function from the state after a reset (on the host: the environment) to
-joint positions, physics data or a state. None: no goal images."""
+joint positions, physics data or a state; None for no goal images."""
 
 
 def goal_poses(goal_image: GoalImage, state: Any) -> Any:

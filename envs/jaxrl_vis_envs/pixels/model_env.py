@@ -19,7 +19,8 @@ class ModelEnv:
 
     Args:
         mj_model: MuJoCo model. Episodes start from its initial configuration, at rest.
-        step: Function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. None: one `mjx.step` with the action as ``ctrl``.
+        step: Function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. If None, one `mjx.step` with the action as
+            ``ctrl``.
 
     Attributes:
         mj_model: The model.

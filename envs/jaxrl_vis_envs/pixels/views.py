@@ -29,11 +29,11 @@ class Views:
 
     Args:
         mj_model: MuJoCo model.
-        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name. None: MuJoCo's free camera.
+        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name; MuJoCo's free camera if None.
         image_size: Height and width in pixels: one number, a pair, or a dictionary of these by camera.
         outputs: One `Output`, several, or a dictionary of these by camera.
-        clip_range: Near and far clipping planes (m), or a dictionary of these by camera. None: those of the model. The far
-            plane is also the depth of the sky.
+        clip_range: Near and far clipping planes (m), or a dictionary of these by camera; the model's if None. The far plane is
+            also the depth of the sky.
         **scene_options: Further options of `Scene.from_mjmodel`, such as ``groups`` or ``shadows``.
 
     Attributes:

@@ -46,7 +46,7 @@ def wrap(
         env: An environment of brax (any of its physics engines) or of MuJoCo Playground, or any other with pure functions
             ``reset(key)`` and ``step(state, action)`` and a model; a `mujoco.MjModel`; or a Gymnasium environment of MuJoCo,
             which stays on the host.
-        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name. None: MuJoCo's free camera.
+        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name; MuJoCo's free camera if None.
         image_size: Height and width in pixels: one number, a pair, or a dictionary of these by camera.
         outputs: ``rgb``, ``depth``, ``segmentation`` (geom ids), ``bodies`` (body ids), ``normals``: one or several, or a
             dictionary of these by camera. See `Views`.
@@ -57,12 +57,12 @@ def wrap(
             shows positions, several show velocities. A reset repeats its image. Goals have one image.
         layout: ``dict``: the own observation (as ``state``, if it is an array) and the images ``pixels/CAMERA`` (colours),
             ``pixels/CAMERA/OUTPUT`` and, for goals, ``.../goal``. ``images``: only the images. ``image``: one array [H, W, C].
-        dtype: ``float32`` (colours from 0 to 1, as brax's agents take them) or ``uint8``. None: uint8 for Gymnasium, else
+        dtype: ``float32`` (colours from 0 to 1, as brax's agents expect them) or ``uint8``. If None, uint8 for Gymnasium, else
             float32.
-        depth_range: Depths (m) encoded as the ends of the dtype's range. None: depths in m, float32.
-        clip_range: Near and far clipping planes of the cameras (m), or a dictionary of these by camera. None: the model's.
-        step: For a `mujoco.MjModel`: function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. None: one `mjx.step` with
-            the action as ``ctrl``.
+        depth_range: Depths (m) encoded as the ends of the dtype's range. If None, depths are in m, float32.
+        clip_range: Near and far clipping planes of the cameras (m), or a dictionary of these by camera; the model's if None.
+        step: For a `mujoco.MjModel`, function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. If None, one `mjx.step`
+            with the action as ``ctrl``.
         **scene_options: Further options of `jaxrl_vis_envs.render.Scene.from_mjmodel`.
 
     Returns:

@@ -195,13 +195,14 @@ class Scene:
 
         Args:
             mj_model: MuJoCo model.
-            camera: Name or index of one of the model's cameras. None: the free camera of `mujoco.Renderer`, which views the
-                whole model from outside. Or an `mujoco.MjvCamera` with its own ``lookat``, ``distance``, ``azimuth`` and
+            camera: Name or index of one of the model's cameras; None for the free camera of `mujoco.Renderer`, which views the
+                whole model from outside; or a `mujoco.MjvCamera` with its own ``lookat``, ``distance``, ``azimuth`` and
                 ``elevation``. A free camera does not move.
             height: Image height in pixels.
             width: Image width in pixels.
             groups: Visible geom groups (default as in `mujoco.Renderer`).
-            site_groups: Visible site groups. None by default, unlike in `mujoco.Renderer`: sites are markers for users.
+            site_groups: Visible site groups; by default no group, unlike in `mujoco.Renderer`, because sites are markers for
+                users.
             tendon_groups: Visible groups of spatial tendons (default as in `mujoco.Renderer`).
             textured: Render textures. If False, which is cheaper, an object has its texture's mean colour, and the sky is a
                 gradient between its colours at the zenith and the nadir.
@@ -209,9 +210,9 @@ class Scene:
                 model.
             shadows: Render hard shadows of the lights that cast shadows in the model: one more ray per light.
             haze: Render haze at the horizon of the first infinite plane, as in the model's visual settings.
-            plane_backs: True: planes are partly transparent from behind, as in MuJoCo. False: they look the same from both
-                sides, which is cheaper. None: planes that the camera is behind in the model's initial pose are transparent,
-                which is correct unless camera and plane pass each other.
+            plane_backs: If True, planes are partly transparent from behind, as in MuJoCo. If False, they look the same from
+                both sides, which is cheaper. If None, only planes that the camera is behind in the model's initial pose are
+                transparent, which is correct unless camera and plane pass each other.
             leave_out: Names of geoms not to render; "skin" and "flex" stand for all skins or flexes.
             lights: "all": all lights except image lights, which MuJoCo ignores too. "mujoco": point lights, which MuJoCo's
                 renderer does not support, are also excluded, to reproduce its images.

@@ -30,7 +30,7 @@ class MjxGoalEnv(GoalEnv):
 
     camera: str  # model camera of the visual task, unless `select_camera` is overridden
     goal_box: tuple[np.ndarray, np.ndarray] | None = (
-        None  # corners [3] of the goals of `goal_configuration`, m; None: it has none
+        None  # lower and upper corner [3] of the goals of `goal_configuration`, m in the world; None without that method
     )
     exact_contacts: bool = False  # take physics steps with ``exact`` (see `mjx_model.step`)
 

@@ -42,7 +42,7 @@ class ReacherConfig(TaskConfig):
     velocity_scale: float = 10.0
     """Joint velocity of an action of 1 under velocity control, rad/s (one control step then turns the joint by .95 rad)."""
     substeps: int | None = None
-    """Physics steps of 10 ms in a control step. None: 10 under velocity control, 2 under torque control."""
+    """Physics steps of 10 ms per control step; if None, 10 under velocity control and 2 under torque control."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -391,7 +391,7 @@ def fingerprint(part: Any) -> Hashable:
 def base_link(constants: ScalarModel) -> int:
     """Return the link in whose frame constraints are computed: the last common ancestor of all contacts, or the world.
 
-    It is the world for models with friction, mocap bodies or welds, whose axes and poses are defined there.
+    It is the world for models with contact friction, mocap bodies or welds, whose axes and poses are defined there.
     """
     if constants.welds or constants.mocaps or any(contact.cone or contact.pyramid for contact in constants.contacts):
         return WORLD

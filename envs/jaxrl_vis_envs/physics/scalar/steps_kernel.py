@@ -42,7 +42,8 @@ def simulate(
         applied: [N].
         timestep: Time step, s.
         count: Number of physics steps.
-        exact: True or False for a kernel that can take exact steps (see `steps.simulate`), None for a smaller one that cannot.
+        exact: True to take exact steps (see `steps.simulate`), False not to, with the same kernel; None for a smaller kernel
+            that cannot.
         mocap: [M, 7], one row for each of ``constants.mocaps``.
         interpret: Run the kernel without a GPU, slowly.
 
