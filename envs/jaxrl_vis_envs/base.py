@@ -38,13 +38,13 @@ class State:
         goal_state: [G] float32, value of that quantity in the goal image. Neither is shown to the agent.
         reward: [] float32, `goals.oracle_reward` of the two.
         done: [] float32, always 0: all episodes have the same length, and their end is a truncation.
-        metrics: ``success`` ([] float32, 0 or 1), ``goal_distance`` ([] float32, unit of the state), and what else `GoalEnv`
-            says in ``metric_names``.
+        metrics: ``success`` ([] float32, 0 or 1), ``goal_distance`` ([] float32, unit of the state), and any others listed in
+            `GoalEnv.metric_names`.
         obs: ``observation`` from `GoalEnv.observe`, ``achieved_goal`` and ``desired_goal`` in the form of `GoalEnv.as_goal`;
             None if the caller asked for no images (`GoalEnv.advance` passes it through unchanged).
         history: [F - 1, nq] float32, joint positions one, two, ... control steps ago, if an observation stacks F > 1 images;
-            else None. Before the first step, the robot counts as having been at rest.
-        domain: Domain randomisation drawn for this episode (see `randomization`); None if it is off.
+            else None. The robot is assumed to have been at rest before the first step.
+        domain: Domain randomisation sampled for this episode (see `randomization`); None if it is off.
     """
 
     data: Any
@@ -78,14 +78,14 @@ class GoalEnv(abc.ABC):
     threshold: float  # an episode succeeds if goal_distance <= threshold, in `distance_unit`
     distance_unit: str = "m"
     control_period: float  # simulated seconds of one control step
-    action_meaning: str = ""  # of the components of an action, with units, for whoever builds the robot
-    # Difficulty of the task before learning, measured by benchmarks/tasks/task_difficulty.py; None: not measured.
+    action_meaning: str = ""  # meaning and units of an action's components, for builders of the real robot
+    # Difficulty of the task before learning, measured by benchmarks/tasks/task_difficulty.py; None if not measured.
     chance: float | None = None  # success rate of uniformly random actions
     difficulty: float | None = None  # mean distance from start to goal, in multiples of `threshold`
-    metric_names: tuple[str, ...] = ("success", "goal_distance")  # of `State.metrics` whose means at the last step are logged
+    metric_names: tuple[str, ...] = ("success", "goal_distance")  # keys of `State.metrics` logged at the last step, as means
     frame_stack: int = 1  # F, number of most recent images stacked in an observation
 
-    if not TYPE_CHECKING:  # hidden from type checkers, which would accept any attribute
+    if not TYPE_CHECKING:  # with this method, type checkers would accept any attribute
 
         def __getattr__(self, name: str) -> NoReturn:
             message = f"{type(self).__name__!r} object has no attribute {name!r}"
@@ -123,7 +123,7 @@ class GoalEnv(abc.ABC):
 
     @property
     def converts_goals(self) -> bool:
-        """Return True if `as_goal` changes observations: they stack images, or show more than a goal is about."""
+        """Return True if `as_goal` changes observations: if they stack images, or contain more than the goal constrains."""
         return self.frame_stack > 1
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
@@ -136,7 +136,7 @@ class GoalEnv(abc.ABC):
         return jnp.tile(frame[: frame.shape[0] // self.frame_stack], (self.frame_stack, 1, 1))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advance and observe: the convenient choice if every step's image is needed.
+        """Advance and observe; convenient if the image of every step is needed.
 
         Raises:
             ValueError: ``action`` does not have the shape [A].

@@ -1,4 +1,4 @@
-"""Validation of configuration values. Errors are one line: the field, its allowed values and the actual one. Imports no JAX."""
+"""Validation of configuration values. Errors are one line: the field, its allowed values and its value. Imports no JAX."""
 
 import dataclasses
 import math
@@ -67,5 +67,5 @@ def vector(config: Any, field: str, size: int) -> Sequence[float]:
 
 
 def is_finite(value: Any) -> bool:
-    """Return True if ``value`` is a real, finite number; bools are not."""
+    """Return True if ``value`` is a real, finite number and not a bool."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -11,15 +11,15 @@ from xml.etree import ElementTree
 MAX_BYTES = 100_000_000
 """Default size limit of a text file."""
 MAX_DEPTH = 100
-"""Limit on nesting: deeper documents are malicious or broken."""
-_MAX_DOTS = 200  # in a line of TOML; parsing a dotted key of n parts takes O(n^2) time
+"""Maximum nesting depth: deeper documents are malicious or broken."""
+_MAX_DOTS = 200  # per line of TOML; parsing a dotted key of n parts takes O(n^2) time
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     """Read a file of at most ``max_bytes`` bytes.
 
     Raises:
-        OSError: It cannot be read or is not a regular file.
+        OSError: The file cannot be read or is not a regular file.
         ValueError: It is larger. The message is a predicate, to be appended to the file's name.
     """
     # Opened without blocking: opening a pipe without a writer would never return.
@@ -38,7 +38,7 @@ def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
     """Read a file of at most ``max_bytes`` bytes of UTF-8, without a byte order mark.
 
     Raises:
-        OSError: It cannot be read or is not a regular file.
+        OSError: The file cannot be read or is not a regular file.
         ValueError: It is larger or not UTF-8. The message is a predicate, to be appended to the file's name.
     """
     try:
@@ -51,7 +51,7 @@ def read_json(path: Path, max_bytes: int = MAX_BYTES) -> Any:
     """Read a JSON file of at most ``max_bytes`` bytes.
 
     Raises:
-        OSError: It cannot be read or is not a regular file.
+        OSError: The file cannot be read or is not a regular file.
         ValueError: It is larger, not JSON, or nested deeper than `MAX_DEPTH`.
     """
     return parse_json(read_text(path, max_bytes))
@@ -100,7 +100,7 @@ def parse_xml(text: str | bytes) -> ElementTree.Element:
     """Parse XML and return the root element.
 
     Raises:
-        ValueError: It is not XML, nested deeper than `MAX_DEPTH`, or declares a document type (as any with entities does).
+        ValueError: It is not XML, is nested deeper than `MAX_DEPTH`, or declares a document type, as any with entities does.
     """
     parser = ElementTree.XMLParser(target=_Builder())
     try:

@@ -3,7 +3,7 @@
 There are two rewards. The *oracle* compares true states within a threshold (thesis, equation 5.6). The *indicator* is positive
 only if the observation equals the goal in every element (thesis, equation 5.4), so it needs no state estimate and has no false
 positives. Arrays may have any leading batch axes; only the axes of one goal are reduced. NumPy arrays are scored with NumPy, so
-that a learner on the host (see `adapters`) pays for no transfer and no compilation.
+that a learner on the host (see `adapters`) needs neither transfers nor compilation.
 """
 
 from typing import Any
@@ -51,8 +51,8 @@ def oracle_reward(
         achieved_state: [..., G] float32, the achieved state.
         goal_state: [..., G] float32, the desired state, in the same unit.
         threshold: Distance up to which the goal counts as reached, in that unit.
-        positive: R+.
-        negative: R-.
+        positive: Reward at the goal (R+).
+        negative: Reward elsewhere (R-).
     """
     is_reached = goal_distance(achieved_state, goal_state) <= threshold
     return _namespace(achieved_state, goal_state).where(is_reached, positive, negative).astype(jnp.float32)
@@ -67,13 +67,13 @@ def indicator_reward(
     tolerance: float = 0.0,
     share: float = 1.0,
 ) -> jax.Array:
-    """Compute the indicator reward (thesis, equation 5.4): ``positive`` where all elements of observation and goal are equal.
+    """Compute the indicator reward (thesis, equation 5.4): ``positive`` if observation and goal are equal, else ``negative``.
 
     Args:
         observation: [..., C, H, W] uint8 images or [..., S] float32 state vectors that were achieved.
         goal: Goals, of the same shape and dtype.
-        positive: R+.
-        negative: R-.
+        positive: Reward if they are equal (R+).
+        negative: Reward otherwise (R-).
         num_axes: Number of axes of one observation: 3 for images, 1 for state vectors.
         tolerance: Difference up to which two elements count as equal, in their unit (grey levels for images).
         share: Fraction of the elements that must be equal.
@@ -87,6 +87,6 @@ def indicator_reward(
         equal = numpy.all(observation == goal, axis=axes)
     else:
         difference = numpy.abs(observation.astype(numpy.float32) - goal.astype(numpy.float32))
-        allowed = int((1.0 - share) * np.prod(goal.shape[-num_axes:]) + 1e-6)  # a share of 0.99 is not exact
+        allowed = int((1.0 - share) * np.prod(goal.shape[-num_axes:]) + 1e-6)  # 0.99 has no exact binary representation
         equal = numpy.sum(difference > tolerance, axis=axes) <= allowed
     return numpy.where(equal, positive, negative).astype(jnp.float32)

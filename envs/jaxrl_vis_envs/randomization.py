@@ -7,9 +7,9 @@
     observe   renders a scene with those leaves changed; goal images have the appearance of their episode
     advance   steps a model with those leaves changed
 
-Only numerical values vary, so one compiled program serves them all, and under `jax.vmap` each environment has its own. The GPU
-kernel of the renderer takes each of these leaves as an input, so it renders varied scenes too. Inactive deviations are neither
-sampled, stored nor computed: with all of them off, the program is the one without randomisation.
+Only numerical values vary, so all episodes share one compiled program, and under `jax.vmap` each environment has its own. The
+GPU kernel of the renderer takes each of these leaves as an input, so it renders varied scenes too. Inactive deviations are
+neither sampled, stored nor computed: if all of them are off, the program is the same as without randomisation.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from jaxrl_vis_envs.render import Scene
 Domain = dict[str, jax.Array]
 """Deviations of one episode, float32, by the name of their range in `Randomization`; only the active ones."""
 
-# Folded into an episode's key. Large, because folding in small numbers gives the keys that `jax.random.split` returns.
+# Folded into an episode's key. It is large, because folding in small numbers gives the keys that `jax.random.split` returns.
 _TAG = 0x646F6D61
 
 _ABSOLUTE = ("camera_position", "camera_orientation", "light_position", "light_direction", "colour")
@@ -38,7 +38,7 @@ class Randomization:
     Ranges described as fractions scale a value by 1 plus the deviation, and must be less than 1.
 
     Raises:
-        ValueError: A range is not a number, negative or not finite, or a fraction is 1 or more.
+        ValueError: A range is not a finite number of at least 0, or a fraction is 1 or more.
     """
 
     camera_position: float = 0.0
@@ -132,10 +132,10 @@ def sample(key: jax.Array, ranges: Randomization, model: Any, action_size: int, 
     """Sample the deviations of one episode.
 
     Args:
-        key: Typed key of the episode, []; the deviations are independent of other samples drawn from it.
+        key: Typed key of the episode, []; the deviations are independent of other samples from it.
         ranges: Ranges of the deviations.
         model: The `mjx.Model`.
-        action_size: A.
+        action_size: Number A of components of an action.
         scene: Scene that images are rendered from; None for a task without images, whose ``ranges`` must not vary appearance.
 
     Returns:
@@ -176,7 +176,7 @@ def varied_scene(scene: Scene, domain: Domain | None) -> Scene:
     if "camera_orientation" in domain:
         changes["camera_turn"] = scene.camera_turn + domain["camera_orientation"]
     if "camera_fovy" in domain:
-        # The field of view is widened by its angle or, for a camera with a sensor, by the sensor's size.
+        # The field of view is scaled by its angle or, for a camera with a sensor, by the sensor's size.
         factor = 1.0 + domain["camera_fovy"]
         changes |= {"fovy": scene.fovy * factor, "sensor": scene.sensor * factor}
     if "light_position" in domain:

@@ -37,11 +37,11 @@ _ENTRIES: dict[str, _Entry] = {}
 
 
 class UnknownEnvironmentError(ValueError):
-    """No environment has that name."""
+    """Error for an environment name that does not exist."""
 
 
 class UnknownOverrideError(ValueError):
-    """The environment's configuration has no field of that name."""
+    """Error for an override that is not a field of the environment's configuration."""
 
 
 def register(name: str, factory: Callable[[Any], GoalEnv], config_class: type, state_variant: str | None = None) -> None:
@@ -49,14 +49,14 @@ def register(name: str, factory: Callable[[Any], GoalEnv], config_class: type, s
 
     Args:
         name: Name for `make`.
-        factory: Builds the environment from an instance of ``config_class``.
+        factory: Function that builds the environment from an instance of ``config_class``.
         config_class: Frozen dataclass whose fields all have defaults; they are the overrides that `make` accepts. An
             environment that observes images has a field ``image_size`` (see `pixels.PixelsConfig`).
         state_variant: Name of the environment with the same physics that observes the state, if there is one.
 
     Raises:
-        ValueError: The name belongs to another factory or is not a word, ``factory`` is not callable, or ``config_class`` is
-            not such a dataclass.
+        ValueError: The name is registered with another factory or is not a word, ``factory`` is not callable, or
+            ``config_class`` is not such a dataclass.
     """
     if not isinstance(name, str) or not name or task_modules.is_own(name):
         raise ValueError(f"the name of an environment must be a word without a colon, such as 'MyReach', got {name!r}")
@@ -137,14 +137,14 @@ def visual_variant(name: str) -> str | None:
 
 
 def load(name: str, folder: str | None = None) -> str | None:
-    """Import the module of an environment and return its folder, so that it can be found again from another one.
+    """Import the module of an environment and return its folder, so that it can be found again from another working directory.
 
     Args:
         name: Name of an environment.
-        folder: For ``module:Name``, the folder the module was imported from before, searched before the current folder.
+        folder: For ``module:Name``, folder from which the module was imported earlier, searched before the current folder.
 
     Returns:
-        The folder that must be on Python's path for the module of ``module:Name``; None for an installed module, and for all
+        Folder that must be on Python's path to import the module of ``module:Name``; None for an installed module, and for all
         other names.
 
     Raises:

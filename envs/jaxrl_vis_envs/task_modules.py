@@ -22,7 +22,7 @@ GROUP = "jaxrl_vis.environments"
 
 
 class TaskModuleError(ValueError):
-    """A task's module is missing or cannot be imported. The message is one line with the problem and its remedy."""
+    """Error for a task's module that is missing or cannot be imported. Its message is one line with the problem and a hint."""
 
 
 def is_own(name: str) -> bool:
@@ -60,11 +60,11 @@ def entry_points() -> dict[str, list[importlib.metadata.EntryPoint]]:
 def load(module: str, folder: str | None = None, installed: bool = False) -> ModuleType:
     """Import a module of tasks from ``folder``, else from the current folder, else from Python's path.
 
-    The folder that contains the module stays on Python's path for its later imports.
+    The folder that contains the module is added to Python's path, for later imports by the module.
 
     Args:
         module: Name of the module, dotted if it is in a package.
-        folder: Folder that contained it before; it may no longer exist.
+        folder: Folder from which it was imported earlier; it may no longer exist. None if unknown.
         installed: Search only Python's path.
 
     Raises:
@@ -88,8 +88,9 @@ def find(module: str, folder: str | None = None) -> Path | None:
     """Return the file that `load` would import first, without importing anything; None if there is none.
 
     Args:
-        module: Name of the module, dotted if it is in a package. For an installed package, the result is the package's file.
-        folder: Folder that contained it before; it may no longer exist.
+        module: Name of the module, dotted if it is in a package. For a module in an installed package, the result is the file
+            of the package.
+        folder: Folder from which it was imported earlier; it may no longer exist. None if unknown.
     """
     for candidate in (folder, "."):
         if candidate is not None and (file := _file_in(Path(candidate).resolve(), module)) is not None:
@@ -148,7 +149,7 @@ def _not_found(module: str, folder: str | None) -> str:
 
 
 def _file_in(folder: Path, module: str) -> Path | None:
-    """Return the file of a module, if ``folder`` were on Python's path; None if it is not there."""
+    """Return the file that ``module`` has if ``folder`` is on Python's path; None if the folder does not contain it."""
     path = folder.joinpath(*module.split("."))
     return next((file for file in (path / "__init__.py", path.with_name(f"{path.name}.py")) if file.is_file()), None)
 

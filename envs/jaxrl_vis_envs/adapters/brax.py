@@ -10,10 +10,10 @@
 `BraxEnv` never sets ``done``: brax's EpisodeWrapper, configured with ``episode_length``, ends episodes and marks them as
 truncated.
 
-Two properties of brax matter here. Its AutoResetWrapper restarts every episode of an environment from that environment's first
+Two properties of brax matter here. Its AutoResetWrapper restarts all episodes of an environment from the start of its first
 one, with the same goal: use many environments, or set ``num_resets_per_eval``. And it compiles without the option that physics
-needs on a CPU with JAX 0.10 (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`` before JAX
-starts.
+needs on a CPU with JAX 0.10 (see `compilation`): there, set ``XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`` before JAX is
+initialised.
 """
 
 import contextlib
@@ -44,8 +44,8 @@ class BraxEnv(Env):
 
     Args:
         env: Name of an environment, or a `GoalEnv`.
-        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (negative distance to the goal). Without goal relabelling,
-            which brax's agents do not do, little is learned from ``oracle`` alone.
+        reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (negative distance to the goal). Brax's agents do not
+            relabel goals, and learn little from ``oracle`` without that.
         **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
     Raises:
@@ -69,7 +69,7 @@ class BraxEnv(Env):
         return BraxState(physics, self._observe(episode), self._reward(episode), jnp.zeros(()), dict(episode.metrics))
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
-        """Step with ``action`` [A] in [-1, 1]. ``done`` stays 0, ``info`` is passed on.
+        """Step with ``action`` [A] in [-1, 1]. ``done`` stays 0, and ``info`` is passed through.
 
         ``metrics`` are ``success`` (0 or 1) and ``goal_distance`` (unit of the task). Brax's evaluation sums them over an
         episode.
@@ -91,7 +91,7 @@ class BraxEnv(Env):
 
     @property
     def observation_size(self) -> Any:
-        """Size 2 S of an observation, or for images the shape of each key."""
+        """Size 2 S of an observation or, for images, the shape by key."""
         shape = self.goal_env.observation_spec.shape
         if not self._sees_images:
             return 2 * shape[0]

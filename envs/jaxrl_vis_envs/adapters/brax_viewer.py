@@ -1,7 +1,7 @@
 """Web page that replays body trajectories in brax's interactive 3-D viewer.
 
-The page contains the bodies and their motion. The viewer itself is fetched from public servers when the page is opened, as in
-brax's own pages: without a network, the page stays empty.
+The page contains the bodies and their motion. The viewer itself is downloaded from public servers when the page is opened, as
+in brax's own pages: without a network, the page stays empty.
 """
 
 import json
@@ -26,7 +26,7 @@ _SHAPES = {
     mujoco.mjtGeom.mjGEOM_MESH: "Mesh",
 }
 _GOAL_COLOUR = (0.24, 0.81, 0.56)
-_GOAL_THICKNESS = 0.8  # relative to the robot's, so that at the goal the robot covers its goal
+_GOAL_THICKNESS = 0.8  # relative to the robot's, so that a robot at the goal occludes it
 _VISIBLE_GROUPS = 3  # as in MuJoCo's viewers, geoms of groups 3 and up are for collisions
 _VIEW_SIZE = 5.0  # the viewer's camera is 10 units away, with its near plane at .1
 
@@ -55,18 +55,18 @@ class Poses(NamedTuple):
 
 
 def viewer_page(mj_model: mujoco.MjModel, poses: Poses, goals: Poses, seconds: float) -> str:
-    """Return a page that replays T instants of a robot and of its goal, shown as a thinner robot in green.
+    """Return a page that replays T time steps of a robot and of its goal, shown as a thinner, green robot.
 
     The scene is translated and scaled to fit the viewer's camera, so the page's coordinates are not in metres.
 
     Args:
         mj_model: Model with B bodies.
         poses: Poses of the robot, [T, B, ...].
-        goals: Poses of the robot at its goal at these instants, [T, B, ...].
-        seconds: Time between instants, s.
+        goals: Poses of the robot at its goal at the same time steps, [T, B, ...].
+        seconds: Duration of a time step, s.
 
     Returns:
-        HTML.
+        The page as HTML.
     """
     scale = _VIEW_SIZE / float(mj_model.stat.extent)
     links: dict[str, list[dict[str, Any]]] = {}
@@ -112,7 +112,7 @@ def _geoms(mj_model: mujoco.MjModel, body: int, scale: float, is_goal: bool = Fa
         size = scale * mj_model.geom_size[geom].astype(float)
         if shape == mujoco.mjtGeom.mjGEOM_PLANE:
             size *= 2  # the viewer expects full side lengths
-        # Capsules keep their length, so that the goal's links still meet.
+        # Capsules and cylinders keep their length, so that the goal's links stay connected.
         thick = slice(0, 1) if shape in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER) else slice(None)
         factor = _GOAL_THICKNESS if is_goal else 1.0
         size[thick] *= factor

@@ -50,8 +50,8 @@ class GymnasiumEnv(gymnasium.Env):
     Args:
         env: Name of an environment, or a `GoalEnv`.
         reward: ``oracle`` (0 at the goal, -1 elsewhere) or ``dense`` (negative distance to the goal).
-        render_mode: None, or ``rgb_array`` for images from the task's camera, also for state tasks; with the appearance of the
-            episode if that is randomised.
+        render_mode: ``rgb_array`` for images from the task's camera, also for state tasks, with the episode's appearance if it
+            is randomised; None for no images.
         render_size: Height and width of images from `render`, px; independent of ``pixels``.
         **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
@@ -157,7 +157,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
     Args:
         env: Name of an environment, or a `GoalEnv`.
-        num_envs: N.
+        num_envs: Number N of environments.
         reward: See `GymnasiumEnv`.
         autoreset_mode: ``NextStep`` (the step after the last one starts new episodes, whatever the action) or ``SameStep`` (the
             last step does, and returns the final observations as ``final_obs``).
@@ -274,7 +274,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return observations, self._infos(observations)
 
     def _infos(self, observations: Observations) -> dict[str, Any]:
-        """Return infos as arrays, each with a mask of the environments that have it: all of them."""
+        """Return infos as arrays, each with a mask [N] of the environments that have it, which is all True."""
         infos = self._environments.info(observations)
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 

@@ -1,4 +1,4 @@
-"""N lockstep environments, shared implementation of the single and the vectorised Gymnasium environment."""
+"""N environments in lockstep: the shared implementation of the single and the vectorised Gymnasium environment."""
 
 import functools
 from typing import Any, NamedTuple
@@ -21,13 +21,14 @@ Observations = dict[str, np.ndarray]
 
 
 class _Programs(NamedTuple):
-    """Compiled functions of an environment for any number N of environments, shared by all with the same settings.
+    """Compiled functions for any number N of copies of an environment, shared by environments with the same settings.
 
     Attributes:
         env: The environment.
         space: Observation space of one environment.
-        reset: seeds [N] uint32 -> (State, observations, goals [N, ...] in the form of the task).
-        step: (State, donated; actions [N, A] float32) -> (State, observations without ``goal_pixels``, which do not change).
+        reset: Function from seeds [N] uint32 to State, observations, and goals [N, ...] in the form of the task.
+        step: Function from State (donated) and actions [N, A] float32 to State and observations, without ``goal_pixels``, which
+            do not change.
     """
 
     env: GoalEnv
@@ -42,7 +43,7 @@ def _make_cached(name: str, overrides: tuple[tuple[str, Any], ...]) -> GoalEnv:
 
 
 def _find_or_make(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
-    """Return the environment of that name and settings, built once if all settings are hashable.
+    """Return the environment ``env``, built if it is a name; cached by name and settings if all settings are hashable.
 
     Raises:
         ValueError: As in `jaxrl_vis_envs.make` and `goal_env`.
@@ -53,7 +54,7 @@ def _find_or_make(env: str | GoalEnv, overrides: dict[str, Any]) -> GoalEnv:
     settings = tuple(pairs)
     try:
         hash(settings)
-    except TypeError:  # not hashable: the environment rejects them with its own message, or accepts them
+    except TypeError:  # not hashable: the environment may accept them or reject them with its own message
         return goal_env(env, overrides)
     return _make_cached(env, settings)
 
@@ -68,7 +69,7 @@ def _programs(env: GoalEnv) -> _Programs:
         observation = {"achieved_goal": state.achieved_state, "desired_goal": state.goal_state}
         if not sees_images:
             return {"observation": env.observe(state), **observation}
-        # A user's environment may have only images.
+        # A user's environment may observe only images.
         vector = state.achieved_state if observe_state is None else observe_state(state.data)
         return {"observation": vector, **observation, "pixels": _to_public(env.observe(state))}
 
@@ -77,7 +78,7 @@ def _programs(env: GoalEnv) -> _Programs:
         assert state.obs is not None
         goal = state.obs["desired_goal"]
         goals = {"goal_pixels": _to_public(goal)} if sees_images else {}
-        # Images are returned, not carried in the state.
+        # Images are returned separately, not stored in the state.
         state = state.replace(obs=None)
         return state, {**jax.vmap(observe)(state), **goals}, goal
 
@@ -95,7 +96,7 @@ def _to_public(image: jax.Array) -> jax.Array:
 
 
 def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
-    """Return the space of one environment's observations, given the shapes of a batch of one."""
+    """Return the observation space of one environment, given the shapes of a batch of one."""
 
     def box(shape: jax.ShapeDtypeStruct) -> spaces.Box:
         low, high = (0, 255) if shape.dtype == jnp.uint8 else (-np.inf, np.inf)
@@ -115,7 +116,7 @@ def _camera(env: GoalEnv, size: int) -> Any:
 
 
 class Environments:
-    """N lockstep environments on the device. The arguments are those of `gymnasium.GymnasiumEnv`.
+    """N environments in lockstep on the device. The arguments are those of `gymnasium.GymnasiumEnv`.
 
     Attributes:
         env: The environment.
@@ -161,7 +162,7 @@ class Environments:
         return self.steps >= self.env.horizon
 
     def reset(self, seeds: np.ndarray) -> Observations:
-        """Start the episodes of ``seeds`` [N] uint32."""
+        """Start an episode for each of ``seeds`` [N] uint32; return observations."""
         self._state, observations, goal = self.programs.reset(seeds)
         self.steps = 0
         observations = _to_host(observations)

@@ -1,4 +1,4 @@
-"""Rewards of the adapters. The other libraries choose the reward once, when an environment is made."""
+"""Rewards of the adapters, chosen when an environment is constructed."""
 
 import functools
 from collections.abc import Callable
@@ -8,11 +8,11 @@ from jaxrl_vis_envs import goals
 
 Reward = Literal["oracle", "dense"]
 RewardFunction = Callable[[Any, Any], Any]
-"""(achieved states [..., G], goal states [..., G]) -> rewards [...] float32; NumPy for NumPy arrays, JAX for JAX arrays."""
+"""Function from achieved and goal states [..., G] to rewards [...] float32; NumPy for NumPy arrays, JAX for JAX arrays."""
 
 
 def reward_function(reward: Reward, threshold: float) -> RewardFunction:
-    """Return the function that scores states; it can be pickled.
+    """Return the reward function of achieved and goal states; it can be pickled.
 
     Args:
         reward: ``oracle`` is 0 within ``threshold`` of the goal and -1 elsewhere (`goals.oracle_reward`); ``dense`` is the

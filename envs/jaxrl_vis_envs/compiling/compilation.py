@@ -1,23 +1,23 @@
 """Compilation of programs that contain physics or rendering: compiler options, target platform, GPU kernels.
 
 XLA's CPU fusion emitters recompute a deep kinematic chain once for every use, which makes MuJoCo's forward kinematics hundreds
-of times slower on a CPU. They are switched off here per function, never by environment variable: a notebook has started JAX
+of times slower on a CPU. They are disabled here per function, never by environment variable, because a notebook initialises JAX
 long before this package is imported. XLA also delegates small sums to a library with its own threads (YNNPACK), although the
 call takes longer than the sum: without it, FetchReach in 16 environments is simulated 1.3 times as fast on two cores, and
 gradient steps take up to a seventh less time.
 
-JAX 0.11 no longer has this option per function (it refuses the name). Its emitters do not explode, but run physics on a CPU
-about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps per second against 2,350). `make` and the
-notebooks therefore install 0.10 where there is no GPU (requirements/cpu.in).
+JAX 0.11 no longer has this option per function (it rejects the name). Its emitters do not have this problem, but run physics on
+a CPU about half as fast (FetchReach, 64 environments, two cores: 1,100 environment steps per second against 2,350). `make` and
+the notebooks therefore install 0.10 where there is no GPU (requirements/cpu.in).
 
 On a GPU the many small kernels of a gradient step are launched together, as a CUDA graph. By default XLA chains them; here
 independent kernels may run concurrently: a gradient step of VisualFetchReach (64x64, H100) took 548 us instead of 689 with the
 preset paper, and 438 instead of 489 with fast.
 
-XLA also autotunes the tile of every matrix product there, by compiling and timing some thirty kernels per product. That was
-four fifths of the compilation of gradient steps (66 to 75 processor seconds instead of 18), for steps no faster than with one
-tile for all products, `_TILE` (paper 544 us and 540 to 562, fast 379 and 377 us). XLA still prefers NVIDIA's own kernels where
-they are faster, as for large matrices.
+XLA also autotunes the tile of every matrix product there, by compiling and timing some thirty kernels per product. That took
+four fifths of the compilation time of gradient steps (66 to 75 processor seconds instead of 18), for steps no faster than with
+one tile for all products, `_TILE` (paper 544 us and 540 to 562, fast 379 and 377 us). XLA still chooses NVIDIA's own kernels
+where they are faster, as for large matrices.
 
 Code that is fast on a CPU is slow on a GPU and vice versa, and some functions have a hand-written kernel for NVIDIA GPUs
 (Pallas, by Triton). The choice follows the platform that a program is compiled for, which is not always the default backend
@@ -41,9 +41,9 @@ import jax
 KERNELS_VARIABLE = "JAXRL_VIS_KERNELS"
 _CHOICES = {"auto": None, "": None, "0": False, "1": True}
 
-# The platform of the branch of `dispatch_by_platform` that is being traced, the choice of `kernels`, and True within
-# `assume_kernels_compile`; None outside of them. They are part of the key of JAX's trace cache, so that a function that was
-# traced for one platform is traced again for another.
+# Platform of the branch of `dispatch_by_platform` that is being traced, choice of `kernels`, and True within
+# `assume_kernels_compile`; None outside of them. They are part of the key of JAX's trace cache, so a function that was traced
+# for one platform is traced again for another.
 _platform = jax.make_user_context(default_value=None)
 _kernels = jax.make_user_context(default_value=None)
 _assume = jax.make_user_context(default_value=None)
@@ -59,8 +59,8 @@ def compiler_options(backend: str | None = None, *, runs_once: bool = False) -> 
 
     Args:
         backend: JAX's name of the backend; None for the default backend.
-        runs_once: For programs that take longer to compile than to run: do not optimise a CPU's machine code (initialising all
-            networks: 1.2 s to compile instead of 2.3, and the same bits).
+        runs_once: Do not optimise a CPU's machine code, for programs that take longer to compile than to run (initialising all
+            networks: 1.2 s to compile instead of 2.3, with bitwise equal results).
     """
     backend = backend or jax.default_backend()
     if backend == "gpu":
@@ -89,7 +89,7 @@ def jit(function: Callable, *, runs_once: bool = False, **jit_options: Any) -> A
 
 
 def accelerator() -> str | None:
-    """Return the platform besides "cpu" that this process can compile for: "cuda", "rocm", "tpu", another name, or None."""
+    """Return the platform other than "cpu" that this process can compile for ("cuda", "rocm", "tpu", ...); None if none."""
     backend = jax.default_backend()
     if backend not in ("cpu", "gpu"):
         return backend
@@ -99,7 +99,7 @@ def accelerator() -> str | None:
 def _has_devices(platform: str) -> bool:
     try:
         return bool(jax.devices(platform))
-    except RuntimeError:  # unknown to this JAX, or absent
+    except RuntimeError:  # unknown to this version of JAX, or absent
         return False
 
 
@@ -111,11 +111,11 @@ def dispatch_by_platform(function: Callable, *arguments: Any) -> Any:
     arrays, `jax.vmap` and `jax.grad`. Nested calls only call the function.
 
     Args:
-        function: Function from pytrees of arrays to one, with the same result on all platforms.
-        arguments: Its arguments.
+        function: Function from pytrees of arrays to a pytree of arrays, with the same result on all platforms.
+        arguments: Positional arguments of the function.
 
     Returns:
-        The function's result.
+        Result of the function.
     """
     other = accelerator() if _platform.value is None else None
     if other is None:
@@ -128,7 +128,7 @@ def dispatch_by_platform(function: Callable, *arguments: Any) -> Any:
 
         return trace
 
-    # Code for a CPU is plain JAX, so it is valid for any other platform that a program is exported to.
+    # Code for a CPU is plain JAX, hence valid on any other platform for which a program is exported.
     return jax.lax.platform_dependent(*arguments, default=branch("cpu"), **{other: branch(other)})
 
 
@@ -143,9 +143,8 @@ def tracing_for(platform: str | None) -> Iterator[None]:
 def tracing_for_default_device() -> Iterator[None]:
     """Trace for JAX's default device only.
 
-    For programs that run nowhere else: functions in `dispatch_by_platform` are traced once instead of twice, which halves the
-    time
-    to trace a program of physics and images.
+    For programs that run only there: functions in `dispatch_by_platform` are traced once instead of twice, which halves the
+    time to trace a program of physics and images.
     """
     device = jax.config.jax_default_device
     platform = jax.default_backend() if device is None else getattr(device, "platform", str(device))
@@ -165,7 +164,7 @@ def targets_cpu() -> bool:
 
 @contextlib.contextmanager
 def kernels(enabled: bool | None) -> Iterator[None]:
-    """Trace with kernels on NVIDIA GPUs (True), without them (False), or by the environment variable (None)."""
+    """Trace with kernels on NVIDIA GPUs (True), without them (False), or as the environment variable specifies (None)."""
     with _kernels(enabled):
         yield
 
@@ -181,9 +180,9 @@ def assume_kernels_compile() -> Iterator[None]:
 
 
 def failed_kernels() -> bool:
-    """Return True if a kernel used under `assume_kernels_compile` does not compile; name each such kernel on stderr.
+    """Return True if a kernel used under `assume_kernels_compile` does not compile; print each such kernel to stderr.
 
-    If so, trace the program again outside of `assume_kernels_compile`.
+    If it returns True, trace the program again outside of `assume_kernels_compile`.
     """
     return not all([_compiles(probe) for probe in sorted(_assumed, key=lambda probe: probe.__module__)])
 
@@ -195,8 +194,8 @@ def use_gpu_kernels(probe: Callable[[], object] | None = None) -> bool:
     overrides this. Every function with a kernel also exists in plain JAX, for all other devices.
 
     Args:
-        probe: Function that compiles a small instance of the kernel, called once per process; if it raises, one line on stderr
-            says so. It is not called within `assume_kernels_compile`. None for a kernel that is known to compile.
+        probe: Function that compiles a small instance of the kernel, called once per process; if it raises, one line is printed
+            to stderr. It is not called within `assume_kernels_compile`. None for a kernel that is known to compile.
 
     Raises:
         ValueError: The environment variable is not 0, 1 or auto.
@@ -227,8 +226,7 @@ def _name_triton_dialect() -> None:
     """Register the Python module of Triton's dialect under the name at which MLIR looks for it.
 
     MLIR tries to import it for nearly every value of a kernel, and Python does not cache failed imports: without this, they
-    take a
-    third of the time to lower a program with kernels.
+    take a third of the time to lower a program with kernels.
     """
     with contextlib.suppress(ImportError):
         sys.modules.setdefault("jaxlib.mlir.dialects.tt", importlib.import_module("jaxlib.triton.dialect"))
@@ -238,7 +236,7 @@ def _has_tensor_cores() -> bool:
     """Return True if there is an NVIDIA GPU of compute capability 8.0 or more, which Pallas requires."""
     try:
         return float(jax.devices("cuda")[0].compute_capability) >= 8.0
-    except (RuntimeError, AttributeError, TypeError, ValueError):  # no GPU, or another vendor's
+    except (RuntimeError, AttributeError, TypeError, ValueError):  # no GPU, or not NVIDIA's
         return False
 
 
@@ -252,7 +250,7 @@ def _compiles(probe: Callable[[], object]) -> bool:
             probe()
 
     try:
-        # Probes are called during other traces that they are not part of; the current trace is local to a thread.
+        # Probes are called during unrelated traces; the current trace is thread-local.
         # (`jax.ensure_compile_time_eval` would also evaluate the inside of the kernel, which is impossible.)
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
             pool.submit(compile_it).result()

@@ -25,12 +25,12 @@ _CARDS = {
     10.3: "NVIDIA B300",
     12.0: "NVIDIA RTX PRO 6000",
 }
-# Name of an installed card -> name to lower under; None if that is not needed or does not help.
+# Name of an installed card -> name under which to lower; None if none is needed or it does not help.
 _substitutes: dict[str, str | None] = {}
 
 
 def kernel_call(kernel: Callable[..., None], *, interpret: bool = False, **options: Any) -> Callable[..., Any]:
-    """Call `jax.experimental.pallas.pallas_call`, also for cards that are missing in JAX's list.
+    """Wrap `jax.experimental.pallas.pallas_call`, with support for cards that are missing in JAX's list.
 
     Args:
         kernel: Function of input and output references.
@@ -38,7 +38,7 @@ def kernel_call(kernel: Callable[..., None], *, interpret: bool = False, **optio
         **options: Options of `pallas_call`.
 
     Returns:
-        The function from arrays to arrays.
+        Function from input arrays to output arrays.
     """
     call = pl.pallas_call(kernel, interpret=interpret, **options)
     name = None if interpret else _substitute_name()
@@ -53,13 +53,13 @@ def kernel_call(kernel: Callable[..., None], *, interpret: bool = False, **optio
 
 
 def _substitute_name() -> str | None:
-    """Return the name to lower kernels under for the first NVIDIA GPU; None for its own."""
+    """Return the card name under which to lower kernels for the first NVIDIA GPU; None for its own name."""
     if jax.__version_info__ < (0, 11):
         return None
     try:
         gpu = jax.devices("cuda")[0]
         capability = float(gpu.compute_capability)
-    except (RuntimeError, AttributeError, TypeError, ValueError):  # no GPU, or another vendor's
+    except (RuntimeError, AttributeError, TypeError, ValueError):  # no GPU, or not NVIDIA's
         return None
     if gpu.device_kind not in _substitutes:
         nearest = max((known for known in _CARDS if known <= capability), default=None)
@@ -71,7 +71,7 @@ def _substitute_name() -> str | None:
 
 @contextlib.contextmanager
 def _lowering_as(name: str | None) -> Iterator[None]:
-    """Trace for a card of that name; the axes of devices stay the same."""
+    """Trace for a card called ``name``, with unchanged mesh axes; None changes nothing."""
     if name is None:
         yield
         return
@@ -85,7 +85,7 @@ def _lowering_as(name: str | None) -> Iterator[None]:
 
 
 def _lowers(gpu: Any, name: str | None) -> bool:
-    """Return True if JAX lowers a kernel for a GPU under this name."""
+    """Return True if JAX lowers a kernel for a GPU under the card ``name``; None for its own."""
 
     def copy(source: Any, target: Any) -> None:
         target[...] = source[...]
@@ -97,9 +97,9 @@ def _lowers(gpu: Any, name: str | None) -> bool:
             jax.jit(call).trace(row).lower(lowering_platforms=("cuda",))
 
     try:
-        # This runs during other traces that it is not part of; the current trace is local to a thread.
+        # This runs during unrelated traces; the current trace is thread-local.
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
             pool.submit(lower).result()
-    except Exception:  # JAX does not document its types
+    except Exception:  # JAX does not document the exception types
         return False
     return True

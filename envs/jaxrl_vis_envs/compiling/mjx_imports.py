@@ -1,10 +1,9 @@
 """Import hook that makes MJX import faster and hides its notice about Warp.
 
-MJX prints two lines if Warp, an optional backend, is missing, when `mujoco.mjx.warp` is imported. And its mesh module imports
-trimesh and `scipy.spatial`, which takes three quarters of the whole import, for models with colliding meshes. The hook removes
-these two lines and defers these libraries until they are used. `jaxrl_vis_envs.physics` installs it before it imports MJX; it
-does nothing for an MJX that is already imported. Other output during the import of `mujoco.mjx.warp` is printed when that is
-done.
+When `mujoco.mjx.warp` is imported and Warp, an optional backend, is missing, MJX prints two lines. Its mesh module imports
+trimesh and `scipy.spatial` for models with colliding meshes, which takes three quarters of the total import time. The hook
+removes the two lines and defers these libraries until they are used. `jaxrl_vis_envs.physics` installs it before importing MJX;
+it has no effect if MJX is already imported. Other output during the import of `mujoco.mjx.warp` is printed after the import.
 """
 
 import contextlib
@@ -21,7 +20,7 @@ _NOTICE = "Failed to import "
 
 
 class _LazyModule(ModuleType):
-    """Placeholder for a module that is imported when an attribute is read."""
+    """Placeholder for a module, which is imported when an attribute is read."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(importlib.import_module(self.__name__), name)
@@ -33,7 +32,7 @@ def _make_trimesh(*arguments: Any, **named: Any) -> Any:
 
 @contextlib.contextmanager
 def _defer_mesh_libraries() -> Iterator[None]:
-    """Give placeholders to modules imported inside, and the actual modules to all others."""
+    """Import placeholders instead of trimesh and `scipy.spatial` within the context."""
     deferred = {name: _LazyModule(name) for name in ("trimesh", "scipy.spatial") if name not in sys.modules}
     if "trimesh" in deferred:
         deferred["trimesh"].Trimesh = _make_trimesh  # pyright: ignore[reportAttributeAccessIssue] - MJX annotates with it
@@ -62,7 +61,7 @@ _CONTEXTS = {"mujoco.mjx.warp": _hide_notice, "mujoco.mjx._src.mesh": _defer_mes
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Finder of two modules of MJX, whose loaders execute them within their contexts."""
+    """Import finder that executes the two modules of MJX in `_CONTEXTS` within their contexts."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
         if fullname not in _CONTEXTS:
@@ -84,6 +83,6 @@ _FINDER = _Finder()
 
 
 def install() -> None:
-    """Install the hook, once per process."""
+    """Install the hook; further calls have no effect."""
     if _FINDER not in sys.meta_path:
         sys.meta_path.insert(0, _FINDER)

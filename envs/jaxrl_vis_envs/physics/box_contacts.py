@@ -1,9 +1,9 @@
-"""Contacts between boxes, face against face, as MuJoCo 4 has them: the corners of where the two faces overlap.
+"""Face-to-face contacts between boxes as in MuJoCo 4: the corners of the overlap of the two faces.
 
-MJX's contacts of boxes leave out boxes that come near without touching (``margin``), and repeat a corner on which a tilted box
-stands up to four times, which makes the corner as much stiffer. Here a pair has up to four contacts, all of them different. Of
-an overlap with more than four corners, as of faces turned against each other, the four that reach farthest towards the corners
-of one face count. Contacts of edge with edge are left out: boxes touch with the faces that are farthest apart.
+MJX's box contacts omit boxes that are close without touching (``margin``), and repeat a corner on which a tilted box stands up
+to four times, which multiplies its stiffness. Here a pair has up to four contacts, all of them different. If the overlap has
+more than four corners, as between faces rotated relative to each other, the four that reach farthest towards the corners of one
+face are used. Edge-to-edge contacts are not supported: boxes touch with the faces that are farthest apart.
 """
 
 import jax
@@ -16,7 +16,7 @@ from jaxrl_vis_envs.physics import rotations
 
 _CONTACTS = 4  # of a pair
 _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]], np.float32)
-_FAR = 1.0  # distance that stands for no contact, m
+_FAR = 1.0  # distance that represents no contact, m
 
 
 def supports(model: mjx.Model) -> bool:
@@ -28,7 +28,7 @@ def supports(model: mjx.Model) -> bool:
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Return ``data``, with its poses, with the contacts of a model that is supported."""
+    """Compute the contacts of a model that `supports` accepts; return ``data``, whose poses must be up to date, with them."""
     order = np.repeat(np.argsort(model.pair_dim, kind="stable"), _CONTACTS)  # MJX sorts contacts by their dimensions
     geoms = np.stack([model.pair_geom1, model.pair_geom2], axis=1)[order]
     first, second = geoms[::_CONTACTS].T
@@ -75,7 +75,7 @@ def _touch(
     is_first = face < 3
     middle, rotation, size = _where(is_first, (position_1, rotation_1, size_1), (position_2, rotation_2, size_2))
     other, other_rotation, other_size = _where(is_first, (position_2, rotation_2, size_2), (position_1, rotation_1, size_1))
-    # Its axis becomes z of a frame in the middle of its box, and that of the other box's nearest face z of the other's.
+    # Axes are permuted: in the frame at the centre of each box, z becomes the normal of the reference or the nearest face.
     rotation, size = _as_last(face % 3, rotation, size)
     offset, turn = rotation.T @ (other - middle), rotation.T @ other_rotation
     turn, other_size = _as_last(jnp.argmax(jnp.abs(turn[2])), turn, other_size)
@@ -83,7 +83,7 @@ def _touch(
     centre = offset - side * jnp.sign(turn[2, 2]) * other_size[2] * turn[:, 2]
     along = turn[:, :2] * other_size[:2]  # columns: half edges of the other face
     inverse = _inverse(along[:2])
-    # Candidates: places on the other face, in half edges [24, 2].
+    # Candidates: points on the other face, in units of its half edges [24, 2].
     corners = jnp.asarray(_SIGNS)
     reference_corners = (corners * size[:2] - centre[:2]) @ inverse.T
     places = jnp.concatenate([corners, reference_corners, _crossings(centre[:2], along[:2], size[:2])])
@@ -104,7 +104,7 @@ def _where(condition: jax.Array, yes: tuple, no: tuple) -> tuple[jax.Array, ...]
 
 
 def _as_last(axis: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Exchange the axes of a box cyclically, so that ``axis`` is the last."""
+    """Permute the axes of a box cyclically, so that ``axis`` is the last."""
     order = (axis + jnp.arange(1, 4)) % 3
     return rotation[:, order], size[order]
 
@@ -115,12 +115,15 @@ def _inverse(matrix: jax.Array) -> jax.Array:
 
 
 def _crossings(centre: jax.Array, along: jax.Array, size: jax.Array) -> jax.Array:
-    """Return where the edges of a face cross the lines of a rectangle's: [16, 2] in half edges, beyond 1 where they do not.
+    """Intersect the edges of a face with the lines through the edges of a rectangle.
 
     Args:
-        centre: [2], middle of the face in the frame of the rectangle, whose middle is 0.
+        centre: [2], centre of the face in the frame of the rectangle, whose centre is 0.
         along: [2, 2], columns are the half edges of the face in that frame.
         size: [2], half edges of the rectangle.
+
+    Returns:
+        [16, 2], intersections in units of the face's half edges; a coordinate is beyond +-1 if the edge does not intersect.
     """
     places = []
     for edge, axis in np.ndindex(2, 2):  # edges along `edge`, lines across `axis`

@@ -13,8 +13,8 @@ from mujoco.mjx._src import smooth, solver, support
 
 from jaxrl_vis_envs.physics import newton, rotations
 
-# Rows of contacts and equalities. Beyond, steps are MJX's own: grasping's results, with more contacts, are recorded with these,
-# and the shorter step rounds differently.
+# Maximum number of rows of contacts and equalities. Above it, MJX's own step is used: the recorded grasping results, with more
+# contacts, were obtained with that, and the shorter step rounds differently.
 _MAX_COUPLED_ROWS = 12
 
 
@@ -24,7 +24,7 @@ def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
 
     Args:
         model: Model that takes ``model.opt.iterations`` Newton steps.
-        data: State with its constraints and with all forces on the joints except the constraints'. The first step starts from
+        data: State with its constraints and with all joint forces except those of the constraints. The first step starts from
             the unconstrained accelerations, or from ``qacc_warmstart`` where that has a lower cost and warm starts are enabled.
         exact: Take one more, full Newton step where it reduces the gradient (see `mjx_model.step`).
     """
@@ -41,7 +41,7 @@ def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
         solved = _polish(model, solved) if exact else solved
     if not _has_short_step(model, data):
         return solved
-    # MJX's factorized mass matrix, which nothing reads, would be an output of every step.
+    # Copying these fields only: MJX's factorized mass matrix, which nothing reads, would otherwise be an output of every step.
     names = ("qfrc_smooth", "qacc_smooth", "qacc", "qfrc_constraint")
     return data.replace(**{name: getattr(solved, name) for name in names})
 
@@ -69,7 +69,7 @@ def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _integrate(model: mjx.Model, position: jax.Array, velocity: jax.Array) -> jax.Array:
-    """Return ``qpos`` [nq] a time step later, at velocities [nv]."""
+    """Return ``qpos`` [nq] one time step later, at constant velocities [nv]."""
     timestep = model.opt.timestep
     if model.nq == model.nv:
         return position + timestep * velocity
@@ -106,7 +106,7 @@ def _damped_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 
 def _after_solving(data: mjx.Data) -> mjx.Data:
-    """Make the mass matrix depend on the accelerations, as far as XLA can see.
+    """Make the mass matrix depend on the accelerations from XLA's point of view, to order the two factorizations.
 
     With damping, the mass matrix is factorized a second time, which XLA on a CPU would do concurrently with the first. In a
     batch, both factorizations wait in threads of XLA's pool for work that they have handed to the same pool: on two cores,

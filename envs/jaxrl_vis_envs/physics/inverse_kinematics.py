@@ -1,4 +1,4 @@
-"""Inverse kinematics of chains of hinges by damped least squares, weighted as a robot that is pulled to the pose moves."""
+"""Inverse kinematics of chains of hinges by damped least squares, weighted by joint mobility as for a robot that is pulled."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
 _SETTLING_STEPS = 3
-# For translations (m^2) and rotations (rad^2). Near a singular pose a pulled arm gives up orientation before position.
+# For translations (m^2) and rotations (rad^2). Near a singular pose, a pulled arm deviates in orientation before position.
 _DAMPING = (3e-3, 3e-3, 3e-3, 3e-2, 3e-2, 3e-2)
 
 
@@ -23,7 +23,7 @@ def reach(
     damping: tuple[float, ...] = _DAMPING,
     steps: int = 10,
 ) -> mjx.Data:
-    """Move ``body`` as near to a pose as the joints allow, and return the arm at rest there.
+    """Move ``body`` as near to a pose as the joints allow, and return ``start`` with that ``qpos`` and its poses.
 
     Damped least squares from ``start``, weighted by the joints' mobilities (1/damping), as in the physics.
 
@@ -34,8 +34,8 @@ def reach(
         body: Index of the last link.
         position: [3] float32 (m, world), target of the link's origin.
         rotation: [3, 3], target orientation; columns are the link's axes in the world.
-        damping: Damping of three translations (m^2) and three rotations (rad^2); higher damping gives way first.
-        steps: Number of steps; during the last three the target stands still.
+        damping: Damping of three translations (m^2) and three rotations (rad^2); those with higher damping deviate first.
+        steps: Number of steps; the target is fixed during the last three.
     """
 
     def improve(data: mjx.Data, share: jax.Array) -> tuple[mjx.Data, None]:
@@ -44,7 +44,7 @@ def reach(
             model, data.replace(qpos=data.qpos + _step(mj_model, data, body, target, rotation, damping))
         ), None
 
-    # The target moves to the goal before the last steps.
+    # The target moves to the goal, and is fixed there during the last steps.
     shares = jnp.minimum(jnp.arange(1, steps + 1) / (steps - _SETTLING_STEPS), 1.0).astype(jnp.float32)
     return jax.lax.scan(improve, start, shares)[0]
 

@@ -24,20 +24,28 @@ _multiply = jax.vmap(rotations.quat_mul)
 
 
 class _Nodes(NamedTuple):
-    """Tree with one node per joint and one per body without joints; node 0 is the world. Arrays are integers."""
+    """Tree with one node per joint and one per body without joints; node 0 is the world. Arrays are integers.
 
-    body: np.ndarray  # [N], body whose frame the node starts from, or nbody if it follows another joint of its body
-    parent: np.ndarray  # [N], parent node
-    depth: int  # length of the longest chain below the world
-    joint_nodes: np.ndarray  # [njnt], node of each joint
-    body_nodes: np.ndarray  # [nbody], last node of each body
+    Attributes:
+        body: [N], body whose frame the node starts from, or nbody if it follows another joint of its body.
+        parent: [N], parent node.
+        depth: Length of the longest chain below the world.
+        joint_nodes: [njnt], node of each joint.
+        body_nodes: [nbody], last node of each body.
+    """
+
+    body: np.ndarray
+    parent: np.ndarray
+    depth: int
+    joint_nodes: np.ndarray
+    body_nodes: np.ndarray
 
 
 @jax.jit  # traced once for all programs that contain it
 def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute poses as `mjx.kinematics` does, in a fraction of the operations, and the poses of cameras on bodies.
+    """Compute poses as `mjx.kinematics` does, in a fraction of the operations, and also those of cameras on bodies.
 
-    Descendants of a mocap body move with it, as in MuJoCo (in MJX they stay). Models with ball joints are left to MJX.
+    Descendants of a mocap body move with it, as in MuJoCo (in MJX they do not). Models with ball joints are delegated to MJX.
     """
     if not np.isin(model.jnt_type, _SUPPORTED).all():
         return _place_cameras(model, mjx.kinematics(model, data))

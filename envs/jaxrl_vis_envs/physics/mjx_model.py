@@ -31,7 +31,7 @@ __all__ = [
     "tip_jacobian",
 ]
 
-# On a CPU, the scalar engine is slower than MJX for more joints, and takes several times as long to compile.
+# With more joints, the scalar engine is slower than MJX on a CPU, and takes several times as long to compile.
 _MAX_SCALAR_JOINTS_ON_CPU = 3
 _ASSETS = pathlib.Path(__file__).resolve().parents[1] / "tasks" / "assets"
 
@@ -52,7 +52,7 @@ def put_model(mj_model: mujoco.MjModel) -> mjx.Model:
 
 
 def start_data(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> mjx.Data:
-    """Call `mjx.put_data` for a device of this process, and make the types of all arrays strong.
+    """Call `mjx.put_data` for a device of this process, and convert weakly typed arrays to strong types.
 
     A weakly typed ``time`` changes its type in the first step, so that programs compile twice (mujoco issue 2306).
     """
@@ -61,7 +61,7 @@ def start_data(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> mjx.Data:
 
 
 def still_data(mj_model: mujoco.MjModel, keyframe: str | None = None) -> mjx.Data:
-    """Return `start_data` at a keyframe of the model, or at its initial configuration, at rest."""
+    """Return `start_data` at a ``keyframe`` of the model, or, if None, at rest at its initial configuration."""
     mj_data = mujoco.MjData(mj_model)
     if keyframe is not None:
         mujoco.mj_resetDataKeyframe(mj_model, mj_data, mj_model.key(keyframe).id)
@@ -79,7 +79,7 @@ def simulate(model: mjx.Model, data: mjx.Data, substeps: int, exact: bool | None
 
 
 def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = None, disturbed: bool = False) -> mjx.Data:
-    """Take ``count`` physics steps; poses and true states are then older than ``qpos``.
+    """Take ``count`` physics steps. Poses are then stale: older than ``qpos``.
 
     Models that the scalar engine supports are simulated by it where it is faster: on NVIDIA GPUs, and on CPUs those of up to
     three joints that `newton` does not support. Contacts between capsules are then always exact, contacts beyond
@@ -90,12 +90,12 @@ def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None 
         model: The model.
         data: Its state.
         count: Number of steps.
-        exact: Make contacts and forces as exact as float32 allows (see `step`). False and None both mean no: with False, a GPU
-            kernel is shared with exact steps in the same program, of a model that differs in its time step only, and compiled
-            once; with None the kernel cannot take exact steps and is smaller.
-        disturbed: Set True if bodies are pushed (``xfrc_applied`` is not 0) or welds are switched off (``eq_active``), which
-            the scalar engine does not support: MJX then takes the steps on all platforms. Where a state is disturbed all the
-            same, the scalar engine sets its ``qpos`` to NaN.
+        exact: Make contacts and forces as exact as float32 allows (see `step`). False and None both disable this. With False,
+            the GPU kernel is shared with exact steps in the same program of a model that differs in its time step only, and
+            compiled once; with None, the kernel cannot take exact steps and is smaller.
+        disturbed: True if bodies are pushed (``xfrc_applied`` is not 0) or welds are switched off (``eq_active``), which the
+            scalar engine does not support; MJX then takes the steps on all platforms. If a state is disturbed although this is
+            False, the scalar engine sets its ``qpos`` to NaN.
     """
     if disturbed or not scalar.supports(model):
         return _take_mjx_steps(model, data, count, bool(exact))
@@ -171,7 +171,7 @@ def _runge_kutta_4(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
 
     def stage(carry: tuple[mjx.Data, jax.Array, jax.Array], row: jax.Array) -> tuple[Any, None]:
         data, mean_velocity, mean_acceleration = carry
-        fraction, weight = row  # elapsed share of the step, and weight in the mean
+        fraction, weight = row  # elapsed fraction of the step, and weight in the mean
         velocity = start.qvel + fraction * timestep * data.qacc
         position = start.qpos + fraction * timestep * data.qvel
         data = data.replace(qpos=position, qvel=velocity, time=start.time + fraction * timestep)

@@ -20,10 +20,10 @@ from mujoco.mjx._src import support
 
 # Elimination takes half the cube of this number of multiplications.
 _MAX_JOINTS = 12
-# Of 800 Newton steps in FetchReach, with joints beyond their limits and fingers in the table, none was longer than 5. Where
-# only rounding errors are left, their quotients reach 1,000 and lead away from the solution.
+# Of 800 Newton steps in FetchReach, with joints beyond their limits and fingers in the table, none was longer than 5. If the
+# gradient consists of rounding errors only, step lengths reach 1,000 and lead away from the solution.
 _MAX_STEP = 8.0
-# With more constraints, the exact line search, whose cost grows with the square of their number, gives way to an iteration.
+# With more constraints, an iterative search replaces the exact line search, whose cost grows with the square of their number.
 _MOST_CORNERS = 64
 _ROOT_STEPS = 8
 
@@ -31,9 +31,9 @@ _ROOT_STEPS = 8
 def supports(model: mjx.Model) -> bool:
     """Return True if this solver can replace MJX's for a model.
 
-    It supports up to 12 hinges and slides and one free joint, pyramidal cones, no dry friction, no activations, and the
-    integrators RK4 (without a free joint) and Euler, the latter implicit in the damping (MuJoCo's default), with and without
-    warm starts.
+    It supports up to 12 hinges and slides plus one free joint, pyramidal cones, and the integrators RK4 (without a free joint)
+    and Euler, the latter implicit in the damping (MuJoCo's default), with and without warm starts; but neither dry friction nor
+    activations.
     """
     is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
     has_few_joints = model.nv - 6 * is_free.sum() <= _MAX_JOINTS and is_free.sum() <= 1 and model.nq == model.nv + is_free.sum()
@@ -92,9 +92,9 @@ def _product(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def _weighted_square(matrix: jax.Array, weights: jax.Array) -> jax.Array:
-    """Return the sum of the outer squares of the rows of ``matrix`` [M, N], with ``weights`` [M]: [N, N]."""
+    """Compute ``matrix.T @ diag(weights) @ matrix`` for ``matrix`` [M, N] and ``weights`` [M]: [N, N]."""
     weighted = weights[:, None] * matrix
-    if len(weights) > _MOST_CORNERS:  # a library's call pays from here on
+    if len(weights) > _MOST_CORNERS:  # above this size, a library call is faster
         return jnp.matmul(matrix.T, weighted, precision="highest")
     return jnp.sum(weighted[:, :, None] * matrix[:, None, :], axis=0)
 
@@ -113,11 +113,11 @@ def damped_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
 def _line_search(
     residual: jax.Array, along: jax.Array, stiffness: jax.Array, is_equality: np.ndarray, first: jax.Array, second: jax.Array
 ) -> jax.Array:
-    """Return the step length of least cost, between 0 and `_MAX_STEP`.
+    """Return the step length of minimum cost, between 0 and `_MAX_STEP`.
 
     Args:
         residual: [R], residuals of the constraints at the start; equalities and negative residuals act.
-        along: [R], change of the residuals per unit of length.
+        along: [R], change of the residuals per unit of step length.
         stiffness: [R], stiffness of the constraints.
         is_equality: [R] bool, True for equalities.
         first: Linear coefficient of the remaining cost, ``first * length + second * length**2 / 2``.
@@ -146,10 +146,10 @@ def _line_search(
 
 
 def _bracketed_root(slope_at: Callable[[jax.Array], tuple[jax.Array, jax.Array]]) -> jax.Array:
-    """Return the length at which the slope of the cost is 0, by Newton's method between a length too short and one too long.
+    """Return the step length at which the slope of the cost is 0, by Newton's method within a bracket.
 
     Args:
-        slope_at: Length -> slope and curvature of the cost; the slope increases and is not positive at 0.
+        slope_at: Function from a step length to slope and curvature of the cost; the slope increases, and is not positive at 0.
     """
 
     def improve(bracket: tuple, _: None) -> tuple[tuple, None]:

@@ -1,4 +1,4 @@
-"""Images: observations of the image tasks, and `wrap`, which gives images to environments of other libraries.
+"""Images: observations of the image tasks, and `wrap`, which adds images to environments of other libraries.
 
 observations   channels, image size and encoding of depth of image tasks (`PixelsConfig`, `image_observer`)
 labels         names of the objects in a segmentation

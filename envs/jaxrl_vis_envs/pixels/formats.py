@@ -1,4 +1,4 @@
-"""Images as observations: names, dtypes and shapes, and one array of all channels."""
+"""Images as observations: names, dtypes and shapes, and concatenation of all channels into one array."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -21,11 +21,11 @@ class Format:
     """Form of image observations.
 
     Attributes:
-        layout: ``dict``: the environment's own observation and the images. ``images``: the images alone. ``image``: one array
+        layout: ``dict``: the environment's own observation and the images. ``images``: only the images. ``image``: one array
             [H, W, C], the channels of all images in order, then those of all goal images.
         dtype: ``float32``: colours from 0 to 1. ``uint8``: colours from 0 to 255. Depths follow if there is a
             ``depth_range``.
-        depth_range: Depths (m) encoded as the ends of the dtype's range, linear in between. None: depths in m, float32.
+        depth_range: Depths (m) encoded as the ends of the dtype's range, linear in between. If None, depths are in m, float32.
     """
 
     layout: Layout = "dict"
@@ -59,7 +59,7 @@ class Format:
         """Concatenate the channels of images, in the format's dtype.
 
         Raises:
-            ValueError: The images have several sizes, or one of them cannot have the dtype.
+            ValueError: The images differ in size, or one of them cannot be converted to the dtype.
         """
         sizes = {name: image.shape[:2] for name, image in images.items()}
         if len(set(sizes.values())) > 1:
@@ -83,13 +83,13 @@ class Format:
 
 
 def image_names(outputs: Mapping[str, tuple[str, ...]]) -> list[str]:
-    """Return the names of all images in an observation, without those of goals.
+    """Return the names of all images in an observation except goal images.
 
     Args:
         outputs: Outputs by camera, see `Views`.
 
     Raises:
-        ValueError: Two images have one name.
+        ValueError: Two images have the same name.
     """
     names = [_name(camera, output) for camera, chosen in outputs.items() for output in chosen]
     if len(set(names)) < len(names) or any(name + GOAL in names for name in names):
@@ -103,9 +103,9 @@ def _name(camera: str, output: str) -> str:
 
 GoalImage = Callable[[Any], Any] | jax.Array | np.ndarray | None
 """Source of goal images: joint positions [nq], or a function from the state after a reset (on the host: the environment) to
-joint positions, physics data or a state. None: no goal images."""
+joint positions, physics data or a state; None for no goal images."""
 
 
 def goal_poses(goal_image: GoalImage, state: Any) -> Any:
-    """Return the source of a goal image's poses for an episode that starts in ``state``."""
+    """Return the source of the goal's poses for an episode that starts in ``state``: ``goal_image``, or its result."""
     return goal_image(state) if callable(goal_image) else goal_image

@@ -23,7 +23,7 @@ _BOUNDS = {"segmentation": (-1, np.iinfo(np.int32).max), "bodies": (-2, np.iinfo
 
 
 class _Drawn:
-    """Poses as attributes, as the renderer reads them."""
+    """Container of poses as attributes, as the renderer reads them."""
 
     def __init__(self, arrays: dict[str, jax.Array]) -> None:
         vars(self).update(arrays)
@@ -32,11 +32,11 @@ class _Drawn:
 class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """Gymnasium wrapper whose observations are, or contain, images of a MuJoCo environment; see `wrap`.
 
-    Poses are computed from the joint positions: those in the environment's data are older by one physics step. Targets are
-    where the environment's own ``render`` shows them.
+    Poses are computed from the joint positions, since those in the environment's data are stale by one physics step. Targets
+    are rendered where the environment's own ``render`` shows them.
 
     Args:
-        env: The environment.
+        env: Environment to wrap.
         goal_image: Source of goal images, see `wrap`.
         form: Fields of `Format`.
         **options: Arguments of `Views`.
@@ -46,7 +46,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
     """
 
     def __init__(self, env: gymnasium.Env, goal_image: GoalImage, form: dict[str, Any], **options: Any) -> None:
-        # Arguments, not objects made of them: Gymnasium stores them in the environment's spec, to make it again.
+        # Pass arguments instead of objects built from them: Gymnasium stores them in the spec, to rebuild the environment.
         gymnasium.utils.RecordConstructorArgs.__init__(self, goal_image=goal_image, form=form, **options)
         gymnasium.Wrapper.__init__(self, env)
         self.views = views = Views(poses.find_model(env), **options)
@@ -72,7 +72,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return self._observe(own), reward, terminated, truncated, info
 
     def _observe(self, own: Any) -> Any:
-        # Goal images are copied: callers keep, and may change, what an observation holds.
+        # Copy the goal images: callers may keep and modify the arrays of an observation.
         images = self._render() | {name: image.copy() for name, image in self._goals.items()}
         layout = self._form.layout
         if layout == "image":
@@ -82,7 +82,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
 
     def _render(self, qpos: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Render the images at joint positions [nq], by default the present ones, with the present mocap poses."""
+        """Render the images at joint positions ``qpos`` [nq] (None for the current ones) and the current mocap poses."""
         model, drawn = self.views.mj_model, self._drawn
         with self._targets() as data:
             drawn.qpos[:] = data.qpos if qpos is None else qpos
@@ -96,10 +96,10 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     @contextlib.contextmanager
     def _targets(self) -> Iterator[mujoco.MjData]:
-        """Yield the environment's physics data, with the targets at their places, in the model too, until the end.
+        """Yield physics data with the targets at their positions, in the model too until the context ends.
 
-        Gymnasium-Robotics moves sites and bodies of targets in a callback of its ``render`` alone. That computes poses as well,
-        on which its next action depends; so it gets a copy of the data.
+        Gymnasium-Robotics moves sites and bodies of targets only in a callback of its ``render``. The callback also computes
+        poses, on which the next action depends, so it is called with a copy of the data.
         """
         inner, own, model = self._inner, self._inner.data, self.views.mj_model
         if not hasattr(inner, "_render_callback"):
@@ -115,7 +115,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             inner.data, model.site_pos[:] = own, sites
 
     def _space(self) -> gymnasium.Space:
-        """Return the space of observations."""
+        """Return the observation space: a Box for the layout ``image``, else a Dict."""
         images = jax.eval_shape(self._draw, self._poses())
         spaces: dict[str, gymnasium.Space] = {}
         chosen = [output for outputs in self.views.outputs.values() for output in outputs]

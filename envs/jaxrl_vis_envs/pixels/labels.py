@@ -6,13 +6,13 @@ import numpy as np
 SKY = -1
 """Label of pixels that show no object."""
 TENDON = -2
-"""Label of tendons in a segmentation by bodies: they belong to none."""
+"""Label of tendons in a segmentation by bodies, since they belong to no body."""
 
 
 def geom_names(mj_model: mujoco.MjModel) -> dict[int, str]:
-    """Return the name of every label of a segmentation by geoms: geoms, sites (from ngeom on), tendons, and -1, the sky.
+    """Return the name of every label of a segmentation by geoms: geoms, sites (from ngeom on), tendons, and -1 for the sky.
 
-    Objects without a name are called by their type and index, such as ``geom 3``.
+    Objects without a name are named after their type and index, such as ``geom 3``.
     """
     names = {index: mj_model.geom(index).name or f"geom {index}" for index in range(mj_model.ngeom)}
     names |= {mj_model.ngeom + index: mj_model.site(index).name or f"site {index}" for index in range(mj_model.nsite)}
@@ -22,7 +22,7 @@ def geom_names(mj_model: mujoco.MjModel) -> dict[int, str]:
 
 
 def body_names(mj_model: mujoco.MjModel) -> dict[int, str]:
-    """Return the name of every label of a segmentation by bodies; bodies without a name are called ``body 3``."""
+    """Return the name of every label of a segmentation by bodies; bodies without a name are named like ``body 3``."""
     names = {index: mj_model.body(index).name or f"body {index}" for index in range(mj_model.nbody)}
     return names | {SKY: "sky", TENDON: "tendon"}
 

@@ -19,13 +19,14 @@ class ModelEnv:
 
     Args:
         mj_model: MuJoCo model. Episodes start from its initial configuration, at rest.
-        step: Function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. None: one `mjx.step` with the action as ``ctrl``.
+        step: Function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. If None, one `mjx.step` with the action as
+            ``ctrl``.
 
     Attributes:
         mj_model: The model.
-        mjx_model: The same for MJX.
+        mjx_model: The same model for MJX.
         action_size: Number of actuators.
-        backend: ``mjx``.
+        backend: Name of the physics engine: ``mjx``.
     """
 
     backend = "mjx"
@@ -37,7 +38,7 @@ class ModelEnv:
         self._step = step
 
     def reset(self, rng: jax.Array) -> State:
-        """Return the state at the model's initial configuration. ``rng`` is not used."""
+        """Return the state at the model's initial configuration. ``rng`` is ignored."""
         return State(self._start, self._observe(self._start), jnp.zeros(()), jnp.zeros(()))  # type: ignore[arg-type]
 
     def step(self, state: State, action: jax.Array) -> State:

@@ -4,9 +4,9 @@ An image is planar, [C, H, W] uint8, with the channels R, G, B, D or the subset 
 the camera's axis) and metric: 0 is the near end of the task's depth range, 255 the far end, linear in between and clipped
 outside. With ``depth_encoding="zbuffer"`` it is the content of OpenGL's depth buffer, as returned by mujoco-py.
 
-``frame_stack`` images, of this control step and the preceding ones, can be stacked along the channels, newest first. The past
-is stored as joint positions (`State.history`) and rendered again: rendering is cheaper than the physics, and the state carries
-no images.
+``frame_stack`` images, of this control step and the preceding ones, can be stacked along the channels, newest first. Past
+states are stored as joint positions (`State.history`) and rendered again: rendering is cheaper than the physics, and the state
+contains no images.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ class PixelsConfig(checks.CheckedConfig):
     pixels: Literal["rgbd", "rgb", "depth"] = "rgbd"
     """Channels."""
     depth_range: tuple[float, float] = (0.1, 10.0)
-    """Depths encoded as 0 and 255, m. Tasks choose it as tight as their moving parts allow."""
+    """Depths encoded as 0 and 255, m. Task defaults are as tight as their moving parts allow."""
     frame_stack: int = 1
     """Number of most recent images stacked in an observation. With one, velocities are not observable."""
     depth_encoding: DepthEncoding = "metric"
@@ -56,8 +56,8 @@ class PixelsConfig(checks.CheckedConfig):
 
 
 Observer = Callable[..., jax.Array]
-"""observer(data, history=None, domain=None): observes the poses in ``data``, preceded by those in ``history``, with the
-appearance in ``domain`` (see `State`)."""
+"""Function ``observer(data, history=None, domain=None)`` that renders the poses in ``data``, preceded by those in ``history``,
+with the appearance in ``domain`` (see `State`)."""
 
 
 class ImageObserver:
@@ -81,9 +81,9 @@ class ImageObserver:
 
         Args:
             data: Physics state with up-to-date poses.
-            history: [frame_stack - 1, nq] float32, joint positions one, two, ... control steps ago. None means that nothing has
-                moved, and one image is repeated.
-            domain: Appearance of the episode (`randomization`), the same for all images.
+            history: [frame_stack - 1, nq] float32, joint positions one, two, ... control steps ago. If None, nothing has moved,
+                and one image is repeated.
+            domain: Appearance of the episode (see `randomization`), the same for all images; None for the model's.
         """
         scene = varied_scene(self.scene, domain)
         if self._config.frame_stack == 1 or history is None:

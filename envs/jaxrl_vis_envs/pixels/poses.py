@@ -1,4 +1,4 @@
-"""Poses of environments of other libraries: from their states, by forward kinematics of their MuJoCo models."""
+"""Poses for environments of other libraries, computed from their states by forward kinematics of their MuJoCo models."""
 
 from typing import Any
 
@@ -22,8 +22,8 @@ _STATES = ("data", "pipeline_state")
 class Poses:
     """Function from the state of an environment to the poses of its bodies, geoms and sites.
 
-    Poses are computed from joint positions (and mocap poses). Those in a state are not used: after `mjx.step` they are older
-    than the joint positions by one physics step, and physics engines other than MJX have none of geoms.
+    Poses are computed from joint positions (and mocap poses). Those in a state are not used: after `mjx.step` they lag behind
+    the joint positions by one physics step, and physics engines other than MJX compute none for geoms.
 
     Args:
         mj_model: The environment's model.
@@ -39,7 +39,8 @@ class Poses:
         Args:
             state: State of an environment with ``data`` (MuJoCo Playground) or ``pipeline_state`` (brax); or physics data with
                 ``qpos`` or brax's ``q``; or joint positions [nq].
-            model: Model with the environment's present geometry, if it is randomised: `mjx.Model`, or brax's System.
+            model: Model with the environment's current geometry, if it is randomised: `mjx.Model`, or brax's System. None for
+                that of ``mj_model``.
 
         Raises:
             ValueError: ``state`` has no joint positions, or those of several environments or of another model.
@@ -59,7 +60,7 @@ class Poses:
 
 
 def physics_data(state: Any) -> Any:
-    """Return the physics data in a state of an environment, or in a state that is inside that; or else ``state`` itself."""
+    """Return the physics data in a state of an environment, or in a state nested inside it, else ``state`` itself."""
     for name in _STATES:
         inner = getattr(state, name, None)
         if inner is not None and _has_positions(data := physics_data(inner)):
@@ -88,7 +89,7 @@ def joint_positions(data: Any) -> Any:
 
 
 def find_model(env: Any) -> mujoco.MjModel:
-    """Return the MuJoCo model of an environment: ``mj_model``, ``sys.mj_model`` or ``model``, also of what it wraps.
+    """Return the MuJoCo model of an environment or of the one it wraps: ``mj_model``, ``sys.mj_model`` or ``model``.
 
     Raises:
         ValueError: It has none.
@@ -104,7 +105,7 @@ def find_model(env: Any) -> mujoco.MjModel:
 
 
 def traced_model(env: Any) -> Any:
-    """Return the model that an environment steps with at present, an `mjx.Model` or brax's System; None if it has none.
+    """Return the model that an environment currently steps, an `mjx.Model` or brax's System; None if it has none.
 
     Wrappers for domain randomisation replace it while they trace the environment.
     """
@@ -125,7 +126,7 @@ def randomized_scene(scene: Scene, model: Any, mj_model: mujoco.MjModel) -> Scen
         mj_model: The model before randomisation.
     """
     count = mj_model.ngeom
-    # By differences, because sizes in a scene are not all those of the model: infinite planes have a large one.
+    # Differences are added, because some sizes in a scene differ from the model's: infinite planes have a large one.
     size = scene.size.at[:count].add(model.geom_size - jnp.asarray(mj_model.geom_size, jnp.float32))
     colours, before = _geom_colours(model), _geom_colours(mj_model)
     changed = jnp.any(colours != before, axis=1, keepdims=True)
@@ -135,7 +136,7 @@ def randomized_scene(scene: Scene, model: Any, mj_model: mujoco.MjModel) -> Scen
 
 
 def _geom_colours(model: Any) -> jax.Array:
-    """Return the colours of geoms or, where those are not set, of their materials: [ngeom, 4] float32."""
+    """Return the colours of geoms or, if not set, of their materials: [ngeom, 4] float32."""
     own, material = jnp.asarray(model.geom_rgba, jnp.float32), jnp.asarray(model.geom_matid)
     if not len(model.mat_rgba):
         return own

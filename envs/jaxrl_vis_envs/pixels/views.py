@@ -1,4 +1,4 @@
-"""Images of one environment from several cameras, in several outputs, in one call."""
+"""Images of one environment from several cameras, with several outputs each, in one call."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, get_args
@@ -12,7 +12,7 @@ from jaxrl_vis_envs.pixels import labels
 from jaxrl_vis_envs.render import Scene, render_planes
 
 Output = Literal["rgb", "depth", "segmentation", "bodies", "normals"]
-"""An image: colours, planar depth, geom of each pixel, body of each pixel, or surface normals."""
+"""Kind of image: colours, planar depth, geom of each pixel, body of each pixel, or surface normals."""
 OUTPUTS: tuple[Output, ...] = get_args(Output)
 Camera = str | int | mujoco.MjvCamera | None
 Cameras = Camera | Iterable[Camera] | Mapping[str, Camera]
@@ -25,15 +25,15 @@ class Views:
     """Function from the poses of one environment to its images from several cameras.
 
     Use `jax.vmap` for a batch. Scenes are built once and share their arrays on the device (triangles, textures, colours), so a
-    further camera costs the memory of its lens.
+    further camera only takes the memory of its lens parameters.
 
     Args:
         mj_model: MuJoCo model.
-        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name. None: MuJoCo's free camera.
+        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name; MuJoCo's free camera if None.
         image_size: Height and width in pixels: one number, a pair, or a dictionary of these by camera.
         outputs: One `Output`, several, or a dictionary of these by camera.
-        clip_range: Near and far clipping planes (m), or a dictionary of these by camera. None: those of the model. The far
-            plane is also the depth of the sky.
+        clip_range: Near and far clipping planes (m), or a dictionary of these by camera; the model's if None. The far plane is
+            also the depth of the sky.
         **scene_options: Further options of `Scene.from_mjmodel`, such as ``groups`` or ``shadows``.
 
     Attributes:
@@ -44,7 +44,7 @@ class Views:
         body_names: Name of each label of ``bodies``.
 
     Raises:
-        ValueError: There is no such camera or output, two cameras have one name, a dictionary lacks a camera, or as in
+        ValueError: There is no such camera or output, two cameras have the same name, a dictionary lacks a camera, or as in
             `Scene.from_mjmodel`.
     """
 
@@ -107,10 +107,10 @@ class Views:
 
 
 def named_cameras(mj_model: mujoco.MjModel, cameras: Cameras) -> dict[str, Camera]:
-    """Return cameras by name: that in the model, ``camera 2`` for one without a name there, ``free`` for the free one.
+    """Return cameras by name: that in the model, ``camera 2`` for one that has none there, ``free`` for the free camera.
 
     Raises:
-        ValueError: There are no cameras, or two of one name.
+        ValueError: There are no cameras, or two have the same name.
     """
     if isinstance(cameras, Mapping):
         by_name: dict[str, Any] = {str(name): camera for name, camera in cameras.items()}
@@ -134,10 +134,10 @@ def _camera_name(mj_model: mujoco.MjModel, camera: Camera) -> str:
 
 
 def by_camera(cameras: Iterable[str], option: str, value: Any) -> dict[str, Any]:
-    """Return the value of an option by camera: that of a dictionary, or the same value for all.
+    """Return the values of an option by camera: a copy of a dictionary ``value``, or the same ``value`` for all cameras.
 
     Raises:
-        ValueError: A dictionary lacks a camera or has another one.
+        ValueError: The dictionary lacks a camera or contains an unknown one.
     """
     if not isinstance(value, Mapping):
         return dict.fromkeys(cameras, value)
@@ -163,7 +163,7 @@ def _clipped(scene: Scene, clip_range: tuple[float, float] | None) -> Scene:
 
 
 def _share_leaves(scene: Scene, first: Scene | None) -> Scene:
-    """Return ``scene`` with those leaves of ``first`` that have the same contents, so that they are on the device once."""
+    """Replace leaves of ``scene`` that equal those of ``first`` by the latter, so that the device stores them once."""
     if first is None:
         return scene
     shared = {}

@@ -20,9 +20,9 @@ from jaxrl_vis_envs.pixels.formats import Dtype, Format, GoalImage, Layout
 from jaxrl_vis_envs.pixels.views import Cameras, ImageSize, Output, Views
 
 OWN = "state"
-"""Name of the environment's own observation, if that is an array."""
+"""Key of the environment's own observation, if that is an array."""
 HIDDEN = "unwrapped_obs"
-"""Name in ``state.info`` of the environment's own observation, if it is not part of the observation."""
+"""Key in ``state.info`` of the environment's own observation, if it is not part of the observation."""
 
 
 def wrap(
@@ -46,30 +46,31 @@ def wrap(
         env: An environment of brax (any of its physics engines) or of MuJoCo Playground, or any other with pure functions
             ``reset(key)`` and ``step(state, action)`` and a model; a `mujoco.MjModel`; or a Gymnasium environment of MuJoCo,
             which stays on the host.
-        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name. None: MuJoCo's free camera.
+        cameras: Name or index of a camera, several of them, or a dictionary of cameras by name; MuJoCo's free camera if None.
         image_size: Height and width in pixels: one number, a pair, or a dictionary of these by camera.
         outputs: ``rgb``, ``depth``, ``segmentation`` (geom ids), ``bodies`` (body ids), ``normals``: one or several, or a
             dictionary of these by camera. See `Views`.
-        goal_image: Joint positions [nq] of a goal, or a function from the state after a reset (of Gymnasium: from the
-            unwrapped environment) to joint positions. Its images are rendered at the reset, and stay for the episode.
-        frames: Number of images that an observation holds of each kind, the latest last, along the channels: positions are in
-            one image, velocities in several. A reset repeats its image. Goals have one image.
+        goal_image: Joint positions [nq] of a goal, or a function from the state after a reset (for Gymnasium: from the
+            unwrapped environment) to joint positions. Its images are rendered at the reset and kept for the episode. If None,
+            there are no goal images.
+        frames: Number of most recent images of each kind in an observation, stacked along the channels, newest last. One image
+            shows positions, several show velocities. A reset repeats its image. Goals have one image.
         layout: ``dict``: the own observation (as ``state``, if it is an array) and the images ``pixels/CAMERA`` (colours),
-            ``pixels/CAMERA/OUTPUT`` and, of goals, ``.../goal``. ``images``: the images alone. ``image``: one array [H, W, C].
-        dtype: ``float32`` (colours from 0 to 1, as brax's agents take them) or ``uint8``. None: uint8 for Gymnasium, else
+            ``pixels/CAMERA/OUTPUT`` and, for goals, ``.../goal``. ``images``: only the images. ``image``: one array [H, W, C].
+        dtype: ``float32`` (colours from 0 to 1, as brax's agents expect them) or ``uint8``. If None, uint8 for Gymnasium, else
             float32.
-        depth_range: Depths (m) encoded as the ends of the dtype's range. None: depths in m, float32.
-        clip_range: Near and far clipping planes of the cameras (m), or a dictionary of these by camera. None: the model's.
-        step: For a `mujoco.MjModel`: function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. None: one `mjx.step` with
-            the action as ``ctrl``.
+        depth_range: Depths (m) encoded as the ends of the dtype's range. If None, depths are in m, float32.
+        clip_range: Near and far clipping planes of the cameras (m), or a dictionary of these by camera; the model's if None.
+        step: For a `mujoco.MjModel`, function ``step(data, action)`` from `mjx.Data` to `mjx.Data`. If None, one `mjx.step`
+            with the action as ``ctrl``.
         **scene_options: Further options of `jaxrl_vis_envs.render.Scene.from_mjmodel`.
 
     Returns:
-        The environment: a `PixelEnv` whose states are of the class of the wrapped environment's, or a Gymnasium wrapper.
+        A `PixelEnv`, whose states have the class of those of the wrapped environment, or a Gymnasium wrapper.
 
     Raises:
         ValueError: ``env`` is none of these, or an option is invalid.
-        ImportError: Gymnasium's environment needs Gymnasium.
+        ImportError: ``env`` is a Gymnasium environment, and Gymnasium is not installed.
     """
     if isinstance(env, type):
         raise ValueError(f"env must be an environment, got the class {env.__name__}: make one of it first")
@@ -100,9 +101,9 @@ class PixelEnv:
     """Environment whose observations are, or contain, images; made by `wrap`.
 
     States are those of the wrapped environment, with another ``obs``. `reset` and `step` are pure functions of one environment:
-    brax's and Playground's wrappers vmap them. All other attributes are those of the wrapped environment, for reading and
-    writing, except ``unwrapped``, which is this one: wrappers for domain randomisation replace the model of what is unwrapped,
-    and step that.
+    brax's and Playground's wrappers vmap them. All other attributes are read from and written to the wrapped environment,
+    except ``unwrapped``, which is this environment: wrappers for domain randomisation replace the model of ``unwrapped``, and
+    step that.
 
     Attributes:
         env: The wrapped environment.
@@ -135,7 +136,7 @@ class PixelEnv:
         return self._with_images(state, None, goals)
 
     def step(self, state: Any, action: jax.Array) -> Any:
-        """Step the wrapped environment, and render."""
+        """Step the wrapped environment with an ``action`` [A], and render."""
         own, earlier, goals = self._split(state)
         changes: dict[str, Any] = {"obs": own}
         if self._form.layout != "dict":
@@ -144,7 +145,7 @@ class PixelEnv:
 
     @property
     def observation_size(self) -> Any:
-        """Shape of an observation: of each of its parts, or of the one image."""
+        """Shape of the image for the layout ``image``, else shapes by key of the observation."""
         obs = jax.eval_shape(self.reset, jax.random.PRNGKey(0)).obs
         return obs.shape if self._form.layout == "image" else {name: leaf.shape for name, leaf in obs.items()}
 
@@ -170,7 +171,7 @@ class PixelEnv:
 
         Args:
             state: State of the wrapped environment.
-            earlier: Images of the observation before, by name or as channels of the one image; None at the start of an episode.
+            earlier: Images of the previous observation, by name or as channels of one image; None at the start of an episode.
             goals: Goal images, in the same form or by name.
         """
         layout, own = self._form.layout, state.obs
@@ -192,15 +193,15 @@ class PixelEnv:
         return _replace(state, obs=obs, info={**state.info, HIDDEN: own})
 
     def _first(self, image: jax.Array, _: jax.Array) -> jax.Array:
-        """Repeat an image at the start of an episode."""
+        """Stack an image with copies of itself along the channels, at the start of an episode."""
         return jnp.concatenate([image] * self._frames, axis=-1)
 
     def _split(self, state: Any) -> tuple[Any, Any, Any]:
-        """Return the environment's own observation, and the images and goal images, of a state of this environment."""
+        """Split a state of this environment into the wrapped environment's observation, the images and the goal images."""
         layout, obs = self._form.layout, state.obs
         has_goals = self._goal_image is not None
         if layout == "image":
-            # Each image, of one frame, has a goal image of as many channels.
+            # Goal images have as many channels as one frame of the images.
             end = obs.shape[-1] // (self._frames + has_goals) * self._frames
             return state.info[HIDDEN], obs[:, :, :end], obs[:, :, end:] if has_goals else {}
         images = {name: obs[name] for name in self._names}
@@ -221,15 +222,15 @@ class PixelEnv:
         return getattr(self.env, name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # On the innermost environment, which steps with it, and not on a wrapper around that.
+        # Set on the innermost environment, which reads it in `step`, not on a wrapper around it.
         setattr(self if name in vars(self) else getattr(self.env, "unwrapped", self.env), name, value)
 
 
 def _replace(state: Any, **changes: Any) -> Any:
-    """Return a state of any library with some fields changed."""
+    """Return a copy of a state of any library with some fields changed."""
     return state.replace(**changes) if hasattr(state, "replace") else dataclasses.replace(state, **changes)
 
 
 def _next(image: jax.Array, earlier: jax.Array) -> jax.Array:
-    """Append an image to the ``earlier`` ones, and drop the first of those."""
+    """Append an image to the ``earlier`` ones along the channels, and drop the oldest."""
     return jnp.concatenate([earlier[..., image.shape[-1] :], image], axis=-1)

@@ -12,7 +12,7 @@ Modules, in the order in which data passes through them; each imports only from 
     model/       reads an `mujoco.MjModel` into NumPy arrays: colours, lights, lens, triangles, texture atlas, paths of tendons
     cords        poses of the capsules of tendons, from the poses of sites
     viewpoint    camera pose and lens, intrinsic matrix, points from depths
-    scene        `Scene`, a pytree of all that; `outputs`: the requested and the returned planes
+    scene        `Scene`, a pytree of all of the above; `outputs`: the requested and the returned planes
     camera       pixel rays, and spheres in view
     pixel/       the per-pixel mathematics in plain JAX, for every backend: unit shapes and lights once per environment;
                  nearest object per pixel; its depth, normal, texture and colour

@@ -58,7 +58,7 @@ def ray_parts(scene: Scene, rays: Rays) -> tuple[tuple, tuple, jax.Array | float
     """Return origins and directions of rays in the camera's frame, and the inverse squared length of the directions.
 
     Returns:
-        Origin and direction as three components each, and the inverse squared length. Each is an array [P], or a number if it
+        Origin and direction as three components each, and the inverse squared length. Each is an array [P], or a scalar if it
         is the same for all rays.
     """
     u, v = rays
@@ -74,7 +74,7 @@ def ray_length(scene: Scene, rays: Rays) -> jax.Array | float:
 
 
 def in_view(scene: Scene, middle: jax.Array, radius: jax.Array, rays: Rays, depth: jax.Array | None) -> jax.Array:
-    """Check which bounding spheres may intersect the rays of a block of pixels (a conservative frustum test).
+    """Test which bounding spheres may intersect the rays of a block of pixels (a conservative frustum test).
 
     Args:
         scene: The scene.

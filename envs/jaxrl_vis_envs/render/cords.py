@@ -1,6 +1,6 @@
-"""Poses of the capsules of tendons, and the colours of those at a limit, from the poses of sites and geoms alone.
+"""Poses of the capsules of tendons, and colours of tendons at a limit, computed from the poses of sites and geoms alone.
 
-`mjx.kinematics` computes no tendons, and MuJoCo's visualiser computes slack cords itself.
+`mjx.kinematics` does not compute tendons, and slack cords exist only in MuJoCo's visualiser.
 """
 
 from typing import Any, NamedTuple
@@ -12,11 +12,11 @@ import numpy as np
 from jaxrl_vis_envs.render.model import tendons
 from jaxrl_vis_envs.render.model.tendons import Path, Piece
 
-# MuJoCo draws the points of a hanging cord at these shares of its horizontal extent.
+# Fractions of the horizontal extent at which MuJoCo places the points of a hanging cord.
 _SHARES = np.append(np.arange(tendons.CHAIN) / (tendons.CHAIN + 1), 1.0).astype(np.float32)
 _SOLVER_STEPS = 8  # Newton's method converges quadratically
 _BISECTIONS = 24
-_STEEPEST = 40.0  # beyond it, hyperbolic functions leave the range of float32
+_STEEPEST = 40.0  # above it, hyperbolic functions overflow in float32
 _TINY = 1e-9
 
 
@@ -26,7 +26,7 @@ class Capsules(NamedTuple):
     Attributes:
         position: [K, 3] float32, m.
         rotation: [K, 3, 3] float32, with the axis in the last column.
-        half: [K] float32, half-length, m; 0 for those that are not drawn.
+        half: [K] float32, half-length, m; 0 for capsules that are not rendered.
     """
 
     position: jax.Array
@@ -35,7 +35,7 @@ class Capsules(NamedTuple):
 
 
 def capsules(scene: Any, data: Any, drawn: tuple[int, ...]) -> Capsules:
-    """Compute the capsules of the tendons ``drawn``, one tendon after the other, each in the order of its path."""
+    """Compute the capsules of the tendons with indices ``drawn``, tendon by tendon, each in the order of its path."""
     ends = [_ends(scene, data, tendon) for tendon in drawn]
     start, end = (jnp.concatenate(parts) for parts in zip(*ends, strict=True))
     along = end - start
@@ -45,7 +45,7 @@ def capsules(scene: Any, data: Any, drawn: tuple[int, ...]) -> Capsules:
 
 
 def coloured(scene: Any, data: Any) -> Any:
-    """Return ``scene`` with the colours of the tendons that are at a limit, mixed as in MuJoCo's visualiser."""
+    """Return ``scene`` with blended colours for tendons that are at a limit, as in MuJoCo's visualiser."""
     first = len(scene.size) - len(scene.tendon_paths)
     rgba = scene.rgba
     for tendon in sorted({index - first for index in scene.object_ids if index >= first}):
@@ -58,7 +58,7 @@ def coloured(scene: Any, data: Any) -> Any:
 
 
 def _impedance(length: jax.Array, values: jax.Array) -> jax.Array:
-    """Compute the impedance of the limit that a tendon of this length violates, 0 for none: [] float32."""
+    """Compute the impedance of the limit that a tendon of this ``length`` violates, 0 if none: [] float32."""
     low, high = values[tendons.RANGE]
     distance = jnp.minimum(length - low, high - length)
     least, most, width, middle, power = values[tendons.SOLIMP]
@@ -86,7 +86,7 @@ def _length(scene: Any, data: Any, path: Path) -> jax.Array:
 
 
 def _ends(scene: Any, data: Any, tendon: int) -> tuple[jax.Array, jax.Array]:
-    """Return beginnings and ends [K, 3] (m) of a tendon's capsules."""
+    """Return start and end points [K, 3] (m, world) of a tendon's capsules."""
     path = scene.tendon_paths[tendon]
     if path.hangs:
         points = _catenary(_site(data, path.pieces[0].first), _site(data, path.pieces[0].last), scene.cords[tendon])
@@ -132,7 +132,7 @@ def _catenary(first: jax.Array, last: jax.Array, values: jax.Array) -> jax.Array
 
 
 class _Wrap(NamedTuple):
-    """Course of a tendon around a geom: points [ARC + 1, 3] of the arc (m), its length (m), and if there is contact at all."""
+    """Path of a tendon around a geom: points [ARC + 1, 3] of the arc (m, world), its length (m), and a flag for contact."""
 
     points: jax.Array
     length: jax.Array
@@ -140,7 +140,7 @@ class _Wrap(NamedTuple):
 
 
 def _wrap(scene: Any, data: Any, piece: Piece) -> _Wrap:
-    """Compute the course of a piece around its sphere or cylinder, as the physics does."""
+    """Compute the path of a piece around its sphere or cylinder, as in the physics."""
     centre = jnp.asarray(data.geom_xpos, jnp.float32)[piece.geom]
     rotation = jnp.asarray(data.geom_xmat, jnp.float32).reshape(-1, 3, 3)[piece.geom]
     radius = scene.size[piece.geom, 0]
@@ -171,7 +171,7 @@ def _wrap(scene: Any, data: Any, piece: Piece) -> _Wrap:
     angles = (start + turn * jnp.linspace(0.0, 1.0, tendons.ARC + 1))[:, None]
     points, length = radius * (jnp.cos(angles) * across + jnp.sin(angles) * up), radius * jnp.abs(turn)
     if not piece.is_ball:
-        # Along the cylinder, in proportion to the way.
+        # Position along the cylinder's axis, proportional to the path length in the plane.
         before, after = _norm(begin[:2] - points[0, :2]), _norm(end[:2] - points[-1, :2])
         way = jnp.maximum(before + length + after, _TINY)
         low, high = (begin[2] + (end[2] - begin[2]) * part / way for part in (before, before + length))
@@ -182,10 +182,10 @@ def _wrap(scene: Any, data: Any, piece: Piece) -> _Wrap:
 
 
 def _around_circle(begin: jax.Array, end: jax.Array, toward: jax.Array | None, radius: jax.Array) -> tuple:
-    """Compute the way around a circle at the origin: angle of its beginning, turn (radians), and if there is contact.
+    """Compute the path around a circle at the origin: start angle and signed turn (rad), and a flag for contact.
 
-    The way is the short one, where the circle is in between; or the long one around the back of the circle, where ``toward``
-    points there: into the angle opposite to that between the two ends. (MuJoCo before 4.0, and MJX, have another rule.)
+    It is the short path if the circle obstructs the straight line, or the long one around the back of the circle if ``toward``
+    points there: into the angle opposite to that between the two ends. (MuJoCo before 4.0, and MJX, use another rule.)
     """
     area = _area(begin, end)
     is_long = jnp.zeros((), bool)
@@ -209,7 +209,7 @@ def _area(one: jax.Array, two: jax.Array) -> jax.Array:
 
 
 def _tangents(begin: jax.Array, end: jax.Array, radius: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the tangent points of one way around a circle, and if the two straight parts cross."""
+    """Return the tangent points [2] of one path around a circle, and True if its two straight parts cross."""
 
     def tangent(point: jax.Array, sign: jax.Array) -> jax.Array:
         square = jnp.maximum(jnp.sum(point * point), _TINY)
@@ -229,7 +229,7 @@ def _tangents(begin: jax.Array, end: jax.Array, radius: jax.Array, sign: jax.Arr
 
 
 def _inside_circle(begin: jax.Array, end: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Compute the angle of the point of a circle to which it holds a tendon inside itself, and if it does at all."""
+    """Compute the angle (rad) of the point where a circle constrains a tendon passing inside it, and a flag for contact."""
     start = jnp.arctan2(begin[1], begin[0])
     turn = jnp.arctan2(_area(begin, end), jnp.sum(begin * end))
 
@@ -248,7 +248,7 @@ def _inside_circle(begin: jax.Array, end: jax.Array, radius: jax.Array) -> tuple
         rises = slope(middle) > 0.0
         return jnp.where(rises, ends[0], middle), jnp.where(rises, middle, ends[1])
 
-    # The way is shortest where its slope is 0.
+    # The path is shortest where the slope of its length is 0.
     low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (jnp.zeros((), jnp.float32), jnp.ones((), jnp.float32)))
     along = end - begin
     share = -jnp.sum(begin * along) / jnp.maximum(jnp.sum(along * along), _TINY)
@@ -275,6 +275,6 @@ def _site(data: Any, index: int) -> jax.Array:
 
 
 def _norm(vector: jax.Array) -> jax.Array:
-    """Return lengths along the last axis; its derivative is finite everywhere."""
+    """Return norms along the last axis, with finite derivatives everywhere."""
     square = jnp.sum(vector * vector, axis=-1)
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)

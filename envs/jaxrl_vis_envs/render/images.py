@@ -1,6 +1,6 @@
 """Rendering of one environment: `render` for viewing and files, `render_planes` for the hot path. Use `jax.vmap` for a batch.
 
-There are three stages: all linear work once per environment (`pixel.shapes`, `pixel.lights`); the nearest object of each pixel
+There are three stages: all linear work, once per environment (`pixel.shapes`, `pixel.lights`); the nearest object of each pixel
 (`pixel.raycast`, `pixel.triangles`), an integer that is never differentiated; and, once per pixel, depth, normal and colour of
 that object from a row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two stages are one kernel on a GPU
 (`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`).
@@ -62,7 +62,7 @@ def render_planes(
         data: Poses of one environment: `mjx.Data` or `mujoco.MjData` after forward kinematics (`mjx.kinematics` is enough), or
             any object with ``geom_xpos`` [ngeom, 3], ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and likewise ``site_xpos`` and
             ``site_xmat`` if sites are rendered. Cameras and lights attached to, tracking or aiming at bodies also need ``xpos``
-            and ``xmat``, those that follow a centre of mass ``xipos``. A geom with a non-finite pose is not rendered.
+            and ``xmat``; those that follow a centre of mass also need ``xipos``. Geoms with a non-finite pose are not rendered.
         rgb: Compute colours.
         depth: Compute the planar depth.
         segmentation: Compute the object id of each pixel.
@@ -94,14 +94,14 @@ def render_planes(
 
 
 def _in_32_bits(scene: Scene) -> Scene:
-    """Convert the leaves to the dtypes that `Scene` documents, whether they are Python numbers or 64-bit arrays."""
+    """Convert the leaves, which may be Python numbers or 64-bit arrays, to the dtypes that `Scene` documents."""
     leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
     dtypes = {name: _INTEGERS.get(name, jnp.float32) for name in leaves}
     return scene.replace(**{name: jnp.asarray(getattr(scene, name), dtype) for name, dtype in dtypes.items()})
 
 
 def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
-    """Return the fast rendering function for these outputs on the platform being traced for, or None."""
+    """Return the fast rendering function for these outputs on the platform being traced for, None if there is none."""
     for path in (kernel, passes):
         if path.can_render(scene, outputs):
             return path.draw
@@ -110,7 +110,7 @@ def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _draw_along(path: _Path, outputs: Outputs, *arguments: Any) -> Planes:
-    """Render along ``path``. Jitted so that it is traced only once, however many programs contain it."""
+    """Render with ``path``. Jitted so that it is traced only once for all programs that contain it."""
     with tracing_for(path.platform):
         return _draw(outputs, *arguments) if path.fast is None else _draw_fast(path, outputs, *arguments)
 
@@ -167,7 +167,7 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
 
 
 def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: blocks.Nearest) -> Planes:
-    """Compute the requested planes of a block of pixels [P] whose nearest objects are known; vectors as three components."""
+    """Compute the requested planes of a block of pixels [P] from their nearest objects; vectors as three components."""
     near, index = raycast.decode(scene, nearest.key, nearest.row)
     hit_mask = index >= 0
     far = near
@@ -198,9 +198,9 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
 
 
 def _declared_last(scene: Scene, view: _View, rays: Rays, nearest: blocks.Nearest, index: jax.Array) -> jax.Array:
-    """Return the rows ``index`` [P], replaced by the reflecting object's where it coincides with one declared before it.
+    """Replace rows ``index`` [P] by the reflecting object's row where it coincides with an object declared before it.
 
-    There, MuJoCo renders the colour of the other object, but the segmentation label of the reflecting one.
+    There, MuJoCo renders the colour of the other object, but the segmentation label of the reflecting object.
     """
     mask = raycast.code_mask(scene)
     last = len(scene.object_ids) - 1

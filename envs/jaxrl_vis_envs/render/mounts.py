@@ -20,7 +20,7 @@ _ROUNDING = 4e-7
 
 
 class Mount(NamedTuple):
-    """Attachment of a camera or a light to a body: a static part of the scene.
+    """Attachment of a camera or a light to a body, a static part of the scene.
 
     Attributes:
         mode: A value of `mujoco.mjtCamLight`.
@@ -34,19 +34,19 @@ class Mount(NamedTuple):
 
     @property
     def aims(self) -> bool:
-        """True if it aims at its target."""
+        """True if the mount aims at its target."""
         return self.target >= 0 and self.mode in (_MODES.mjCAMLIGHT_TARGETBODY, _MODES.mjCAMLIGHT_TARGETBODYCOM)
 
     @property
     def posed(self) -> int:
-        """Highest index of a body whose pose is used; 0 for none, since the world does not move."""
+        """Highest index of the bodies whose poses are used; 0 if none, since the world does not move."""
         by_mass = self.mode == _MODES.mjCAMLIGHT_TRACKCOM
         target = self.target if self.aims and self.mode == _MODES.mjCAMLIGHT_TARGETBODY else _WORLD
         return max(_WORLD if by_mass else self.body, target)
 
     @property
     def weighed(self) -> int:
-        """Index of the body whose subtree's centre of mass is used; -1 for none."""
+        """Index of the body whose subtree's centre of mass is used; -1 if none."""
         if self.mode == _MODES.mjCAMLIGHT_TRACKCOM:
             return self.body
         return self.target if self.aims and self.mode == _MODES.mjCAMLIGHT_TARGETBODYCOM else -1
@@ -91,7 +91,7 @@ def mount_position(bodies: Bodies, data: Any, mount: Mount, offset: jax.Array) -
 
 
 def target_position(bodies: Bodies, data: Any, mount: Mount) -> jax.Array:
-    """Compute the point that a mount aims at, [3] float32 (m)."""
+    """Compute the point in the world that a mount aims at, [3] float32 (m)."""
     if mount.mode == _MODES.mjCAMLIGHT_TARGETBODYCOM:
         return centre_of_mass(bodies, data, mount.target)
     return jnp.zeros(3, jnp.float32) if mount.target == _WORLD else jnp.asarray(data.xpos, jnp.float32)[mount.target]
@@ -108,7 +108,7 @@ def centre_of_mass(bodies: Bodies, data: Any, body: int) -> jax.Array:
 
 
 def _subtree(parents: tuple[int, ...], body: int) -> list[int]:
-    """Return the indices of a body and all its descendants. MuJoCo sorts bodies after their parents."""
+    """Return the indices of a body and all its descendants. In MuJoCo, bodies come after their parents."""
     members = {body}
     for index in range(body + 1, len(parents)):
         if parents[index] in members:
@@ -121,14 +121,14 @@ def look_at(position: jax.Array, aim: jax.Array) -> jax.Array:
     back = position - aim
     rounding = _ROUNDING * (jnp.max(jnp.abs(position)) + jnp.max(jnp.abs(aim)))
     z = _unit(back, rounding)
-    # Vertical directions, and differences within rounding error, do not determine the horizontal axis.
+    # The horizontal axis is undetermined for vertical directions and for differences within rounding error.
     x = _unit(jnp.stack([-back[1], back[0], jnp.zeros_like(back[0])]), rounding)
     y = jnp.stack([z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0]])
     return jnp.stack([x, y, z], axis=1)
 
 
 def _unit(vector: jax.Array, rounding: jax.Array) -> jax.Array:
-    """Normalise a vector [3]; if it is not longer than the rounding error, return the x axis."""
+    """Normalise a vector [3]; return the x axis if its norm does not exceed the rounding error."""
     square = jnp.sum(vector * vector)
     none = square <= jnp.square(rounding) + _MIN_VALUE * _MIN_VALUE
     return jnp.where(none, jnp.array([1.0, 0.0, 0.0], jnp.float32), vector / jnp.sqrt(jnp.where(none, 1.0, square)))

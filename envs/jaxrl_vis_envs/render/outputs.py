@@ -11,10 +11,10 @@ class Frame(NamedTuple):
     Attributes:
         rgb: [H, W, 3] uint8.
         depth: [H, W] float32, planar depth in metres (along the camera's axis); the scene's ``zfar`` for the sky.
-        segmentation: [H, W] int32: geom id, ngeom + site id for a site, ngeom + nsite + tendon id for a tendon, -1 for the sky.
-        normals: [H, W, 3] float32, unit vectors in the camera's frame (x right, y up, z towards the viewer), 0 for the sky; or
-            None.
-        distance: [H, W] float32, metres along the ray, ``zfar`` for the sky; or None.
+        segmentation: [H, W] int32, geom id, ngeom + site id for a site, ngeom + nsite + tendon id for a tendon, -1 for the sky.
+        normals: [H, W, 3] float32, unit vectors in the camera's frame (x right, y up, z towards the viewer), 0 for the sky;
+            None if not requested.
+        distance: [H, W] float32, metres along the ray, ``zfar`` for the sky; None if not requested.
     """
 
     rgb: jax.Array
@@ -25,14 +25,14 @@ class Frame(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """Image as planes, for the hot path: not quantised by default, and only the requested planes.
+    """Image as planes, for the hot path: not quantised by default. Planes that were not requested are None.
 
     Attributes:
-        rgb: [3, H, W] float32 in [0, 1], or uint8 if quantised; or None.
-        depth: [H, W] float32 as in `Frame`, or None.
-        segmentation: [H, W] int32 as in `Frame`, or None.
-        normals: [3, H, W] float32 as in `Frame`, or None.
-        distance: [H, W] float32 as in `Frame`, or None.
+        rgb: [3, H, W] float32 in [0, 1], or uint8 if quantised.
+        depth: [H, W] float32 as in `Frame`.
+        segmentation: [H, W] int32 as in `Frame`.
+        normals: [3, H, W] float32 as in `Frame`.
+        distance: [H, W] float32 as in `Frame`.
     """
 
     rgb: jax.Array | None

@@ -15,7 +15,7 @@ from jaxrl_vis_envs.render.outputs import Frame
 
 
 class ReferenceRenderer:
-    """Renderer of `mujoco.MjData` by `mujoco.Renderer`. Close it, or use it as a context manager.
+    """Renderer of `mujoco.MjData` based on `mujoco.Renderer`. Close it, or use it as a context manager.
 
     Args:
         mj_model: MuJoCo model. Its ``vis.global_.offwidth`` and ``offheight`` limit the image size.

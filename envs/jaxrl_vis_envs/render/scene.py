@@ -1,4 +1,4 @@
-"""Scene: everything an image needs besides the poses, read once from a MuJoCo model.
+"""Scene: all inputs of an image except the poses, read once from a MuJoCo model.
 
 A `Scene` is a pytree. Sizes, colours, materials, lights and camera parameters are leaves, so a batch of appearances is a
 ``jax.vmap`` over ``scene.replace(rgba=...)``; geom types, ids and the image size are static and determine the compiled program.
@@ -38,7 +38,7 @@ class Scene:
 
     Attributes:
         size: [N, 3] float32, metres, as in `mjModel.geom_size` for each type (infinite planes: a very large half-size; tendons:
-            their width, thrice).
+            three times their width).
         bound: [N] float32, metres, radius of each object's bounding sphere, for sorting transparent objects.
         rgba: [N, 4] float32 in [0, 1], colour of the geom or its material. Alpha is used only for the objects marked in
             ``transparent``, which is fixed when the scene is constructed.
@@ -88,8 +88,8 @@ class Scene:
             first. That is descending order, with the reflecting object, if any, at the end.
         object_types: G values of `mujoco.mjtGeom`.
         transparent: G flags: 0 opaque, 1 transparent, 2 a plane that is transparent from behind.
-        reordered: Whether a reflecting object is drawn before objects declared before it. MuJoCo's segmentation keeps the
-            order of declaration.
+        reordered: True if a reflecting object is drawn before objects declared before it. MuJoCo's segmentation keeps the order
+            of declaration.
         geom_count: ngeom of the model.
         tendon_paths: Paths of the tendons.
         camera_id: Index of the camera in the model; `cameras.FREE_CAMERA` for a free one.
@@ -100,10 +100,10 @@ class Scene:
         width: W, pixels.
         light_types: L values of `mujoco.mjtLightType`.
         light_mounts: L attachments of the lights.
-        light_highlights: L + 1 booleans, the last for the headlight: whether the light can cause specular highlights. A light
+        light_highlights: L + 1 booleans, the last for the headlight: True if the light can cause specular highlights. A light
             without a specular colour in the model cannot, and costs less.
-        light_shadows: L booleans: whether the light casts shadows (none does unless shadows are requested).
-        headlight: Whether the headlight is on.
+        light_shadows: L booleans, True if the light casts shadows (none does unless shadows are requested).
+        headlight: True if the headlight is on.
         sky: "plain" (a gradient between two colours), or "texture".
         haze: Index of the infinite plane with a hazy horizon, -1 for no haze; and the width of the haze.
         atlas: Layout of the textures in ``texels``.
@@ -195,26 +195,27 @@ class Scene:
 
         Args:
             mj_model: MuJoCo model.
-            camera: Name or index of one of the model's cameras. None: the free camera of `mujoco.Renderer`, which views the
-                whole model from outside. Or an `mujoco.MjvCamera` with its own ``lookat``, ``distance``, ``azimuth`` and
+            camera: Name or index of one of the model's cameras; None for the free camera of `mujoco.Renderer`, which views the
+                whole model from outside; or a `mujoco.MjvCamera` with its own ``lookat``, ``distance``, ``azimuth`` and
                 ``elevation``. A free camera does not move.
             height: Image height in pixels.
             width: Image width in pixels.
             groups: Visible geom groups (default as in `mujoco.Renderer`).
-            site_groups: Visible site groups. None by default, unlike in `mujoco.Renderer`: sites are markers for users.
+            site_groups: Visible site groups; by default no group, unlike in `mujoco.Renderer`, because sites are markers for
+                users.
             tendon_groups: Visible groups of spatial tendons (default as in `mujoco.Renderer`).
             textured: Render textures. If False, which is cheaper, an object has its texture's mean colour, and the sky is a
                 gradient between its colours at the zenith and the nadir.
-            textures: Names or indices of further textures to load, for scenes in which objects have another one than in the
+            textures: Names or indices of further textures to load, for scenes whose objects have other textures than in the
                 model.
             shadows: Render hard shadows of the lights that cast shadows in the model: one more ray per light.
             haze: Render haze at the horizon of the first infinite plane, as in the model's visual settings.
-            plane_backs: True: planes are partly transparent from behind, as in MuJoCo. False: they look the same from both
-                sides, which is cheaper. None: planes that the camera is behind in the model's initial pose are transparent,
-                which is correct unless camera and plane pass each other.
-            leave_out: Names of geoms not to render, and "skin" or "flex" for all of those.
-            lights: "all": all lights except image lights, which MuJoCo ignores too. "mujoco": also without point lights, which
-                MuJoCo's renderer does not support, to reproduce its images.
+            plane_backs: If True, planes are partly transparent from behind, as in MuJoCo. If False, they look the same from
+                both sides, which is cheaper. If None, only planes that the camera is behind in the model's initial pose are
+                transparent, which is correct unless camera and plane pass each other.
+            leave_out: Names of geoms not to render; "skin" and "flex" stand for all skins or flexes.
+            lights: "all": all lights except image lights, which MuJoCo ignores too. "mujoco": point lights, which MuJoCo's
+                renderer does not support, are also excluded, to reproduce its images.
 
         Returns:
             The scene. Objects with alpha 0 and objects of other groups are omitted.
@@ -288,8 +289,8 @@ class Scene:
     def intrinsics(self) -> jax.Array:
         """Compute the camera's intrinsic matrix in OpenCV's convention, in pixels.
 
-        Pixel centres are at whole numbers: (0, 0) is the centre of the top left pixel. A function of the leaves ``fovy``,
-        ``focal``, ``principal`` and ``sensor``, hence traceable.
+        Pixel centres are at integer coordinates: (0, 0) is the centre of the top left pixel. The matrix is a function of the
+        leaves ``fovy``, ``focal``, ``principal`` and ``sensor``, hence traceable.
 
         Returns:
             [3, 3] float32.
@@ -311,7 +312,7 @@ class Scene:
         return viewpoint.extrinsic_matrix(self, data)
 
     def points(self, depth: jax.Array, data: Any = None) -> jax.Array:
-        """Compute the point that each pixel of a depth image shows: a point cloud in the order of the pixels.
+        """Convert a depth image to a point cloud in the order of the pixels.
 
         Args:
             depth: [H, W], planar depth in m, as in `Frame`. Pixels of the sky are points on the far plane.

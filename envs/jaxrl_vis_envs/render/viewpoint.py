@@ -1,7 +1,7 @@
 """Pose and lens of a scene's camera, its intrinsic matrix, and points from depths.
 
-Below `scene` in the order of imports, so that `Scene` can offer these as methods. Functions take any object with the camera's
-fields of `Scene`.
+Imported by `scene`, which offers these functions as methods of `Scene`. They take any object with the camera's fields of
+`Scene`.
 
 Two frames of the camera occur. The renderer's own is OpenGL's: x right, y up, looking along -z. Matrices and points for users
 are in OpenCV's: x right, y down, looking along z.
@@ -25,8 +25,8 @@ def camera_pose(scene: Any, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]
 
     Args:
         scene: The scene.
-        data: `mjx.Data`, `mujoco.MjData` or any object with the body poses that `mounts.mount_position` reads. A camera fixed
-            to the world needs none.
+        data: `mjx.Data`, `mujoco.MjData` or any object with the body poses that `mounts.mount_position` reads. Unused for a
+            camera fixed to the world.
 
     Returns:
         Position [3] float32 in metres, rotation [3, 3] float32 whose columns are the camera's axes, and a flag ([] bool) that
@@ -52,7 +52,7 @@ def camera_pose(scene: Any, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]
 
 @jax.custom_jvp
 def barrier(tree: Any) -> Any:
-    """Prevent XLA from recomputing a value for every use. JAX 0.11 cannot transpose its own barrier."""
+    """Prevent XLA from recomputing values for every use. Differentiable in both modes; JAX 0.11's own barrier is not."""
     return jax.lax.optimization_barrier(tree)
 
 

@@ -11,7 +11,7 @@ class TaskConfig(checks.CheckedConfig):
     """Settings shared by all built-in tasks."""
 
     horizon: int
-    """Control steps in an episode."""
+    """Number of control steps in an episode."""
     threshold: float
     """Distance to the goal within which an episode succeeds, in the task's `distance_unit`."""
     randomization: Randomization = OFF

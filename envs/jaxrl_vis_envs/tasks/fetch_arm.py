@@ -1,4 +1,4 @@
-"""Fetch arm of Gymnasium-Robotics: its start, and the displacements that pull its gripper, which always points down."""
+"""Fetch arm of Gymnasium-Robotics: start state, and actions that displace the gripper, which always points down."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ _SETTLING_SUBSTEPS = 200
 
 
 class FetchArm(PulledArm):
-    """Arm with closed fingers. Its model has the parts of fetch_reach.xml."""
+    """Fetch arm with closed fingers; the model contains the parts of fetch_reach.xml."""
 
     action_size = 4
     action_meaning = (
@@ -35,7 +35,7 @@ class FetchArm(PulledArm):
         Args:
             config: Settings of the task.
             mj_model: Model with the arm.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         self._fingers = np.array([mj_model.joint(name).qposadr[0] for name in ("right_finger", "left_finger")])
         super().__init__(config, mj_model, "gripper", observer)

@@ -45,7 +45,7 @@ _BOX_ON_TABLE = dict(
 )
 _BOX_ON_FLOOR = dict(condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, 1), solimp=(0.9, 0.95, 0.001, 0.5, 2))
 _MOVED = 0.001  # displacement in a control step that counts as a move of the box, m; it settles by less
-_CANDIDATES = 32  # positions drawn at once; none is acceptable in 2 of 10^15 episodes
+_CANDIDATES = 32  # positions sampled at once; the probability that none is acceptable is 2e-15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,15 +54,15 @@ class FetchPushConfig(PulledArmConfig):
 
     horizon: int = 50
     threshold: float = 0.05
-    """Distance of the box from the goal within which an episode succeeds, m."""
+    """Distance between box and goal within which an episode succeeds, m."""
     object_range: float = 0.15
-    """The box starts uniformly within this distance of the gripper's start along x and y, m."""
+    """Maximum distance of the box's start (uniform) from the gripper's start along x and y, m."""
     object_distance: float = 0.1
-    """Least distance between the starts of box and gripper, m."""
+    """Minimum distance between the starts of box and gripper, m."""
     goal_range: float = 0.15
-    """Goals are uniform within this distance of the gripper's start along x and y, m."""
+    """Maximum distance of goals (uniform) from the gripper's start along x and y, m."""
     met_goals: bool = True
-    """Draws, as the original, goals that the box meets where it starts, too. False draws only others."""
+    """Also sample goals that the box already meets at its start, as in the original. False excludes them."""
     goal_lift: float = 0.14
     """Height of the gripper above its start in a goal image, m."""
     solver_iterations: int = 6
@@ -73,7 +73,7 @@ class FetchPushConfig(PulledArmConfig):
         checks.positive(self, "object_range")
         checks.not_negative(self, "object_distance", "goal_range", "goal_lift")
         checks.boolean(self, "met_goals")
-        # Within these bounds at least a fifth of the square is left to draw from.
+        # Within these bounds at least a fifth of the square is left to sample from.
         if self.object_distance > self.object_range:
             raise ValueError(f"object_distance must be at most object_range, {self.object_range}, got {self.object_distance}")
         if not self.met_goals and self.threshold > self.goal_range:
@@ -89,7 +89,7 @@ class VisualFetchPushConfig(PixelsConfig, FetchPushConfig):
 
 
 class FetchPush(FetchArm):
-    """The task. ``observer`` determines what the agent sees."""
+    """Fetch push task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     config: FetchPushConfig
     camera = "front"
@@ -101,7 +101,7 @@ class FetchPush(FetchArm):
 
         Args:
             config: Settings of the task.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         mj_model = mjx_model.load_model("fetch_reach.xml", _add_box)
         self._box = mj_model.body("box").id
@@ -111,7 +111,7 @@ class FetchPush(FetchArm):
         self._goal_pose, self._goal_grip = self._lifted(mj_model)
 
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
-        """Return the original's start, in which the fingers are still pressed 2.5 mm into the table."""
+        """Return the original's start, in which the fingers still penetrate the table by 2.5 mm."""
         mj_data = mujoco.MjData(mj_model)
         mj_data.qpos[:] = (*_START_JOINTS, *_START_BOX, 1.0, 0.0, 0.0, 0.0)
         mj_data.qvel[:] = (*_START_VELOCITIES, *_START_BOX_VELOCITY, 0.0, 0.0, 0.0)
@@ -119,7 +119,7 @@ class FetchPush(FetchArm):
         return mj_data
 
     def _lifted(self, mj_model: mujoco.MjModel) -> tuple[jax.Array, jax.Array]:
-        """Return ``qpos`` of goal images, but for the place of the box, and the position [3] (m, world) of the grip in them."""
+        """Return ``qpos`` for goal images, except for the box's position, and the position [3] (m, world) of the grip there."""
         mj_data = mujoco.MjData(mj_model)
         mj_data.qpos[:] = self._start.qpos
         mujoco.mj_forward(mj_model, mj_data)
@@ -139,7 +139,7 @@ class FetchPush(FetchArm):
         return state.replace(metrics={**state.metrics, "moved": jnp.zeros(())})
 
     def advance(self, state: State, action: jax.Array) -> State:
-        """Advance as `GoalEnv.advance`; ``metrics["moved"]`` is 1 once the box has moved by a millimetre in a control step."""
+        """Advance as `GoalEnv.advance`; ``metrics["moved"]`` is 1 once the box has moved by over 1 mm in a control step."""
         after = super().advance(state, action)
         moves = jnp.linalg.norm(after.achieved_state - state.achieved_state) > _MOVED
         moved = jnp.maximum(state.metrics["moved"], moves.astype(jnp.float32))
@@ -155,7 +155,7 @@ class FetchPush(FetchArm):
         return self._with_box(still, self._goal_pose, place)
 
     def _places(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Sample where the box starts and its goal: [2] each, m in the world."""
+        """Sample the start and the goal of the box: [2] each, m in the world."""
         config = self.config
         start_key, goal_key = jax.random.split(key)
         middle = self._start.site_xpos[self._grip, :2]
@@ -165,7 +165,7 @@ class FetchPush(FetchArm):
             return places[jnp.argmax(jnp.linalg.norm(places - origin, axis=-1) >= distance)]
 
         start = first(start_key, config.object_range, middle, config.object_distance)
-        # A threshold and a tenth of a millimetre: the box meets its goal up to the threshold itself.
+        # Slightly above the threshold, since the box meets its goal at the threshold itself.
         away = 0.0 if config.met_goals else config.threshold + 1e-4
         return start, first(goal_key, config.goal_range, start, away)
 
@@ -182,9 +182,9 @@ class FetchPush(FetchArm):
         return self._draw is None or super().converts_goals
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
-        """Return the observation of the goal that a box at its place would meet: with the arm as in goal images, at rest.
+        """Return the goal observation that the box in ``frame`` meets: the box there, and the arm at rest as in goal images.
 
-        So a policy that observes states is told where the box should be, and nothing else, as in the original.
+        A policy that observes states thus learns only where the box should be from a goal, as in the original.
         """
         if self._draw is not None:
             return super().as_goal(frame)
@@ -194,8 +194,8 @@ class FetchPush(FetchArm):
     def observe_state(self, data: mjx.Data) -> jax.Array:
         """Return the original's observation: [25] float32, lengths in m, angles in rad, velocities per control step.
 
-        Positions of grip and box and of the box from the grip, of the two fingers, and the box's Euler angles; velocities of
-        the box relative to the grip, of the box's rotation, of the grip, and of the fingers.
+        Positions of the grip, the box, the box relative to the grip, and the two fingers, and the box's Euler angles; then the
+        velocity of the box relative to the grip, its angular velocity, and the velocities of the grip and the fingers.
         """
         grip, box = data.site_xpos[self._grip], data.xpos[self._box]
         grip_velocity = mjx_model.point_velocity(self.mj_model, data, self._hand, grip)
@@ -206,7 +206,7 @@ class FetchPush(FetchArm):
 
 
 def _euler_angles(rotation: jax.Array) -> jax.Array:
-    """Return angles [3] (rad) about x, y and z of a rotation matrix [3, 3], as the original's ``mat2euler``."""
+    """Convert a rotation matrix [3, 3] to angles [3] (rad) about x, y and z, as the original's ``mat2euler``."""
     cosine = jnp.hypot(rotation[2, 2], rotation[1, 2])
     is_regular = cosine > 1e-6
     roll = jnp.where(is_regular, -jnp.arctan2(rotation[1, 2], rotation[2, 2]), 0.0)
@@ -215,7 +215,7 @@ def _euler_angles(rotation: jax.Array) -> jax.Array:
 
 
 def _add_box(spec: mujoco.MjSpec) -> None:
-    """Add the box, and give the arm of FetchReach the original's fingers."""
+    """Add the box, and replace the fingers of FetchReach's arm by the original's."""
     for side in ("right", "left"):
         spec.delete(spec.pair(f"{side}_finger_on_table"))
         for name in (f"{side}_finger", f"{side}_fingertip"):
@@ -228,7 +228,7 @@ def _add_box(spec: mujoco.MjSpec) -> None:
     box.add_joint(name="box", type=mujoco.mjtJoint.mjJNT_FREE, damping=(0.01, 0.0, 0.0), armature=0.0)
     _add_solid(box, "box", (0.0, 0.0, 0.0), (_HALF_SIZE,) * 3, (0.1, 0.35, 0.8, 1.0), _MASS)
     spec.add_pair(name="box_on_table", geomname1="table", geomname2="box", **_BOX_ON_TABLE)
-    # A box in place of the floor's plane, for a box that is pushed off the table.
+    # A box instead of the floor's plane, on which a box pushed off the table can land.
     _add_solid(spec.worldbody, "ground", (0.0, 0.0, -0.5), (3.0, 3.0, 0.5), (0.0, 0.0, 0.0, 0.0))
     spec.geom("ground").group = 3
     spec.add_pair(name="box_on_floor", geomname1="ground", geomname2="box", **_BOX_ON_FLOOR)

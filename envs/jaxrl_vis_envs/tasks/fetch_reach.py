@@ -39,7 +39,7 @@ _TABLE_TOP = 0.4  # m
 _GREY = (0.356, 0.361, 0.376, 1.0)  # colour of the original's gripper
 # Half-sizes (m) and alpha of the boxes of the original's mocap body.
 _CROSS_HAIR = ((0.005, 0.005, 0.005, 0.7), (1.0, 0.005, 0.005, 0.1), (0.005, 1.0, 0.001, 0.1), (0.005, 0.005, 1.0, 0.1))
-# Camera of Eysenbach et al. (2022, arXiv 2206.07568): one that looks at a point, m, as MuJoCo's free camera; angles in degrees.
+# Camera of Eysenbach et al. (2022, arXiv 2206.07568), which looks at a point (m) like MuJoCo's free camera; angles in degrees.
 _THEIR_CAMERA = "contrastive_rl"
 _LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION, _FOVY = (1.2, 0.8, 0.5), 0.8, 180.0, -30.0, 45.0
 _GOAL_STEPS, _GOAL_GAIN = 10, 10.0  # control steps towards the goal before their goal image is taken; actions per metre
@@ -56,11 +56,11 @@ class FetchReachConfig(PulledArmConfig):
     threshold: float = 0.05
     """Distance to the goal within which an episode succeeds, m."""
     goal_range: float = 0.15
-    """Goals are uniform within this distance of the start along each axis, m."""
+    """Maximum distance of goals (uniform) from the start along each axis, m."""
     solver_iterations: int = 4
     """Newton iterations per physics step. One is enough in free space, but not while the fingers rub on the table."""
     goal_at: GoalAt = "grip"
-    """Point of the gripper that is at the goal in a goal image: the grip site or, as in the release, its link 2 cm above."""
+    """Point of the gripper at the goal in a goal image: the grip site or, as in the release, the link 2 cm above it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,12 +77,12 @@ class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
     clip_range: tuple[float, float] = (0.026, 130.0)
     """Near and far clipping planes of the release, m."""
     cross_hair: bool = False
-    """Renders the release's cross-hair at the mocap body that pulls the gripper; at the goal in an episode's first image."""
+    """Render the release's cross-hair at the mocap body that pulls the gripper; in an episode's first image, at the goal."""
     view: View = "front"
-    """Camera and goal images. front: facing the robot. contrastive_rl: those of contrastive RL's ``fetch_reach_image``, whose
-    goal images show where ten steps in proportion to the distance lead; its images are ``pixels="rgb"``."""
+    """Camera and goal images. front: facing the robot. contrastive_rl: those of contrastive RL's ``fetch_reach_image``, with
+    goal images taken after ten proportional steps towards the goal; its images are ``pixels="rgb"``."""
     finger_colour: FingerColour = "orange"
-    """Orange fingers, which stand out, or grey ones as in the original."""
+    """Colour of the fingers: orange, which stands out, or grey as in the original."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -94,7 +94,7 @@ class VisualFetchReachConfig(PixelsConfig, FetchReachConfig):
 
 
 class FetchReach(FetchArm):
-    """The task. ``observer`` determines what the agent sees."""
+    """Fetch reach task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     config: FetchReachConfig
     camera = "front"
@@ -105,7 +105,7 @@ class FetchReach(FetchArm):
 
         Args:
             config: Settings of the task.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         self._has_cross_hair = isinstance(config, VisualFetchReachConfig) and config.cross_hair
         self._is_their_view = self.select_camera(config) == _THEIR_CAMERA
@@ -151,7 +151,7 @@ class FetchReach(FetchArm):
         return self.achieved(goal_data) if is_shown else self._goal_point(key)
 
     def _driven_towards(self, goal: jax.Array) -> mjx.Data:
-        """Return the robot after actions in proportion to the distance of its grip from ``goal`` [3] (m, world)."""
+        """Return the state after ten actions proportional to the distance from the grip to ``goal`` [3] (m, world)."""
 
         def drive(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
             towards = jnp.clip(_GOAL_GAIN * (goal - self.achieved(data)), -1.0, 1.0)
@@ -177,10 +177,10 @@ class FetchReach(FetchArm):
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """Return the robot at rest with its grip as near to ``goal`` [3] (m, world) as joints and table allow, pointing down.
 
-        With ``goal_at="link"`` it is the gripper's link that is at the goal.
+        With ``goal_at="link"``, the gripper's link is at the goal instead of the grip.
 
-        The joint angles agree with those after driving the arm there for 200 substeps within .002 rad in the median and .02 rad
-        at the 99th percentile of 300 goals, and a reset costs a hundredth.
+        For 300 goals, the joint angles differ from those after driving the arm there for 200 substeps by .002 rad (median) and
+        .02 rad (99th percentile), and a reset costs a hundredth.
         """
         fingertip = self.mj_model.geom("right_fingertip").id
         lowest = _TABLE_TOP + float(self.mj_model.geom_pos[fingertip, 0] + self.mj_model.geom_size[fingertip, 0])
@@ -200,7 +200,7 @@ def _add_cross_hair(spec: mujoco.MjSpec) -> None:
 
 
 def _add_their_camera(spec: mujoco.MjSpec) -> None:
-    """Add the camera of contrastive RL's task, at rest in the world."""
+    """Add the camera of contrastive RL's task, fixed in the world."""
     azimuth, elevation = np.deg2rad([_AZIMUTH, _ELEVATION])
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     forward = np.cos(elevation) * level + [0.0, 0.0, np.sin(elevation)]

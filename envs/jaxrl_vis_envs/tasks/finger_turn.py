@@ -25,8 +25,8 @@ from jaxrl_vis_envs.pixels import Observer, PixelsConfig
 from jaxrl_vis_envs.tasks.config import TaskConfig
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv, register_task
 
-# Start candidates sampled together; the first without contact is used. One in ten is in contact, hence all 16 are once in
-# 10^16 episodes.
+# Start candidates sampled together; the first without contact is used. Each is in contact with probability 0.1, so all 16 are
+# with probability 1e-16.
 _START_CANDIDATES = 16
 
 
@@ -42,7 +42,7 @@ class FingerTurnConfig(TaskConfig):
     solver_iterations: int = 4
     """Newton iterations per physics step."""
     line_search_iterations: int = 8
-    """Line search iterations per Newton iteration of MJX's solver; ours, which this task uses, has its own number."""
+    """Line search iterations per Newton iteration of MJX's solver; the package's own, which this task uses, ignores it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,7 +60,7 @@ class VisualFingerTurnConfig(PixelsConfig, FingerTurnConfig):
 
 
 class FingerTurn(MjxGoalEnv):
-    """The task. ``observer`` determines what the agent sees."""
+    """Finger turn task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     action_size = 2
     action_meaning = "torques of the proximal and the distal joint, in multiples of 30 and 15 N m"
@@ -74,7 +74,7 @@ class FingerTurn(MjxGoalEnv):
 
         Args:
             config: Settings of the task.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         mj_model = mjx_model.load_model("finger_turn.xml")
         mj_model.opt.iterations = config.solver_iterations

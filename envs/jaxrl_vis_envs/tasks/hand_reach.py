@@ -3,13 +3,13 @@
 HandReach of Gym's robotics environments with the goals of the OL-AUX release: the fingertip positions after 20 random actions
 from the start, most of which fully open or close each joint. ``goal_rule="meet"`` is Gym's own: the thumb meets a finger above
 the palm or, one time in ten, everything returns to the start; its threshold in Gym is .01 m. The release's images differ from
-ours in the camera pose (``view``) and the fingertip markers (``tip_marks``).
+those here in the camera pose (``view``) and the fingertip markers (``tip_marks``).
 
     VisualHandReach   observes RGB-D from above the palm; each fingertip has its own colour
     HandReach         observes joint angles and velocities, and fingertip positions
 
 State: positions in the world of the tips of the first, middle, ring and little finger and the thumb, m; the distance is that of
-the 15 numbers together. Action: a target angle for each of the 20 actuators, with -1 and 1 at the ends of its range. The distal
+all 15 coordinates. Action: a target angle for each of the 20 actuators, with -1 and 1 at the ends of its range. The distal
 joints of the four fingers have no actuator; a tendon couples each to the joint before it.
 """
 
@@ -54,7 +54,7 @@ class HandReachConfig(TaskConfig):
 
     horizon: int = 50
     threshold: float = 0.03
-    """Distance of the 15 numbers to the goal's within which an episode succeeds, m (1.3 cm rms per finger)."""
+    """Distance of the 15 fingertip coordinates from the goal's within which an episode succeeds, m (1.3 cm rms per finger)."""
     goal_rule: Literal["random_actions", "meet"] = "random_actions"
     """Source of goals: random actions from the start (the release), or thumb and finger meeting (Gym)."""
     goal_actions: int = 20
@@ -66,7 +66,7 @@ class HandReachConfig(TaskConfig):
     goal_substeps: int = 10
     """Physics steps per control step while generating a goal, for which only the distribution matters."""
     contacts: bool = True
-    """Let fingers, thumb and palm collide. False is for measuring the effect of contacts."""
+    """Simulate collisions of fingers, thumb and palm. False is for measuring the effect of contacts."""
     solver_iterations: int = 1
     """Newton iterations per physics step."""
     line_search_iterations: int = 4
@@ -100,7 +100,7 @@ class VisualHandReachConfig(PixelsConfig, HandReachConfig):
 
 
 class HandReach(MjxGoalEnv):
-    """The task. ``observer`` determines what the agent sees."""
+    """Hand reach task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     action_size = 20
     action_meaning = "target angles of the 20 actuators, in the model's order, with -1 and 1 at the ends of each one's range"
@@ -114,7 +114,7 @@ class HandReach(MjxGoalEnv):
 
         Args:
             config: Settings of the task.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         is_release_view = self.select_camera(config) == _RELEASE_CAMERA
         mj_model = mjx_model.load_model("hand_reach.xml", _add_release_camera if is_release_view else None)
@@ -188,7 +188,7 @@ class HandReach(MjxGoalEnv):
         return 0.5 * (low + high) + 0.5 * (high - low) * action
 
     def _after_random_actions(self, key: jax.Array) -> mjx.Data:
-        """Return the hand at rest in the configuration that random actions from the start lead to."""
+        """Return the hand at rest in the configuration reached by random actions from the start."""
         uniform_key, noise_key = jax.random.split(key)
         shape = (self.config.goal_actions, self.action_size)
         actions = jax.random.uniform(uniform_key, shape, jnp.float32, -1.0, 1.0)
@@ -196,7 +196,7 @@ class HandReach(MjxGoalEnv):
 
         def act(data: mjx.Data, action: jax.Array) -> tuple[mjx.Data, None]:
             data = data.replace(ctrl=self._targets(action))
-            # Not exact, but in the kernel of the exact steps of `act`.
+            # Not exact, but False (not None) shares the kernel with the exact steps of `act`.
             return mjx_model.take_steps(self._goal_model, data, self.config.goal_substeps, exact=False), None
 
         return self.configuration(jax.lax.scan(act, self._start, actions)[0].qpos)
@@ -221,7 +221,7 @@ def _add_release_camera(spec: mujoco.MjSpec) -> None:
 
 
 def _joints_by_actuator(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return the rotation of each joint, coupled ones included, per radian of each actuator's joint: [nq, nu]."""
+    """Return the rotation of each joint (including coupled ones) per radian of each actuated joint: [nq, nu]."""
     ratios = np.zeros((mj_model.nq, mj_model.nu))
     joints = mj_model.actuator_trnid[:, 0]
     ratios[joints, np.arange(mj_model.nu)] = 1.0

@@ -1,7 +1,7 @@
 """Base class of the MJX tasks. A task defines its start, goals, actions and true state.
 
-A task is a subclass of `MjxGoalEnv` with five methods, and a frozen config with ``horizon`` and ``threshold``. With a
-`pixels.Observer` it is the visual task, without one the state task; `register_task` registers both.
+A task is a subclass of `MjxGoalEnv` with five methods, and a frozen config with ``horizon`` and ``threshold``. It is the visual
+task with a `pixels.Observer`, and the state task without one; `register_task` registers both.
 """
 
 import abc
@@ -30,17 +30,17 @@ class MjxGoalEnv(GoalEnv):
 
     camera: str  # model camera of the visual task, unless `select_camera` is overridden
     goal_box: tuple[np.ndarray, np.ndarray] | None = (
-        None  # corners [3] of the goals of `goal_configuration`, m; None: it has none
+        None  # lower and upper corner [3] of the goals of `goal_configuration`, m in the world; None without that method
     )
-    exact_contacts: bool = False  # whether physics steps are those of `mjx_model.step` with ``exact``
+    exact_contacts: bool = False  # take physics steps with ``exact`` (see `mjx_model.step`)
 
     def __init__(self, config: Any, mj_model: mujoco.MjModel, observer: Callable[[mujoco.MjModel], Observer] | None) -> None:
-        """Store what all tasks have in common.
+        """Store the attributes common to all tasks.
 
         Args:
             config: Settings of the task.
             mj_model: MuJoCo model; later changes to it have no effect.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
 
         Raises:
             ValueError: JAX runs in 64 bits, or ``config.randomization`` varies the appearance of a task that renders no scene.
@@ -94,14 +94,14 @@ class MjxGoalEnv(GoalEnv):
         """Return the true quantity that goals constrain, `State.achieved_state`: [G] float32."""
 
     def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
-        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``; by default, what that achieves."""
+        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``; by default, `achieved` of that."""
         return self.achieved(goal_data)
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
         """Return the robot at rest at a goal within `goal_box`, [3] float32 (m, world), with its poses.
 
         Raises:
-            NotImplementedError: Goals of this task are no points in space.
+            NotImplementedError: The goals of this task are not points in space.
         """
         raise NotImplementedError(f"goals of {type(self).__name__} are no points in space")
 
@@ -130,8 +130,8 @@ class MjxGoalEnv(GoalEnv):
         return self._observe(state.data, state.history, state.domain)
 
     def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: randomization.Domain | None = None) -> State:
-        """Return the State of an episode that starts at ``data``, with goal state [G], without images, and varied only by
-        ``domain``.
+        """Return the State of an episode that starts at ``data``, with goal state [G], without images, and with the
+        randomisation ``domain``.
         """
         history = start_history(data.qpos, self.frame_stack)
         return self._measure(data, self.achieved(data), goal_state, None, history, domain)
@@ -160,7 +160,7 @@ class MjxGoalEnv(GoalEnv):
         return jax.eval_shape(lambda: mjx.make_data(self.mj_model, device=jax.local_devices()[0]))
 
     def _with_dynamics(self, domain: randomization.Domain | None) -> Self:
-        """Return a copy of this task with the dynamics of an episode, so that `act` remains a function of its arguments."""
+        """Return a copy of this task with the randomised dynamics of an episode, so that `act` remains a pure function."""
         if not self._randomization.varies_model or domain is None:
             return self
         varied = copy.copy(self)

@@ -1,4 +1,4 @@
-"""Base of the two tasks whose arm a weld pulls to a mocap body: settings, start, achieved state and state observation."""
+"""Base of the tasks whose arm is pulled by a weld to a mocap body: settings, start, achieved state and state observation."""
 
 import abc
 import dataclasses
@@ -38,7 +38,7 @@ class PulledArmConfig(TaskConfig):
 
 
 class PulledArm(MjxGoalEnv):
-    """Arm without motors, pulled by its hand. Goals are positions of its grip, m in the world."""
+    """Task with an arm without motors, pulled by its hand. Goals are positions of its grip, m in the world."""
 
     distance_unit = "m"
     control_period = CONTROL_PERIOD
@@ -56,7 +56,7 @@ class PulledArm(MjxGoalEnv):
             config: Settings of the task.
             mj_model: Model with a site called "grip" and a single mocap body.
             hand: Name of the body that is pulled.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         mj_model.opt.iterations = config.solver_iterations
         self._hand = mj_model.body(hand).id

@@ -36,13 +36,13 @@ class ReacherConfig(TaskConfig):
     threshold: float = 0.01
     """Distance between fingertip and goal within which an episode succeeds, m."""
     start_range: float = 0.1
-    """Start angles of both joints are uniform within this distance of 0, rad."""
+    """Maximum magnitude of the start angles of both joints (uniform), rad."""
     control: Literal["velocity", "torque"] = "velocity"
     """Meaning of an action: the joint velocity at the start of the control step, or the torque during it."""
     velocity_scale: float = 10.0
     """Joint velocity of an action of 1 under velocity control, rad/s (one control step then turns the joint by .95 rad)."""
     substeps: int | None = None
-    """Physics steps of 10 ms in a control step. None: 10 under velocity control, 2 under torque control."""
+    """Physics steps of 10 ms per control step; if None, 10 under velocity control and 2 under torque control."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,7 +62,7 @@ class VisualReacherConfig(PixelsConfig, ReacherConfig):
 
 
 class Reacher(MjxGoalEnv):
-    """The task. ``observer`` determines what the agent sees."""
+    """Reacher task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     action_size = 2
     action_meaning = (
@@ -78,7 +78,7 @@ class Reacher(MjxGoalEnv):
 
         Args:
             config: Settings of the task.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         mj_model = mjx_model.load_model("reacher.xml")
         self._substeps = config.substeps or _DEFAULT_SUBSTEPS[config.control]
@@ -108,7 +108,7 @@ class Reacher(MjxGoalEnv):
         return data.site_xpos[self._fingertip, :2]
 
     def observe_state(self, data: mjx.Data) -> jax.Array:
-        """Cosines and sines of both joint angles, fingertip x and y (m), joint velocities (rad/s): [8] float32."""
+        """Return cosines and sines of both joint angles, fingertip x and y (m), joint velocities (rad/s): [8] float32."""
         return jnp.concatenate([jnp.cos(data.qpos), jnp.sin(data.qpos), self.achieved(data), data.qvel])
 
     def configuration(self, joint_angles: jax.Array) -> mjx.Data:

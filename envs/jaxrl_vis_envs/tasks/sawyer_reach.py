@@ -1,9 +1,9 @@
 """Sawyer reach: move the hand of a Sawyer arm, by position control, to a point in a large box above the table.
 
 The real-robot task of the thesis (5.1.5.2) in simulation: 25 steps of at most 5 cm along each axis, goals uniform in a box with
-a diagonal of 1.30 m, success within 10 cm at the last step. The thesis gives neither the sides nor the position of the box;
-ours is 1.00 x 0.70 x 0.45 m, around the middle of the workspace of the authors' simulated Sawyer, and entirely reachable. An
-episode starts at its centre. A hand that stays there succeeds in 1.3 % of the episodes.
+a diagonal of 1.30 m, success within 10 cm at the last step. The thesis gives neither the sides nor the position of the box.
+Here it is 1.00 x 0.70 x 0.45 m, around the middle of the workspace of the authors' simulated Sawyer, and entirely reachable.
+Episodes start at its centre. A hand that stays there succeeds in 1.3 % of the episodes.
 
     VisualSawyerReach   observes RGB-D from above the far edge of the table
     SawyerReach         observes the hand's position and velocity
@@ -64,7 +64,7 @@ class VisualSawyerReachConfig(PixelsConfig, SawyerReachConfig):
 
 
 class SawyerReach(PulledArm):
-    """The task. ``observer`` determines what the agent sees."""
+    """Sawyer reach task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     config: SawyerReachConfig
     action_size = 3
@@ -79,7 +79,7 @@ class SawyerReach(PulledArm):
 
         Args:
             config: Settings of the task.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         super().__init__(config, mjx_model.load_model("sawyer_reach.xml"), "hand", observer)
         centre, half = np.array(config.goal_centre), np.array(config.goal_size) / 2

@@ -54,7 +54,7 @@ def build(stalks: int) -> mujoco.MjModel:
 def build_servoed(stalks: int) -> mujoco.MjModel:
     """Build the model of the arm with fixed, open jaws, driven by position servos, among stalks without knees.
 
-    Its mocap body "wind" carries numbers only.
+    The pose of its mocap body "wind" only stores numbers.
     """
 
     def edit(spec: mujoco.MjSpec) -> None:
@@ -110,7 +110,7 @@ def grip_at(joints: Any, numeric: Any = jnp) -> Any:
 
 
 def is_within(target: np.ndarray) -> np.ndarray:
-    """Check if link lengths and joint limits let the grip reach a position.
+    """Check if the grip can reach a position within link lengths and joint limits.
 
     Args:
         target: [..., 3], m in the frame of a stand.
@@ -131,7 +131,7 @@ def is_within(target: np.ndarray) -> np.ndarray:
 
 
 def grip_frame(joints: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return unit vectors [..., 2] across the jaws, to the right, and along the forearm, for ``joints`` [..., 3]."""
+    """Return horizontal unit vectors [..., 2] across the jaws (to the right) and along the forearm, for ``joints`` [..., 3]."""
     turn = joints[..., 1] + joints[..., 2]
     along = jnp.stack([-jnp.sin(turn), jnp.cos(turn)], axis=-1)
     return jnp.stack([along[..., 1], -along[..., 0]], axis=-1), along

@@ -45,7 +45,7 @@ class StalkReachConfig(TaskConfig):
 
     horizon: int = 50
     threshold: float = 0.02
-    """Distance of the middle of the jaws to the stalk within which an episode succeeds, m: the stalk is between them."""
+    """Distance between the middle of the jaws and the stalk within which an episode succeeds, m: the stalk is between them."""
     stalks: int = 4
     """Number of stalks, from 1 to 4."""
     spacing: tuple[float, float] = (0.05, 0.09)
@@ -107,7 +107,7 @@ class _Episode(NamedTuple):
 
 
 class StalkReach(MjxGoalEnv):
-    """The task. ``observer`` determines what the agent sees."""
+    """Stalk reach task (see the module docstring), observed as images or as state, depending on ``observer``."""
 
     config: StalkReachConfig
     action_size = 3
@@ -124,7 +124,7 @@ class StalkReach(MjxGoalEnv):
 
         Args:
             config: Settings of the task.
-            observer: Builds the function from poses to images, from the model. None: the agent observes `observe_state`.
+            observer: Function that builds the observer (poses to images) from the model. If None, `observe_state` is used.
         """
         mj_model = stalk_arm.build_servoed(config.stalks)
         mj_model.opt.iterations = config.solver_iterations
@@ -186,7 +186,7 @@ class StalkReach(MjxGoalEnv):
         return (bending.at_height(data, self._layout, height) - rest)[stalk]
 
     def _gusts(self, wind: jax.Array) -> bending.Gusts:
-        """Return the wind of an episode from `_Episode.wind` [3]."""
+        """Build the wind of an episode from `_Episode.wind` [3]."""
         return bending.Gusts(
             heading=jnp.stack([jnp.cos(wind[0]), jnp.sin(wind[0])]),
             strength=jnp.asarray(self.config.wind, jnp.float32),
@@ -219,13 +219,13 @@ def _turn(axis: int, angle: jax.Array) -> jax.Array:
 
 
 def _along(foot: jax.Array, turn: jax.Array, height: jax.Array | float) -> jax.Array:
-    """Return the points [N, 3] (m) of stalks at rest at a height in m."""
+    """Return the points [N, 3] (m, world) of stalks at rest at a ``height`` (m)."""
     axis = jax.vmap(lambda quaternion: rotations.rotate(jnp.array([0.0, 0.0, 1.0]), quaternion))(turn)
     return foot + height / axis[:, 2:] * axis
 
 
 def within_reach(position: jax.Array) -> jax.Array:
-    """Clamp a position [3] (m, world) to the grip's workspace, along the arm's own coordinates."""
+    """Clamp a position [3] (m, world) to the grip's workspace, in radius and bearing around the shoulder and in height."""
     shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
     offset = position[:2] - shoulder
     radius = jnp.clip(jnp.linalg.norm(offset), *_RADII)

@@ -1,6 +1,6 @@
 """The scalar engine: a subset of MuJoCo's physics written out in scalars, for GPUs with one thread per episode.
 
-    supports    checks that a model lies in the subset
+    supports    checks if a model lies in the subset
     simulate    takes physics steps: on NVIDIA GPUs all of them in one kernel, elsewhere in plain JAX
 
 These two functions, and the probe that every kernel has, are all that the rest of the package uses. The modules, from the
@@ -39,15 +39,15 @@ def simulate(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = 
         exact: Make forces as exact as float32 allows (see `mjx_model.take_steps`).
 
     Returns:
-        ``data`` with new ``qpos``, ``qvel``, ``qacc``, ``qacc_warmstart``, ``qfrc_constraint`` and ``time``; other fields,
-        poses among them, are those of before. ``qpos`` is NaN if bodies are pushed or a weld is inactive.
+        ``data`` with new ``qpos``, ``qvel``, ``qacc``, ``qacc_warmstart``, ``qfrc_constraint`` and ``time``. All other fields,
+        body poses included, are unchanged and thus stale. ``qpos`` is NaN if ``xfrc_applied`` is not 0 or a weld is inactive.
     """
     take = steps_kernel.simulate if use_gpu_kernels(probe) else steps.simulate_arrays
     return _simulate_by(take, model, data, count, exact)
 
 
 def _simulate_by(take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int, exact: bool | None) -> mjx.Data:
-    """`simulate` by ``take``, a function with the arguments of `steps.simulate_arrays`."""
+    """Implement `simulate` with ``take``, a function with the arguments of `steps.simulate_arrays`."""
     constants, timestep = scalar_model.build_scalar_model(model), float(model.opt.timestep)
     state = JointState(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
     indices = np.array(constants.mocaps, int)

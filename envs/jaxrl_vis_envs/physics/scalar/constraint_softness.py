@@ -21,7 +21,7 @@ class Softness(NamedTuple):
         min_impedance: Impedance without violation.
         max_impedance: Impedance at a violation of ``width``.
         width: Violation at which the impedance saturates, m or rad.
-        midpoint: Inflection point of the curve, as a share of the width.
+        midpoint: Inflection point of the curve, as a fraction of the width.
         power: Exponent of the curve.
     """
 

@@ -36,7 +36,7 @@ class GeomPair(NamedTuple):
         frames: Frames of the geoms relative to their links.
         radii: Radii, m; unused for a plane.
         half_lengths: Half lengths of the capsules' segments, m; unused with a plane.
-        joints_of_one: Joints that move the first geom but not the second, and the second but not the first.
+        joints_of_one: Joints that move only the first geom, and joints that move only the second.
     """
 
     is_on_plane: bool
@@ -83,7 +83,7 @@ def build_pair(model: mjx.Model, tree: list[Link], frames: list[FixedFrame], geo
 
 
 def common_ancestor(tree: list[Link], pairs: list[GeomPair]) -> int:
-    """Return the last link that carries all geoms of some pairs, or the world; the joints up to it do not affect distances."""
+    """Return the last common ancestor link of all geoms of ``pairs``, or the world; joints up to it do not affect distances."""
     chains = [links.ancestor_joints(tree, frame.link) for pair in pairs for frame in pair.frames]
     last = WORLD
     for level in zip(*chains, strict=False):
@@ -147,7 +147,7 @@ def contact_axes(normal: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def translation_jacobian(pair: GeomPair, frames: LinkFrames, direction: Vector, position: Vector) -> dict[int, Any]:
-    """Return the derivative of the second geom's displacement relative to the first along a direction at a point, by joint."""
+    """Return derivatives by joint of the displacement, second geom minus first, along ``direction`` at ``position``."""
     moment = cross(position, direction)
     back = (scale(direction, -1.0), scale(moment, -1.0))
     entries = {joint: frames.derivative_along(joint, *back) for joint in pair.joints_of_one[0]}
@@ -156,7 +156,7 @@ def translation_jacobian(pair: GeomPair, frames: LinkFrames, direction: Vector, 
 
 
 def rotation_jacobian(pair: GeomPair, frames: LinkFrames, direction: Vector) -> dict[int, Any]:
-    """Return the derivative of the second geom's rotation relative to the first about a direction, by joint."""
+    """Return derivatives by joint of the rotation, second geom minus first, about ``direction``."""
     back = scale(direction, -1.0)
     entries = {joint: dot(frames.rotation_derivative(joint), back) for joint in pair.joints_of_one[0]}
     return entries | {joint: dot(frames.rotation_derivative(joint), direction) for joint in pair.joints_of_one[1]}

@@ -1,7 +1,7 @@
 """Dynamics of a tree of links in scalars (`partial_arithmetic`): poses, mass matrix and bias forces.
 
 All quantities are expressed in the links' own frames (`links`), where joint axes and inertias are constants and most operations
-fold away. Float32 also loses the least precision there: nothing is a small difference of large numbers.
+fold away. This also minimizes the loss of precision in float32: no quantity is a small difference of large numbers.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms": recursive Newton-Euler, 5.3, and composite rigid bodies, 6.2.
 """
@@ -186,7 +186,7 @@ class _LinkMotion:
         return _LinkMotion(add(spin, own), add(change, cross(spin, own)), lift)
 
     def wrench(self, link: Link) -> tuple[Vector, Vector]:
-        """Return the force, and the torque about the frame's origin, that this motion of the link requires."""
+        """Return the force, and the torque about the frame's origin, that produce this motion of the link."""
         moment, inertia = _vector(link.moment), _symmetric(link.inertia)
         force = add(scale(self._lift, link.mass), combine(self._acceleration_columns, moment))
         turning = add(symmetric_times(inertia, self._change), cross(self._spin, symmetric_times(inertia, self._spin)))

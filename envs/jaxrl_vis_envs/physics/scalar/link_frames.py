@@ -26,7 +26,7 @@ def mocap_poses(links: tuple[int, ...], numbers: Column) -> dict[int, MocapPose]
 
     Args:
         links: Links of the mocap bodies (`links.mocap_link`).
-        numbers: Seven scalars per body: position, m, and a quaternion of any length.
+        numbers: Seven scalars per body: position, m, and a quaternion of any norm.
     """
     poses = {}
     for index, link in enumerate(links):
@@ -37,9 +37,10 @@ def mocap_poses(links: tuple[int, ...], numbers: Column) -> dict[int, MocapPose]
 
 
 class LinkFrames:
-    """Frames of links and joints, expressed in the frame of one link.
+    """Frames of links and joints, expressed in the frame of one link: the base frame.
 
-    Quaternions, and the frames of what mocap bodies carry, are available in the world's frame only.
+    Frames of mocap bodies and their descendants are available only if the base is the world. Quaternions are relative to the
+    world whatever the base is.
     """
 
     def __init__(self, tree: list[Link], joints: list[JointTransform], base: int, mocap: dict[int, MocapPose]) -> None:
@@ -55,16 +56,16 @@ class LinkFrames:
         self._quaternions |= {link: body.quaternion for link, body in mocap.items()}
 
     def point(self, link: int, position: np.ndarray) -> Vector:
-        """Return a point of a link from its ``position`` [3] (m) in the link's frame."""
+        """Transform a point, ``position`` [3] (m), from the link's frame to the base frame."""
         pose = self._poses[link]
         return add(pose.origin, combine(pose.axes, floats(position)))
 
     def direction(self, link: int, direction: np.ndarray) -> Vector:
-        """Return a direction from its components [3] in the link's frame."""
+        """Rotate a ``direction`` [3] from the link's frame to the base frame."""
         return combine(self._poses[link].axes, floats(direction))
 
     def quaternion(self, link: int) -> Quaternion:
-        """Return the quaternion of a link's frame."""
+        """Return the rotation of a link's frame in the world, a unit quaternion."""
         if link not in self._quaternions:
             own, joint = self._tree[link], self._joints[link]
             quaternion = quaternions.multiply(self.quaternion(own.parent), quaternions.from_matrix(own.rotation))
@@ -74,24 +75,24 @@ class LinkFrames:
         return self._quaternions[link]
 
     def joint_axis(self, joint: int) -> Vector:
-        """Return the axis that a joint turns about or slides along."""
+        """Return the axis that a joint turns about or slides along, in the base frame."""
         return self._poses[joint].axes[self._tree[joint].axis]
 
     def point_derivative(self, joint: int, point: Vector) -> Vector:
-        """Return the derivative of a carried point with respect to a joint, m/rad or m/m."""
+        """Return the derivative of a ``point`` moved by a joint with respect to that joint, m/rad or m/m; base frame."""
         axis = self.joint_axis(joint)
         return axis if self._tree[joint].slides else cross(axis, subtract(point, self._poses[joint].origin))
 
     def rotation_derivative(self, joint: int) -> Vector:
-        """Return the derivative of the carried links' rotation vector with respect to a joint, rad/rad or rad/m."""
+        """Return the rotation vector of links moved by a joint per unit of that joint, rad/rad or rad/m; base frame."""
         return ZERO if self._tree[joint].slides else self.joint_axis(joint)
 
     def derivative_along(self, joint: int, direction: Vector, moment: Vector) -> Any:
-        """Return the derivative of a carried point along a direction with respect to a joint, m/rad or m/m.
+        """Return the derivative of the position along a direction of a point moved by a joint, m/rad or m/m.
 
         Args:
             joint: Index of the joint.
-            direction: Direction of unit length.
+            direction: Unit vector in the base frame.
             moment: Cross product of the point and the direction.
         """
         link, axis = self._tree[joint], self.joint_axis(joint)

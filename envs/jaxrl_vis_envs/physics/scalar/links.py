@@ -1,8 +1,8 @@
 """Kinematic trees of one-degree-of-freedom joints as links: each joint carries one link, in a frame with the joint along one
 axis.
 
-All of this is known before the program runs and is computed in double precision: a link has the masses of all bodies fixed to
-it, and its frame stands at its joint.
+All of this is constant and computed in double precision before the program runs: a link has the masses of all bodies fixed to
+it, and its frame is located at its joint.
 
 Source: Featherstone, "Rigid Body Dynamics Algorithms", chapter 4 (one joint per body; several joints between two bodies have
 massless bodies between them).
@@ -15,8 +15,8 @@ import numpy as np
 from mujoco import mjx
 
 WORLD = -1
-"""Index of the fixed link. Mocap bodies, which stand still during a step, have indices below it (`mocap_link`)."""
-_ROUNDING = 1e-9  # relative to the largest entry: smaller ones are zeros with rounding errors
+"""Index of the fixed link. Mocap bodies, which do not move during a step, have indices below it (`mocap_link`)."""
+_ROUNDING = 1e-9  # relative to the largest entry: smaller entries are rounding errors of zeros
 
 
 class Link(NamedTuple):
@@ -121,7 +121,7 @@ def _compose(frame: FixedFrame, rotation: np.ndarray, position: np.ndarray) -> F
 
 
 def _align_axis(axis: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the frame axis to put along a joint's ``axis``, and the frame's axes in those of the body: [3, 3]."""
+    """Return the index of the frame axis to align with a joint's ``axis``, and the frame's axes in the body's frame: [3, 3]."""
     axis = axis / np.linalg.norm(axis)
     index = int(np.argmax(np.abs(axis)))
     # The shortest rotation of the frame's axis onto the joint's, or, if they are opposite, half a turn.

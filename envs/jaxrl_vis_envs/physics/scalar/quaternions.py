@@ -28,7 +28,7 @@ def inverse(quaternion: Quaternion) -> Quaternion:
 
 
 def normalize(parts: Any) -> Quaternion:
-    """Scale four scalars to unit length."""
+    """Normalise four scalars to a unit quaternion."""
     real, x, y, z = parts
     scaled = 1.0 / jnp.sqrt(plus(*(times(part, part) for part in (real, x, y, z))))
     return times(real, scaled), times(x, scaled), times(y, scaled), times(z, scaled)
@@ -58,7 +58,7 @@ def about_axis(axis: int, half_turn: tuple[Any, Any]) -> Quaternion:
 
 
 def from_matrix(matrix: np.ndarray) -> Quaternion:
-    """Convert a known rotation matrix [3, 3]; parts below 1e-9, which are rounding errors, become 0."""
+    """Convert a known rotation matrix [3, 3] to a quaternion; components below 1e-9, which are rounding errors, become 0."""
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix, np.float64).ravel())
     return floats(np.where(np.abs(quaternion) < 1e-9, 0.0, quaternion))  # type: ignore[return-value] - of four

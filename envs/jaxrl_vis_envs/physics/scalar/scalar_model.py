@@ -16,7 +16,7 @@ from jaxrl_vis_envs.physics.scalar.links import WORLD, FixedFrame, Link
 from jaxrl_vis_envs.physics.scalar.partial_arithmetic import floats
 from jaxrl_vis_envs.physics.scalar.welds import Weld
 
-# The code is unrolled over joints and pairs, and has to fit into one kernel.
+# Maximum numbers: the code is unrolled over joints and pairs, and must fit into one kernel.
 _MAX_JOINTS, _MAX_PAIRS = 32, 32
 _ONE_DEGREE_OF_FREEDOM = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _INTEGRATORS = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
@@ -35,18 +35,33 @@ _BY_CENTRE_OF_MASS = (mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, mujoco.mjtCamLight
 
 
 class FrictionConstraint(NamedTuple):
-    """Dry friction of a joint."""
+    """Dry friction of a joint.
+
+    Attributes:
+        joint: Index of the joint.
+        max_force: Maximum friction force, N m or N.
+        inverse_weight: Approximate inverse inertia along the constraint.
+        softness: Softness of the constraint.
+    """
 
     joint: int
-    max_force: float  # N m or N
+    max_force: float
     inverse_weight: float
     softness: Softness
 
 
 class LimitConstraint(NamedTuple):
-    """Range of a joint, or of a tendon, which is a weighted sum of joints."""
+    """Range of a joint, or of a fixed tendon, whose length is a weighted sum of joint positions.
 
-    joints: dict[int, float]  # joint -> coefficient
+    Attributes:
+        joints: Coefficient of each joint in the limited quantity.
+        bounds: Lower and upper bound of the limited quantity.
+        margin: Distance from a bound below which the limit acts.
+        inverse_weight: Approximate inverse inertia along the constraint.
+        softness: Softness of the constraint.
+    """
+
+    joints: dict[int, float]
     bounds: tuple[float, float]
     margin: float
     inverse_weight: float
@@ -54,18 +69,34 @@ class LimitConstraint(NamedTuple):
 
 
 class ContactConstraint(NamedTuple):
-    """Contact of two geoms."""
+    """Contact of two geoms.
+
+    Attributes:
+        pair: The geoms.
+        margin: Distance below which the contact acts, m.
+        inverse_weights: Approximate inverse inertia of each row: along the normal and, for elliptic cones, the tangents. A
+            pyramid's edges share one.
+        softness: Softness of the same rows.
+        cone: Friction of each row of an elliptic cone (`scalar_newton.Problem`); empty for other contacts.
+        pyramid: Friction along the two tangents and, if torsional, about the normal, for a pyramid; empty for other contacts.
+    """
 
     pair: GeomPair
     margin: float
-    inverse_weights: tuple[float, ...]  # of each row: along the normal and, for elliptic cones, along the tangents
-    softness: tuple[Softness, ...]  # of each row
-    cone: tuple[float, ...]  # friction of each row of an elliptic cone (`scalar_newton.Problem`); empty for other contacts
-    pyramid: tuple[float, ...]  # friction along two tangents and about the normal, shared by a pyramid's edges
+    inverse_weights: tuple[float, ...]
+    softness: tuple[Softness, ...]
+    cone: tuple[float, ...]
+    pyramid: tuple[float, ...]
 
 
 class WeldConstraint(NamedTuple):
-    """Weld of two bodies, with the inverse weights of its position and rotation rows."""
+    """Weld of two bodies.
+
+    Attributes:
+        weld: The bodies and their relative pose.
+        inverse_weights: Approximate inverse inertia of the position rows and of the rotation rows.
+        softness: Softness of all rows.
+    """
 
     weld: Weld
     inverse_weights: tuple[float, float]
@@ -73,7 +104,16 @@ class WeldConstraint(NamedTuple):
 
 
 class Actuator(NamedTuple):
-    """Motor or servo of one joint: force, gain and bias are affine in control, length and velocity."""
+    """Motor or servo of one joint, with a force of gain * control + bias.
+
+    Attributes:
+        joint: Index of the joint.
+        gear: Factor from joint position to actuator length, and from actuator force to joint force.
+        gain: Constant, and coefficients of length and velocity, of the gain.
+        bias: Constant, and coefficients of length and velocity, of the bias.
+        control_bounds: Lower and upper bound of the control; infinite if unbounded.
+        force_bounds: Lower and upper bound of the force; infinite if unbounded.
+    """
 
     joint: int
     gear: float
@@ -84,24 +124,43 @@ class Actuator(NamedTuple):
 
 
 class ScalarModel(NamedTuple):
-    """Constants of a model. Unless said otherwise, tuples have one element per joint."""
+    """Constants of a model with N joints.
+
+    Attributes:
+        links: [N], links of the kinematic tree.
+        rest: [N], joint positions ``qpos0``, rad or m.
+        armature: [N], armature inertias of the joints, kg m^2 or kg.
+        damping: [N], damping of the joints, N m s/rad or N s/m.
+        springs: [N], stiffness (N m/rad or N/m) and rest position (rad or m) of each joint.
+        tendon_masses: Coefficients of the joints, and armature, of each tendon.
+        gravity: [3] float64, m/s^2, in the world; 0 if disabled.
+        actuators: All actuators, in the order of the controls.
+        frictions: Dry friction of joints.
+        limits: Limits of joints and tendons.
+        contacts: Contacts of geom pairs.
+        welds: Welds of bodies.
+        mocaps: Indices of the mocap bodies that links or constrained geoms and bodies depend on.
+        iterations: Newton iterations per step.
+        warm_start: True to start the solver from the last step's accelerations.
+        runge_kutta: True for the classical Runge-Kutta method, False for Euler's, implicit in the damping.
+    """
 
     links: list[Link]
-    rest: tuple[float, ...]  # qpos0
+    rest: tuple[float, ...]
     armature: tuple[float, ...]
     damping: tuple[float, ...]
-    springs: tuple[tuple[float, float], ...]  # stiffness and rest position
-    tendon_masses: tuple[tuple[dict[int, float], float], ...]  # of each tendon: coefficients of joints, and armature
+    springs: tuple[tuple[float, float], ...]
+    tendon_masses: tuple[tuple[dict[int, float], float], ...]
     gravity: np.ndarray
     actuators: tuple[Actuator, ...]
     frictions: tuple[FrictionConstraint, ...]
     limits: tuple[LimitConstraint, ...]
     contacts: tuple[ContactConstraint, ...]
     welds: tuple[WeldConstraint, ...]
-    mocaps: tuple[int, ...]  # mocap bodies that links or constrained geoms and bodies depend on
+    mocaps: tuple[int, ...]
     iterations: int
     warm_start: bool
-    runge_kutta: bool  # the classical Runge-Kutta method; False for Euler's, implicit in the damping
+    runge_kutta: bool
 
 
 def supports(model: mjx.Model) -> bool:
@@ -177,7 +236,7 @@ def _has_simple_equalities(model: mjx.Model) -> bool:
 
 
 def _has_joint_above(model: mjx.Model, bodies: tuple[int, int]) -> bool:
-    """Return True if joints move at least one of two bodies."""
+    """Return True if any joint moves at least one of two bodies."""
     for body in map(int, bodies):
         while body:
             if model.body_jntnum[body]:
@@ -219,7 +278,7 @@ def build_scalar_model(model: mjx.Model) -> ScalarModel:
 
 
 def _disabling(flag: mujoco.mjtDisableBit) -> int:
-    """Return the flags of which any disables a kind of constraint."""
+    """Return a mask of the flags that disable a kind of constraint: its own, and that of all constraints."""
     return int(flag | _FLAG.mjDSBL_CONSTRAINT)
 
 
@@ -321,7 +380,7 @@ def _welds(model: mjx.Model, tree: list[Link], frames: list[FixedFrame]) -> list
 
 
 def fingerprint(part: Any) -> Hashable:
-    """Return the contents of a `ScalarModel` or of a part of it in hashable form, equal for equal contents."""
+    """Convert a `ScalarModel` or a part of it to a hashable value that is equal for equal contents."""
     if isinstance(part, np.ndarray):
         return part.shape, part.tobytes()
     if isinstance(part, dict):
@@ -330,9 +389,9 @@ def fingerprint(part: Any) -> Hashable:
 
 
 def base_link(constants: ScalarModel) -> int:
-    """Return the link in whose frame constraints are computed: the last one that carries all contacts, or the world.
+    """Return the link in whose frame constraints are computed: the last common ancestor of all contacts, or the world.
 
-    Friction has its axes, and mocap bodies and welds have their poses, in the world.
+    It is the world for models with contact friction, mocap bodies or welds, whose axes and poses are defined there.
     """
     if constants.welds or constants.mocaps or any(contact.cone or contact.pyramid for contact in constants.contacts):
         return WORLD

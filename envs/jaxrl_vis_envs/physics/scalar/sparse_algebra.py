@@ -34,7 +34,7 @@ def solve_positive(matrix: Matrix, right: Column) -> Column:
 
 
 def _factorize(matrix: Matrix, size: int) -> tuple[list[Row], Column]:
-    """Factorize a matrix as L' D L: the entries of L left of its unit diagonal, by row, and the inverses of D."""
+    """Factorize a matrix as L' D L; return the entries of L left of its unit diagonal, by row, and the reciprocals of D."""
     left, factors, inverse = dict(matrix), [{} for _ in range(size)], [None] * size
     for row in reversed(range(size)):
         inverse[row] = 1.0 / left[row, row]
@@ -49,7 +49,7 @@ def _factorize(matrix: Matrix, size: int) -> tuple[list[Row], Column]:
 
 
 def _solve_transposed(factors: list[Row], right: Column) -> Column:
-    """Solve a system of the matrix L'."""
+    """Solve a linear system with the matrix L'."""
     values = list(right)
     for row in reversed(range(len(values))):
         for column, factor in factors[row].items():
@@ -82,7 +82,7 @@ def symmetric_product(matrix: Matrix, column: Column) -> Column:
 
 
 def safe_divide(numerator: Any, denominator: Any) -> Any:
-    """Divide, with a finite result where the denominator is 0."""
+    """Divide elementwise; the result is finite where the denominator is 0."""
     return numerator / jnp.where(denominator == 0, TINY, denominator)
 
 

@@ -59,7 +59,7 @@ class StepInputs(NamedTuple):
 
 
 class _ConstraintRow(NamedTuple):
-    """Row of a `scalar_newton.Problem`; ``max_friction`` is None except for dry friction."""
+    """Row of a `scalar_newton.Problem`, with its fields; ``max_friction`` is None except for dry friction."""
 
     entries: Row
     stiffness: Any
@@ -92,7 +92,7 @@ def simulate(
         exact: Make forces as exact as float32 allows (see `mjx_model.step`), a bool or an int32 scalar, 1 or 0. Contacts are
             always exact.
         in_kernel: Generate code for a GPU kernel (see `scalar_newton.solve`).
-        mocap: Seven scalars for each of ``constants.mocaps``: position, m, and a quaternion of any length.
+        mocap: Seven scalars for each of ``constants.mocaps``: position, m, and a quaternion of any norm.
 
     Returns:
         The state after the steps.
@@ -120,7 +120,7 @@ def simulate_arrays(
     exact: bool | None,
     mocap: jax.Array | None = None,
 ) -> JointState:
-    """`simulate` for arrays: [N] each for N joints, controls [nu], mocap bodies [M, 7] or None."""
+    """Call `simulate` with arrays: [N] each for N joints, controls [nu], mocap bodies [M, 7] or None."""
     start = JointState(*map(list, state))
     poses = [] if mocap is None else list(mocap.reshape(-1))
     end = simulate(constants, start, list(control), list(applied), timestep, count, bool(exact), mocap=poses)
@@ -179,9 +179,9 @@ def _accelerations(
 
 
 def constraint_problem(constants: ScalarModel, state: JointState, inputs: StepInputs) -> tuple[Problem, list[int]]:
-    """Return the constraint problem of one step, and the joint at each place of the problem's order.
+    """Return the constraint problem of one step, and the joint at each index of the problem.
 
-    The joints are reordered so that the problem's matrices fill in little when they are factorized from the last row up.
+    The joints are reordered for little fill-in when the problem's matrices are factorized from the last row up.
     """
     displacement = [minus(position, rest) for position, rest in zip(state.position, constants.rest, strict=True)]
     welded = {
@@ -225,12 +225,12 @@ def constraint_problem(constants: ScalarModel, state: JointState, inputs: StepIn
 
 
 def elimination_order(size: int, mass: list[tuple[int, int]], rows: list[tuple[int, ...]]) -> list[int]:
-    """Order joints greedily so that a matrix fills in little when it is factorized from the last row up.
+    """Order joints greedily for little fill-in when a matrix is factorized from the last row up.
 
     Args:
         size: Number of joints.
-        mass: Nonzero places of the mass matrix, (joint, ancestor) and others. Joints come after their ancestors, in which order
-            the mass matrix alone does not fill in at all.
+        mass: Nonzero entries of the mass matrix, (joint, ancestor) and others. Joints come after their ancestors; in that
+            order, the mass matrix alone has no fill-in.
         rows: Joints that each constraint couples.
     """
     neighbours: list[set[int]] = [set() for _ in range(size)]

@@ -30,10 +30,10 @@ def simulate(
     mocap: jax.Array | None = None,
     interpret: bool = False,
 ) -> JointState:
-    """`steps.simulate` for arrays, float32; over all axes of `jax.vmap` in one kernel.
+    """Call `steps.simulate` with float32 arrays, as one kernel over all axes of `jax.vmap`.
 
-    The kernel reads the time step, the number of steps and ``exact`` at run time: calls in one program with equal constants for
-    equally many episodes are one kernel, which is compiled once.
+    The kernel reads the time step, the number of steps and ``exact`` at run time. Calls within one program with equal constants
+    and batch sizes therefore share one kernel, compiled once.
 
     Args:
         constants: Constants of the model with N joints.
@@ -42,7 +42,8 @@ def simulate(
         applied: [N].
         timestep: Time step, s.
         count: Number of physics steps.
-        exact: True or False for a kernel that can take exact steps (see `steps.simulate`), None for a smaller one that cannot.
+        exact: True to take exact steps (see `steps.simulate`), False not to, with the same kernel; None for a smaller kernel
+            that cannot.
         mocap: [M, 7], one row for each of ``constants.mocaps``.
         interpret: Run the kernel without a GPU, slowly.
 
@@ -62,7 +63,7 @@ def simulate(
 
 @dataclasses.dataclass(frozen=True)
 class _KernelConstants:
-    """Constants of a model, compared by their fingerprint, and True if the kernel can take exact steps."""
+    """Constants of a model, compared by their fingerprint, and whether the kernel can take exact steps."""
 
     fingerprint: Hashable
     constants: ScalarModel = dataclasses.field(compare=False)
@@ -70,11 +71,11 @@ class _KernelConstants:
 
 
 def _simulate_episode(known: _KernelConstants, rows: list[jax.Array]) -> list[jax.Array]:
-    """Compute the final scalars of an episode from its inputs, in the order of `simulate`."""
+    """Compute the final `JointState` of an episode from its inputs, both as flat lists of scalars."""
     constants = known.constants
     joints = len(constants.links)
     (timestep, *loops), rows = rows[:3], rows[3:]
-    # Equal in all threads of a warp, which run through the same loops.
+    # Equal in all threads of a warp, which execute the same loops.
     count, is_exact = (jnp.max(number).astype(jnp.int32) for number in loops)
     exact = is_exact if known.may_be_exact else False
     position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))

@@ -1,8 +1,8 @@
 """One scalar per thread in Pallas kernels (Triton) of thousands of operations: loads, stores and the launch.
 
-Triton searches the whole program once for each load and store to decide how the threads of a block share it, so a kernel with
+Triton analyses the whole program once for each load and store to distribute it over the threads of a block, so a kernel with
 500 loads takes minutes to compile. Here each thread loads and stores its own scalars by inline PTX, which Triton does not
-analyse. This needs a primitive that Pallas lacks, the address of an array, which is added here.
+analyse. This needs a primitive that Pallas lacks and that is added here: the address of an array.
 """
 
 import functools
@@ -31,12 +31,12 @@ def episode_kernel(
 ) -> Callable[[jax.Array], jax.Array]:
     """Wrap a function of one episode as a GPU kernel with one thread per episode, 32 threads per program.
 
-    Calls within one program with the same ``compute`` and ``known`` for equally many episodes are one kernel, compiled once.
+    Calls within one program with the same ``compute``, ``known`` and batch size share one kernel, compiled once.
 
     Args:
         name: Name of the kernel.
         compute: Function from ``known`` and an episode's inputs to its outputs; scalars are [32] float32, one per thread. It is
-            traced once for all numbers of episodes.
+            traced once for all batch sizes.
         known: Constants of the kernel.
         outputs: Number of outputs.
         interpret: Run the kernel without a GPU, slowly.
@@ -103,7 +103,7 @@ def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, known: Ha
 
 @functools.cache
 def _address_primitive() -> Any:
-    """Return a primitive from a kernel's array to its address, for all threads: [32] int64.
+    """Return a primitive that maps a kernel's array to its address, repeated for all threads: [32] int64.
 
     It uses private modules of JAX, imported here so that a JAX without them loses the kernels and nothing else.
     """

@@ -36,7 +36,7 @@ class Weld(NamedTuple):
     Attributes:
         frames: Frames of the bodies.
         quaternions: Rotations to be aligned, relative to the links; the first includes the weld's relative rotation.
-        points: [3] each, points to coincide, in the links' frames, m.
+        points: [3] each, anchor points that the weld makes coincide, in the links' frames, m.
         torque_scale: Length that converts rotations to displacements, m.
         joints: Joints that move the first body alone, the second alone, and both.
     """

@@ -6,8 +6,8 @@ nearest object (`raycast`), its normal (in octahedral encoding, 16 bits per axis
 the final colour (8 bits per channel). Each pass over a tile is a loop of one iteration (`tiles.once`), because XLA would fuse
 the passes otherwise; if only planes are visible in a tile, a cheaper version runs.
 
-Per pixel, the code is that of the plain renderer, and results agree up to the last bits: with colours, depths are those of the
-keys.
+Per pixel, the code is that of the plain renderer, and results agree up to the last bits: in images with colours, depths are
+decoded from the keys.
 """
 
 from collections.abc import Callable
@@ -78,10 +78,10 @@ def draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitS
 
 
 class _Tile(NamedTuple):
-    """Intermediate int32 values [P] of a tile: keys, colours, and the results of earlier passes. The next tile reuses their
-    memory.
+    """Intermediate int32 values [P] of a tile: keys, colours, and the results of earlier passes. ``row`` is None if rows are
+    part of the keys.
 
-    ``row`` is None if rows are part of the keys.
+    The next tile reuses their memory.
     """
 
     key: jax.Array
@@ -95,14 +95,12 @@ class _Tile(NamedTuple):
 def _render_tiles(
     scene: Scene, unit: shapes.UnitShapes, colouring: "_Colouring | None", labelled: bool, rays: Rays
 ) -> tuple[jax.Array, ...]:
-    """Render all tiles one after the other; return keys, packed colours and rows (or None) of all pixels, [tiles, P] int32
-    each.
-    """
+    """Render all tiles sequentially; return keys, packed colours, and rows (or None) of all pixels, [tiles, P] int32 each."""
     visible = tiles.visible_in_tiles(scene, unit, rays)
 
     def draw_tile(carry: tuple, pixels: tuple) -> tuple:
         number, tile, results = carry
-        # Values that go directly into a loop's results are computed on one core: copy them one iteration later.
+        # XLA computes values that are stored directly in a loop's results on one core: store them one iteration later.
         previous = jnp.maximum(number - 1, 0)
         results = jax.tree.map(lambda whole, own: whole.at[previous].set(own), results, (tile.key, tile.colour, tile.row))
         rays, visible = pixels
@@ -152,7 +150,7 @@ class _Colouring:
         self.lights = lights.unpack(scene, light_table)
 
     def colour(self, tile: _Tile, rays: Rays, busy: jax.Array) -> _Tile:
-        """Return the tile with its colours. Unless it is ``busy``, only planes and sky are visible in it."""
+        """Return the tile with its colours. Unless ``busy`` ([] bool), only planes and sky are visible in it."""
         all_rows = list(range(len(self.scene.object_types)))
         planes = [row for row in all_rows if self.scene.object_types[row] == shapes.PLANE]
 
@@ -178,16 +176,16 @@ class _Colouring:
         return tile._replace(normal=normal, texture=tile.texture if texture is None else texture, colour=colour)
 
     def _normal(self, inputs: _PassInputs) -> jax.Array:
-        """Compute packed normals. As in the following passes, only ``inputs.rows`` occur among the objects."""
+        """Compute packed normals [P] int32. As in the following passes, only the objects ``inputs.rows`` may be visible."""
         return _pack_normal(surface.outward_normal(*self._intersect(inputs)))
 
     def _texture(self, inputs: _PassInputs) -> jax.Array:
-        """Compute the texture factor of objects, or the colour of the sky: packed, 10 bits per channel."""
+        """Compute the texture factor of objects, or the colour of the sky: [P] int32, 10 bits per channel."""
         image = texturing.texture_colour(self.scene, *self._intersect(inputs)) or (jnp.ones_like(inputs.rays.u),) * 3
         return _pack(self._over_sky(inputs, image, shade.sky(self.scene, self.rotation, inputs.rays)), 10)
 
     def _finish(self, inputs: _PassInputs, normal: jax.Array | None, texture: jax.Array | None) -> jax.Array:
-        """Compute the final colour: packed, 8 bits per channel. Without ``normal``, it is cheaply computed for planes."""
+        """Compute the final colour: [P] int32, 8 bits per channel. Without ``normal``, compute normals (cheap for planes)."""
         row, hit = self._intersect(inputs)
         if normal is not None:
             hit = hit._replace(normal=_unpack_normal(normal))
@@ -212,7 +210,7 @@ class _Colouring:
 
 
 def _select_row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.Row:
-    """Return the row of every pixel, as `lookup.fetch`. If there are few, select by comparison: XLA would store lookups."""
+    """Return the row of every pixel, as `lookup.fetch`. Few rows are selected by comparisons, since XLA would store lookups."""
     if len(rows) > _MAX_SELECTED:
         return lookup.fetch(table, index)
     first, *others = rows or [0]
@@ -224,7 +222,7 @@ def _select_row(table: jax.Array, rows: list[int], index: jax.Array) -> lookup.R
 
 
 def _pack(colour: Vector, bits: int) -> jax.Array:
-    """Round three channels [P] in [0, 1] to this many bits each, and pack them: [P] int32."""
+    """Quantise three channels [P] in [0, 1] to ``bits`` bits each, and pack them: [P] int32."""
     steps = float(2**bits - 1)
     red, green, blue = ((clip_to_unit(channel) * steps + 0.5).astype(jnp.int32) for channel in colour)
     return red | (green << bits) | (blue << 2 * bits)
@@ -236,7 +234,7 @@ def _unpack(packed: jax.Array) -> jax.Array:
 
 
 def _pack_normal(normal: Vector) -> jax.Array:
-    """Encode directions of any length octahedrally: [P] int32, 16 bits per axis."""
+    """Encode directions of any norm in the octahedral encoding: [P] int32, 16 bits per axis."""
     inverse = reciprocal(jnp.abs(normal[0]) + jnp.abs(normal[1]) + jnp.abs(normal[2]) + 1e-30)
     x, y = normal[0] * inverse, normal[1] * inverse
     below = normal[2] < 0.0

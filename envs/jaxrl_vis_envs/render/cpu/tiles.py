@@ -1,12 +1,12 @@
 """Nearest object of every pixel on a CPU, tile by tile, testing only objects that may be visible in the tile.
 
-A batched program cannot skip work for one image only. But cameras mostly stand still, and robots stay in place: most tiles show
-the same few objects in all images of a batch. Work that depends on a tile is therefore a loop of zero or one iterations
+A batched program cannot skip work for a single image. But most cameras are static and most robots stay in place, so most tiles
+show the same few objects in all images of a batch. Work that depends on a tile is therefore a loop of zero or one iterations
 (`once`), which all images of the batch execute or skip together.
 
-XLA needs three measures for this. A condition that differs between images would become a select after the work: it is reduced
-to one for the batch (`_anywhere`). A branch of ``cond`` runs on one core, the body of a ``while`` on all. And a loop that reads
-what it overwrites is not vectorised, so every object has its own keys, which are compared afterwards.
+XLA requires three measures for this. A condition that differs between images would become a select after the work, so it is
+reduced to one condition for the batch (`_anywhere`). A branch of ``cond`` runs on one core, the body of a ``while`` on all. And
+a loop that reads what it overwrites is not vectorised, so every object has its own keys, which are compared afterwards.
 """
 
 from collections.abc import Callable
@@ -59,7 +59,7 @@ def non_plane_rows(scene: Scene) -> list[int]:
 
 
 def initial_keys(scene: Scene, plane: jax.Array) -> tuple[jax.Array, ...]:
-    """Return ``plane`` [P] int32 for each object whose keys `nearest_key` carries."""
+    """Return initial buffers of `nearest_key`: ``plane`` [P] int32 for each object with its own keys."""
     return (plane,) * len(non_plane_rows(scene)) if _culls_per_tile(scene) else ()
 
 
@@ -111,12 +111,12 @@ def nearest_key(
 
 
 def once(condition: jax.Array, function: Callable[[jax.Array], jax.Array], otherwise: jax.Array) -> jax.Array:
-    """Compute ``function(0)`` if the condition, one for the whole batch, is True; only once, whatever the result is used for.
+    """Compute ``function(0)`` if the condition is True, only once regardless of the number of uses of the result.
 
     Args:
-        condition: [] bool.
-        function: Takes an int32 zero that XLA cannot constant-fold: anything that does not depend on it is computed regardless.
-        otherwise: Result if the condition is False; its memory is reused for that of the function.
+        condition: [] bool, the same for the whole batch.
+        function: Function of an int32 zero that XLA cannot constant-fold; whatever does not depend on it is always computed.
+        otherwise: Result if the condition is False; its memory is reused for the result of the function.
     """
     iteration = jnp.where(condition, 0, 1)
     return jax.lax.while_loop(
@@ -126,7 +126,7 @@ def once(condition: jax.Array, function: Callable[[jax.Array], jax.Array], other
 
 @jax.custom_batching.custom_vmap
 def _anywhere(flags: jax.Array) -> jax.Array:
-    """Return ``flags``; within a batch, True where they are True for any element, as one answer for all."""
+    """Return ``flags``, reduced over the batch under `jax.vmap`: True where they are True for any element."""
     return flags
 
 

@@ -49,9 +49,9 @@ _TYPES = {shapes.PLANE, shapes.SPHERE, shapes.CAPSULE, shapes.ELLIPSOID, shapes.
 
 
 def can_render(scene: Scene, outputs: Outputs) -> bool:
-    """Return True if the kernel renders these planes on the platform being traced for: any planes of a supported scene.
+    """Return True if the kernel renders these planes on the platform being traced for.
 
-    The exception is segmentation if a reflecting object may coincide with another one.
+    It renders all planes of supported scenes, except segmentation if a reflecting object may coincide with another one.
     """
     return supports(scene) and not (outputs.segmentation and scene.reordered) and use_gpu_kernels(probe)
 
@@ -98,7 +98,7 @@ def rectangles(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
 
 
 def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[jax.Array, np.ndarray]:
-    """Determine which objects may be visible in which tile.
+    """Determine which objects may be visible in which tiles.
 
     Args:
         scene: The scene.
@@ -106,7 +106,8 @@ def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[j
         tile: Rows and columns of a tile.
 
     Returns:
-        Bits [tiles, words] int32, where bit b of word w is for object ``order[32 w + b]``; and the order [G], sorted by type.
+        Bits [tiles, words] int32, in which bit b of word w stands for object ``order[32 w + b]``; and the order [G], sorted by
+        type.
     """
     order = np.argsort(np.array(scene.object_types), kind="stable").astype(np.int32)
     high, wide = tile
@@ -147,7 +148,7 @@ class _Refs(NamedTuple):
 
 
 def _nearest(scene: Scene, refs: _Refs, tile_index: Any, rays: Rays, znear: Any, best: tuple) -> tuple:
-    """Return the minimum key over the objects of a tile and ``best``: (key,), or (depth bits, row) if rows are separate."""
+    """Return the minimum of ``best`` and the keys of a tile's objects: (key,), or (depth bits, row) if rows are separate."""
     mask = raycast.code_mask(scene)
     start, direction, inverse_square = camera.ray_parts(scene, rays)
     kinds = sorted(scene.object_types)
@@ -349,7 +350,7 @@ def draw(
         ids=jnp.asarray(ids),
     )
     pixels = scene.height * scene.width
-    # In the order in which the kernel writes them.
+    # Outputs in the order in which the kernel writes them.
     kinds = {
         "rgb": ((3, pixels), jnp.uint8 if outputs.quantized else jnp.float32),
         "depth": ((pixels,), jnp.float32),

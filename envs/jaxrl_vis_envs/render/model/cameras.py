@@ -1,4 +1,4 @@
-"""Camera of a scene: one of the model's, or a free one; its lens and its mount. NumPy only."""
+"""Camera of a scene (one of the model's, or a free camera), its lens and its mount. NumPy only."""
 
 import numbers
 from typing import Any
@@ -16,7 +16,7 @@ Camera = str | int | mujoco.MjvCamera | None
 
 
 def find_camera(mj_model: mujoco.MjModel, camera: Camera) -> int:
-    """Return the camera's index, `FREE_CAMERA` for a free one.
+    """Return the index of a camera, `FREE_CAMERA` for a free camera.
 
     Raises:
         ValueError: There is no such camera; the message lists those of the model.
@@ -80,7 +80,7 @@ def projection(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> str:
 
 
 def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) -> dict[str, Any]:
-    """Return the leaves of the camera, with keys as in `Scene`."""
+    """Return the camera's arrays, the leaves of a scene. Keys as in `Scene`."""
     if camera_id == FREE_CAMERA:
         position, turn = free_camera_pose(free_camera(mj_model, camera))
         lens = dict(fovy=mj_model.vis.global_.fovy, focal=np.zeros(2), principal=np.zeros(2), sensor=np.zeros(2))
@@ -112,7 +112,7 @@ def camera_parameters(mj_model: mujoco.MjModel, camera_id: int, camera: Camera) 
 
 
 def camera_mount(mj_model: mujoco.MjModel, camera_id: int) -> Mount:
-    """Return the mount of the camera; a free one is fixed to the world."""
+    """Return the mount of a camera; a free camera is fixed to the world."""
     if camera_id == FREE_CAMERA:
         return Mount(int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED), 0, -1)
     fields = (mj_model.cam_mode, mj_model.cam_bodyid, mj_model.cam_targetbodyid)

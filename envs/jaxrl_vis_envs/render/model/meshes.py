@@ -21,7 +21,7 @@ COLUMNS = 36
 _HFIELD, _MESH = int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_MESH)
 # MuJoCo uses a corner's smooth normal only if its cosine with the triangle's own normal is at least this.
 _SMOOTH = 0.8
-# Relative to the square of a triangle's longest side; with less area, its normal is lost in float32.
+# Minimum area relative to the square of a triangle's longest side; below it, float32 cannot represent the normal.
 _MIN_AREA = 1e-9
 
 
@@ -30,16 +30,16 @@ def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray
 
     Args:
         mj_model: MuJoCo model.
-        ids: Rendered objects.
-        types: Their types, as rendered.
-        clear: Flags of the transparent ones. Their triangles are blended in the order in which MuJoCo draws them, which is
-            therefore the order of their rows; those of other objects are grouped by position.
+        ids: [G], indices of the rendered objects.
+        types: [G], their types as rendered.
+        clear: [G] bool, True for transparent objects. Their rows are in MuJoCo's drawing order, in which their triangles are
+            blended; triangles of other objects are grouped by position.
 
     Returns:
         ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows per cluster; ``clusters`` [K, 4]
         float32, centre and radius (m) of the bounding sphere of each rendered cluster, in the same frame; ``cluster_places``
-        [K, 2] int32, the index into ``ids`` of the object, and the first row of its triangles. A mesh shared by several geoms
-        has its triangles once, and its clusters once per geom.
+        [K, 2] int32, index of the cluster's object in ``ids``, and first row of its triangles. If several geoms share a mesh,
+        its triangles are stored once, and its clusters once per geom.
     """
     rows: list[np.ndarray] = []
     built: dict[tuple[int, int, bool], tuple[int, np.ndarray]] = {}
@@ -111,7 +111,7 @@ def _strip_quads(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
 
 
 def _flat_normals(corners: np.ndarray) -> np.ndarray:
-    """Return unit normals [T, 3]; arbitrary for a triangle without area."""
+    """Return unit normals [T, 3]; undefined for a triangle without area."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
 
@@ -130,8 +130,8 @@ def _single_normals(corners: np.ndarray) -> np.ndarray:
 def _clustered(
     corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray, ordered: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows [K * CLUSTER, COLUMNS] of the triangles by cluster, and bounding spheres [K, 4]. Drops triangles without
-    area.
+    """Drop triangles without area and group the others; return rows [K * CLUSTER, COLUMNS] by cluster, and bounding spheres
+    [K, 4].
     """
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     longest = np.max(np.sum(np.square(corners - np.roll(corners, 1, axis=1)), axis=2), axis=1)
@@ -153,7 +153,7 @@ def _clustered(
     if not groups:
         return rows.reshape(-1, COLUMNS), np.zeros((0, 4))
     full = np.arange(CLUSTER) < np.array([len(group) for group in groups])[:, None]
-    # Incomplete groups repeat their first triangle, for the bounding spheres.
+    # Incomplete groups repeat their first triangle to compute the bounding spheres.
     members = np.repeat(np.array([group[:1] for group in groups]), CLUSTER, axis=1)
     members[full] = np.concatenate(groups)
     rows[full] = table[members[full]]
@@ -164,7 +164,7 @@ def _clustered(
 
 
 def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:
-    """Split the members recursively along their longest axis into groups of at most `CLUSTER`; nearly all groups are full."""
+    """Split ``members`` recursively along their longest axis into groups of at most `CLUSTER`, nearly all of them full."""
     if len(members) <= CLUSTER:
         return [members] if len(members) else []
     points = middles[members]

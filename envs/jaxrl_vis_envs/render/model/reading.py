@@ -16,7 +16,7 @@ _SDF, _MESH, _BOX, _PLANE, _CAPSULE = (
 
 # A plane's half-size of 0 means infinite along that axis; this is far beyond any clipping distance.
 INFINITE_SIZE = 1e10
-# MuJoCo draws objects with less alpha as transparent.
+# MuJoCo renders objects with a lower alpha as transparent.
 OPAQUE = 0.995
 # Values of `Scene.transparent`.
 SOLID, CLEAR, CLEAR_FROM_BEHIND = range(3)
@@ -24,11 +24,11 @@ SOLID, CLEAR, CLEAR_FROM_BEHIND = range(3)
 MAX_LIGHTS = 8
 
 LIGHTS = ("all", "mujoco")
-"""Choices of lights: all but image lights, or only those that MuJoCo's renderer supports, without point lights."""
+"""Choices of lights: all except image lights, or only those that MuJoCo's renderer supports, which excludes point lights."""
 
 
 def body_masses(mj_model: mujoco.MjModel, mounts: Iterable[Mount]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Return masses and parents of the bodies if any mount follows a centre of mass, else empty ones."""
+    """Return masses (kg) and parents of the bodies if any mount follows a centre of mass, else an empty array and tuple."""
     if all(mount.weighed < 0 for mount in mounts):
         return np.zeros(0), ()
     return mj_model.body_mass, tuple(mj_model.body_parentid.tolist())
@@ -42,7 +42,7 @@ def drawn_objects(
     tendon_groups: tuple[int, ...],
     leave_out: tuple[str, ...],
 ) -> np.ndarray:
-    """Return the mask [ngeom + nsite + ntendon] of rendered objects: in a visible group, not invisible, not left out."""
+    """Return the mask [ngeom + nsite + ntendon] of rendered objects: in a visible group, with alpha above 0, not left out."""
     geoms = np.isin(_clamped(mj_model.geom_group), groups)
     sites = np.isin(_clamped(mj_model.site_group), site_groups)
     left_out = [mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in leave_out]
@@ -77,7 +77,7 @@ def check_size(**lengths: int) -> None:
 
 
 def group_numbers(name: str, groups: Any) -> tuple[int, ...]:
-    """Return group numbers as a tuple, or raise a ValueError: an invalid group would silently hide everything."""
+    """Return group numbers as a tuple, or raise a ValueError, since an invalid group would silently hide everything."""
     listed = list(groups) if isinstance(groups, Iterable) else [groups]
     if not all(isinstance(group, numbers.Integral) and not isinstance(group, bool) for group in listed):
         raise ValueError(f"{name} must be group numbers, such as (0, 1, 2), got {groups!r}")
@@ -122,20 +122,20 @@ def object_types(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def drawing_order(mj_model: mujoco.MjModel, types: np.ndarray, ids: np.ndarray, opaque: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the objects ``ids`` in the reverse of MuJoCo's drawing order: of coincident objects, the one drawn last is
+    """Return the objects ``ids`` in the reverse of MuJoCo's drawing order. Of coincident objects, the one drawn last is
     visible.
 
-    MuJoCo draws objects in the order of declaration, except that the first reflecting one comes before all others, even if
+    MuJoCo draws objects in the order of declaration, except that the first reflecting one precedes all others, even if
     reflections are disabled. This exception does not apply to segmentation.
 
     Args:
         mj_model: MuJoCo model.
         types: `object_types`.
         ids: Indices of the rendered objects, ascending.
-        opaque: Flags of the opaque ones.
+        opaque: Mask of the opaque objects.
 
     Returns:
-        The indices, and True if they differ from the reversed order of declaration.
+        The ordered indices, and True if they differ from the reversed order of declaration.
     """
     material = object_materials(mj_model)[ids]
     reflectance = np.append(mj_model.mat_reflectance, 0.0)[material]
@@ -165,7 +165,7 @@ def check_supported(
     leave_out: tuple[str, ...],
     shadows: bool,
 ) -> None:
-    """Raise a one-line ValueError listing everything visible that is not supported, with a remedy."""
+    """Raise a one-line ValueError that lists all visible objects that are not supported, with a hint."""
     deformables = (
         ("skin", mj_model.skin_group, mujoco.mjtObj.mjOBJ_SKIN),
         ("flex", mj_model.flex_group, mujoco.mjtObj.mjOBJ_FLEX),
@@ -183,7 +183,7 @@ def check_supported(
 
 
 def object_name(mj_model: mujoco.MjModel, index: int) -> str:
-    """Return the name of object ``index`` (a geom, or ngeom + a site; tendons need no messages)."""
+    """Return the name of object ``index`` (a geom, or ngeom + a site) for messages, which never concern tendons."""
     is_geom = index < mj_model.ngeom
     number = int(index if is_geom else index - mj_model.ngeom)
     name = (mj_model.geom(number) if is_geom else mj_model.site(number)).name or f"number {number}"
@@ -230,7 +230,7 @@ def object_appearance(mj_model: mujoco.MjModel) -> dict[str, np.ndarray]:
 def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
     """Return the texels [rows, columns, channels] in [0, 255] that MuJoCo's renderer interpolates.
 
-    MuJoCo decodes flat textures that are flagged as sRGB (float64), and leaves all others as they are (uint8).
+    Flat textures that are flagged as sRGB are decoded to float64, as in MuJoCo; all others are returned unchanged, as uint8.
     """
     height, width = int(mj_model.tex_height[texture]), int(mj_model.tex_width[texture])
     channels = int(mj_model.tex_nchannel[texture])
@@ -245,7 +245,7 @@ def texture_pixels(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
 
 
 def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return mean texture colours [N, 4] in [0, 1], alpha last, of every geom, site and tendon; ones if there is no texture."""
+    """Return the mean RGBA colour [N, 4] in [0, 1] of the texture of every geom, site and tendon; ones without a texture."""
     means = np.ones((mj_model.ntex + 1, 4))  # the last row is for objects without a texture
     for texture in range(mj_model.ntex):
         pixels = texture_pixels(mj_model, texture)
@@ -255,7 +255,7 @@ def mean_texture_colours(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def skybox(mj_model: mujoco.MjModel) -> int:
-    """Return the index of the sky's texture, -1 for none."""
+    """Return the index of the sky's texture, -1 if there is none."""
     skyboxes = np.flatnonzero(mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     return int(skyboxes[0]) if len(skyboxes) else -1
 
@@ -307,7 +307,7 @@ def haze_plane(mj_model: mujoco.MjModel, drawn: np.ndarray) -> tuple[int, float]
 def lights(
     mj_model: mujoco.MjModel, material_specular: np.ndarray, shadows: bool, points: bool
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the leaves of the active lights, and their static properties. Keys as in `Scene`.
+    """Return arrays and static properties of the active lights. Keys as in `Scene`.
 
     Image lights, which MuJoCo's renderer does not support, are ignored; so are point lights unless ``points``.
     """

@@ -1,4 +1,4 @@
-"""Spatial tendons as MuJoCo's visualiser draws them: a capsule for each straight piece, a chain of them for a slack cord.
+"""Spatial tendons as MuJoCo's visualiser renders them: one capsule per straight piece, a chain of capsules for a slack cord.
 
 NumPy only; the poses of the capsules are computed in `cords`.
 """
@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 
 CHAIN = 28
-"""Capsules of a cord that may hang: MuJoCo draws a catenary with so many."""
+"""Number of capsules of a cord that may hang, as in MuJoCo's catenaries."""
 ARC = 16
-"""Capsules of the arc around a geom. MuJoCo draws as many as the arc is long, one for about 0.12 radians."""
+"""Number of capsules of the arc around a geom. In MuJoCo it depends on the arc: one for about 0.12 rad."""
 WRAPPED = 1 + ARC + 1
-"""Capsules of a piece that may wrap around a geom: to it, around it, and from it."""
+"""Number of capsules of a piece that may wrap around a geom: to it, around it, and from it."""
 
 # Columns of `Scene.cords`.
 LENGTH = 0  # m, of the cord that hangs
@@ -38,8 +38,8 @@ class Piece(NamedTuple):
         last: Index of the site at its end.
         geom: Index of the geom that it may wrap around, -1 for none.
         side: Index of the site on whose side of the geom it passes, -1 for none.
-        is_ball: Whether the geom is a sphere, not a cylinder.
-        divisor: Divisor of its length, behind a pulley.
+        is_ball: True if the geom is a sphere, False for a cylinder.
+        divisor: Divisor of the piece's length (that of the preceding pulley; 1 without one).
     """
 
     first: int
@@ -51,12 +51,12 @@ class Piece(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Course of a spatial tendon: a static part of the scene.
+    """Path of a spatial tendon, a static part of the scene.
 
     Attributes:
-        pieces: Its pieces, in order. Empty for a fixed tendon, which is not drawn.
-        hangs: Whether it hangs between its two sites as long as it is slack.
-        shows_limits: Whether its colour shows a limit that is reached.
+        pieces: Its pieces, in order. Empty for a fixed tendon, which is not rendered.
+        hangs: True if it hangs between its two sites while it is slack.
+        shows_limits: True if its colour indicates a limit that is reached.
     """
 
     pieces: tuple[Piece, ...] = ()
@@ -65,7 +65,7 @@ class Path(NamedTuple):
 
     @property
     def capsules(self) -> int:
-        """Number of capsules."""
+        """Number of capsules that the tendon is rendered as."""
         return CHAIN if self.hangs else sum(1 if piece.geom < 0 else WRAPPED for piece in self.pieces)
 
 
@@ -94,7 +94,7 @@ def _path(mj_model: mujoco.MjModel, tendon: int) -> Path:
     low, high = mj_model.tendon_range[tendon]
     short, long = mj_model.tendon_lengthspring[tendon]
     springs = mj_model.tendon_stiffness[tendon] > 0
-    # A cord between two sites that is held by either a limit or a spring, and by it only from a length on.
+    # A cord between two sites hangs if either a limit or a spring acts on it, and only above some length.
     by_limit, by_spring = limited and not springs and low == 0 and high > 0, springs and short == 0 and long > 0
     falls = not mj_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY and np.linalg.norm(mj_model.opt.gravity) > 0
     hangs = bool(count == 2 and falls and (by_limit != by_spring))
@@ -108,7 +108,7 @@ def capsule_counts(mj_model: mujoco.MjModel, paths: tuple[Path, ...]) -> np.ndar
 
 
 def cord_columns(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Return what the capsules of tendons depend on besides poses, [ntendon, COLUMNS]."""
+    """Return the parameters of tendons, besides poses, that their capsules depend on: [ntendon, COLUMNS]."""
     columns = np.zeros((mj_model.ntendon, COLUMNS))
     springs = mj_model.tendon_stiffness > 0
     columns[:, LENGTH] = np.where(springs, mj_model.tendon_lengthspring[:, 1], mj_model.tendon_range[:, 1])

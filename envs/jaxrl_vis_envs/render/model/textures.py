@@ -15,11 +15,11 @@ import numpy as np
 from jaxrl_vis_envs.render.model import reading
 
 NONE, FLAT, CUBE, UNWRAPPED = range(4)
-"""Mapping of a texture onto an object: none, projected along z, from a cube around it, or by the mesh's own coordinates."""
+"""Mappings of a texture onto an object: none, projected along z, from a surrounding cube, or by the mesh's own coordinates."""
 
 
 class Image(NamedTuple):
-    """Texture in the atlas: its first level, number of levels, and number of faces (1, or 6 of a cube)."""
+    """Texture in the atlas: index of its first level, number of levels, and number of faces (6 for a cube map, else 1)."""
 
     first_level: int
     levels: int
@@ -32,11 +32,11 @@ class Atlas(NamedTuple):
     Attributes:
         levels: First row in the texels, width and height (of one face) of every image at every level.
         mappings: Texture mapping of each of the G rendered objects.
-        images: Texture of each of the G rendered objects in the model; None for none.
+        images: Image that each of the G rendered objects has in the model; None without a texture.
         loaded: Image of each texture of the model; None for those that are not in the atlas.
-        uniform: Flags of the G rendered objects whose texture repeats per metre, not per object.
-        alpha: Flags of the G rendered objects whose texture has alpha, which matters if they are transparent.
-        sky: Texture of the sky, None for a plain one.
+        uniform: G flags, True for objects whose texture repeats per metre instead of per object.
+        alpha: G flags, True for objects whose texture has alpha, which matters if they are transparent.
+        sky: Image of the sky, None for a plain sky.
     """
 
     levels: tuple[tuple[int, int, int], ...]
@@ -56,7 +56,14 @@ class Atlas(NamedTuple):
 def build_atlas(
     mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray, textured: bool, further: tuple[int, ...] = ()
 ) -> tuple[Atlas, np.ndarray, str]:
-    """Collect the textures of the objects ``ids``, rendered with these types, the ``further`` ones, and that of the sky.
+    """Collect the textures of the rendered objects and of the sky, and further ones.
+
+    Args:
+        mj_model: MuJoCo model.
+        ids: Indices of the rendered objects.
+        types: Their types, as rendered.
+        textured: False to collect no textures.
+        further: Indices of further textures to load; ignored if no object has a texture.
 
     Returns:
         The atlas, the texels [T, 4] uint32 (T at least 1), and "plain" or "texture" for the sky.
@@ -101,12 +108,12 @@ def _mapping(mj_model: mujoco.MjModel, index: int, kind: int, texture: int) -> i
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = mj_model.geom_dataid[index]
         if mj_model.mesh_texcoordadr[mesh] >= 0:
-            return UNWRAPPED if flat else NONE  # a cube map does not use a mesh's own coordinates, and MuJoCo renders none
+            return UNWRAPPED if flat else NONE  # a cube map ignores a mesh's own coordinates, and MuJoCo renders none
     return FLAT if flat else CUBE
 
 
 def _faces(mj_model: mujoco.MjModel, texture: int) -> np.ndarray:
-    """Return the pixels [faces, height, width, 3 or 4], uint8 or float64, in [0, 255]."""
+    """Return the texels [faces, height, width, 3 or 4] of a texture, uint8 or float64, in [0, 255]."""
     pixels = reading.texture_pixels(mj_model, texture)
     if mj_model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D:
         return pixels[None]
@@ -139,7 +146,7 @@ def _halved(faces: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _quads(faces: np.ndarray, repeats: bool) -> np.ndarray:
-    """Pack each texel with its neighbours, see the module's docstring. Beyond the border, the image repeats or is clamped."""
+    """Pack each texel with its neighbours (see the module docstring). Beyond the border, the image repeats or is clamped."""
     # Rounded by adding half and truncating. Signed integers, because they convert faster and skies have large faces.
     red, green, blue = ((faces[..., index] + 0.5).astype(np.int32) for index in range(3))
     packed = (red + (green << 8) + (blue << 16)).astype(np.uint32)
@@ -165,13 +172,13 @@ def _is_plain_sky(mj_model: mujoco.MjModel, texture: int) -> bool:
         return False
     edge = faces.shape[1]
     position = (2.0 * np.arange(edge) + 1.0) / edge - 1.0
-    # A few texels rule out most other skies; all are compared only if those match.
+    # Compare a few texels first, which rule out most other skies, then all.
     sparse, all_ = slice(None, None, max(1, edge // 16)), slice(None)
     return all(_is_gradient(mj_model, faces[:, part, part], position[part]) for part in (sparse, all_))
 
 
 def _is_gradient(mj_model: mujoco.MjModel, faces: np.ndarray, position: np.ndarray) -> bool:
-    """Compare texels [6, N, N, 3] at ``position`` [N] (-1 to 1) along both axes of a cube's faces with MuJoCo's gradient."""
+    """Return True if texels [6, N, N, 3] at ``position`` [N] (-1 to 1) along both axes of a cube's faces match the gradient."""
     across, down = np.meshgrid(position, position)
     one = np.ones_like(across)
     # z of each texel's direction on the faces right, left, up, down, front, back.

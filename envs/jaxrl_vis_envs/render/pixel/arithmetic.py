@@ -1,4 +1,4 @@
-"""Arithmetic on single pixels and their vectors, in as few instructions as possible on each device."""
+"""Elementwise arithmetic on pixels and their vectors, in as few instructions as possible on each device."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ Vector = tuple  # of three numbers or arrays [P]
 
 
 def maximum(one: jax.Array, other: jax.Array | float) -> jax.Array:
-    """Return the elementwise maximum, [P]: one instruction on a CPU, where XLA's NaN-propagating one takes five."""
+    """Return the elementwise maximum, [P], in one instruction on a CPU, where XLA's NaN-propagating maximum takes five."""
     return jnp.where(one > other, one, other) if targets_cpu() else jnp.maximum(one, other)
 
 
@@ -73,7 +73,7 @@ def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:
 
 
 def reciprocal(value: jax.Array) -> jax.Array:
-    """Compute 1 / value for positive values, accurate to a few bits, by Newton's method from an estimate based on the exponent.
+    """Compute 1 / value for positive values, up to the last few bits, by Newton's method from an estimate of the exponent.
 
     XLA never fuses a division whose quotient is used twice: it would store the quotient and recompute the rest of the loop.
     """

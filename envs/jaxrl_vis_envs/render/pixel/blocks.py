@@ -27,7 +27,8 @@ _CPU_TILE, _TILE = 8, 16
 
 
 class Layout(NamedTuple):
-    """Pixels in blocks: rows and columns [blocks, P], NumPy; and the height and width of a tile, None for strips.
+    """Image coordinates of the pixels by block, rows and columns [blocks, P], NumPy; and height and width of a tile, None for
+    strips.
 
     If an image is not divisible into tiles, they extend beyond its right and lower border.
     """
@@ -47,7 +48,7 @@ def layout(scene: Scene) -> Layout:
 
 
 def tiles(scene: Scene, high: int, wide: int) -> Layout:
-    """Split the image of a scene into tiles of this height and width."""
+    """Split the image of a scene into tiles of height ``high`` and width ``wide``."""
     down, across = -(-scene.height // high), -(-scene.width // wide)
     rows, columns = np.indices((down * high, across * wide))
 
@@ -68,7 +69,7 @@ def restore(scene: Scene, layout: Layout, plane: jax.Array) -> jax.Array:
 
 
 def near_divisor(pixels: int, preferred: int) -> int:
-    """Return a tile length near the preferred one, and a divisor of ``pixels`` if there is one nearby."""
+    """Return a tile length near the ``preferred`` one that divides ``pixels``, if there is one nearby."""
     lengths = [length for length in range(preferred // 2 + 2, 2 * preferred - 4) if pixels % length == 0]
     return min(lengths, key=lambda length: abs(length - preferred), default=min(preferred, pixels))
 
@@ -82,12 +83,12 @@ def _block_count(pixels: int) -> int:
 
 
 def _half_count(pixels: int) -> int:
-    """Return 2 on a CPU, if divisible: the minimum for a loop."""
+    """Return 2 on a CPU if ``pixels`` is even, the minimum number of blocks for a loop, else `_block_count`."""
     return 2 if targets_cpu() and pixels % 2 == 0 else _block_count(pixels)
 
 
 def scan(function: Callable, *pixels: Any) -> Any:
-    """Apply ``function``, from trees of arrays [P] to trees of arrays [P], to trees of arrays [blocks, P], block by block."""
+    """Apply ``function``, from pytrees of arrays [P] to pytrees of arrays [P], block by block to pytrees of [blocks, P]."""
     if _shape(pixels)[0] == 1:
         first = jax.tree.map(lambda plane: plane[0], pixels)
         return jax.tree.map(lambda plane: plane[None], function(*first))
@@ -95,7 +96,7 @@ def scan(function: Callable, *pixels: Any) -> Any:
 
 
 def scan_one(function: Callable, *pixels: Any) -> jax.Array:
-    """`scan` for a function with one int32 result, on all cores of a CPU.
+    """Apply `scan` to a function with one int32 result, on all cores of a CPU.
 
     XLA computes values that go directly into the stacked results of a loop on one thread, but carried values on all of them:
     results are therefore carried for one iteration before they are stacked.
@@ -112,12 +113,12 @@ def scan_one(function: Callable, *pixels: Any) -> jax.Array:
 
 
 def _shape(pixels: Any) -> tuple[int, ...]:
-    """Return the common shape of a tree's arrays."""
+    """Return the common shape of a pytree's arrays."""
     return jax.tree.leaves(pixels)[0].shape
 
 
 def merge_blocks(pixels: Any) -> Any:
-    """Merge arrays [blocks, P] into fewer, longer blocks, for stages that do not depend on which pixels are in a block."""
+    """Merge arrays [blocks, P] into fewer, longer blocks, for stages that process pixels independently of their blocks."""
     count = _block_count(math.prod(_shape(pixels)))
     return jax.tree.map(lambda plane: plane.reshape(count, -1), pixels)
 

@@ -18,7 +18,21 @@ COLUMNS = 20
 
 
 class Light(NamedTuple):
-    """One light in the camera's frame. Vectors are [3] arrays or three scalars, all other values scalars."""
+    """Light in the camera's frame. Vectors are arrays [3] or three scalars; all other values are scalars.
+
+    Attributes:
+        directional: True for a directional light.
+        highlights: True if the light can cause specular highlights.
+        shadows: True if the light casts shadows.
+        position: Position, m; None for a directional light.
+        direction: Unit vector along which the light shines.
+        ambient: Ambient colour.
+        diffuse: Diffuse colour.
+        specular: Specular colour.
+        attenuation: Constant, linear (1/m) and quadratic (1/m^2) attenuation; None for a directional light.
+        cosine_cutoff: Cosine of the cone's half-angle; None except for a spot light.
+        exponent: Exponent of the falloff from the cone's axis; None except for a spot light.
+    """
 
     directional: bool
     highlights: bool
@@ -38,7 +52,7 @@ def light_poses(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array]:
 
     Args:
         scene: The scene.
-        data: Has the body poses that `mounts.mount_position` reads.
+        data: Physics data with the body poses that `mounts.mount_position` reads.
 
     Returns:
         Positions [L, 3] in metres and unit directions [L, 3], float32.
@@ -85,7 +99,7 @@ def camera_lights(scene: Scene, data: Any, camera_position: jax.Array, camera_ro
 
 
 class LightFacts(NamedTuple):
-    """Static properties of a light."""
+    """Static properties of a light: three as in `Light`, and ``cone``, True for a spot light."""
 
     directional: bool
     highlights: bool
@@ -103,7 +117,7 @@ def facts(scene: Scene) -> list[LightFacts]:
 
 
 def pack(lights: list[Light]) -> jax.Array:
-    """Store all parameters of the lights in one table: [L, COLUMNS] float32."""
+    """Pack all parameters of the lights into one table: [L, COLUMNS] float32."""
     rows = []
     for light in lights:
         zeros, zero = jnp.zeros(3, jnp.float32), jnp.zeros((), jnp.float32)
@@ -119,7 +133,7 @@ def pack(lights: list[Light]) -> jax.Array:
 
 
 def unpack(scene: Scene, table: Any) -> list[Light]:
-    """Undo `pack`, with vectors as three scalars. The table may be an array or, in a kernel, a block of memory."""
+    """Invert `pack`, with vectors as three scalars. The table may be an array or, in a kernel, a block of memory."""
     lights = []
     for index, fact in enumerate(facts(scene)):
         values = [table[index, column] for column in range(COLUMNS)]
@@ -132,7 +146,7 @@ def unpack(scene: Scene, table: Any) -> list[Light]:
 
 
 def light_vector(light: Light, point: Vector) -> tuple[Vector, jax.Array | None, jax.Array | None]:
-    """Return unit vectors to the light, distances (m) and their inverses, [P] each; the latter None for a directional light."""
+    """Return unit vectors to the light, distances (m) and their inverses, [P] each; the last two are None if directional."""
     if light.directional:
         return tuple(-light.direction[axis] for axis in range(3)), None, None
     assert light.position is not None
@@ -145,7 +159,7 @@ def light_vector(light: Light, point: Vector) -> tuple[Vector, jax.Array | None,
 def light_factors(
     light: Light, point: Vector, normal: Vector, to_camera: Vector, exponent: jax.Array, lit: jax.Array | None
 ) -> tuple:
-    """Compute the factors of a light's ambient, diffuse and specular colour, each [P] or a number.
+    """Compute the factors of a light's ambient, diffuse and specular colour, each [P] or a scalar.
 
     Args:
         light: The light.
@@ -153,7 +167,7 @@ def light_factors(
         normal: Unit outward normal.
         to_camera: Unit vector to the camera.
         exponent: Exponent of the highlight.
-        lit: [P], 1 where the light is visible from the point, 0 in shadow; None for no shadows.
+        lit: [P], 1 where the light is visible from the point, 0 in shadow; None if it casts no shadows.
     """
     to_light, distance, _ = light_vector(light, point)
     fade: Any = 1.0

@@ -14,17 +14,17 @@ from jaxrl_vis_envs.render.scene import Scene
 
 
 class TextureRow(NamedTuple):
-    """Texture mapping of an object, and its position in the atlas: numbers, or arrays [P] float32.
+    """Texture mapping of an object, and the texture's position in the atlas: scalars, or arrays [P] float32.
 
     Attributes:
         mapping: One of the constants of `textures`.
         scale: Factors of the coordinates, see `_texture_scales`.
         shift: Offsets of a flat texture's coordinates, horizontal and vertical.
-        first_level: Index of its first level.
+        first_level: Index of the texture's first level.
         levels: Number of levels.
         six_faces: 1 for a cube with six faces, otherwise 0.
-        width: Width of its finest level, texels.
-        height: Height of its finest level, texels.
+        width: Width of the finest level, texels.
+        height: Height of the finest level, texels.
     """
 
     mapping: jax.Array
@@ -38,7 +38,7 @@ class TextureRow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Properties of one object, or of the object at each pixel: numbers, or arrays [P] float32."""
+    """Properties of one object, or of the object at each pixel: scalars, or arrays [P] float32."""
 
     axes: Vector  # of three vectors
     origin: Vector
@@ -81,7 +81,7 @@ def object_table(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
 
 
 def appearance_columns(scene: Scene) -> list[jax.Array]:
-    """Return the columns of `object_table` that do not depend on poses, from the type on; [G] float32 each."""
+    """Return the columns of `object_table` that do not depend on poses, starting with the type; [G] float32 each."""
     ids = np.array(scene.object_ids)
     columns = [jnp.asarray(scene.object_types, jnp.float32), *(scene.rgba[ids, channel] for channel in range(3))]
     columns += [scene.emission[ids], scene.specular[ids], 128.0 * scene.shininess[ids]]
@@ -94,8 +94,8 @@ def appearance_columns(scene: Scene) -> list[jax.Array]:
 
 
 def _atlas_places(scene: Scene, ids: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """Return first level, number of levels, 1 for six faces, width and height of the objects' textures, [G, 5] float32; and the
-    mapping [G] float32, which is that of no texture where one is not loaded.
+    """Return first level, number of levels, 1 for six faces, width and height of the objects' textures, [G, 5] float32; and
+    their mappings [G] float32, which are `textures.NONE` for textures that are not loaded.
     """
     images = [*scene.atlas.loaded, None]  # the last is selected by index -1
     chosen = jnp.clip(scene.texture[ids], -1, len(images) - 2)
@@ -108,7 +108,7 @@ def _atlas_places(scene: Scene, ids: np.ndarray) -> tuple[jax.Array, jax.Array]:
 
 
 def _texture_scales(scene: Scene, ids: np.ndarray) -> list[jax.Array]:
-    """Return factors and offsets that map coordinates of a point to those of the texture: five [G].
+    """Return factors and offsets that map coordinates of a point to texture coordinates: five arrays [G].
 
     A flat texture multiplies the surface coordinates (see `charts`) by the first two and adds the last two; a cube multiplies
     the coordinates in the unit shape's frame by the first three; an unwrapped texture multiplies the mesh's own coordinates by

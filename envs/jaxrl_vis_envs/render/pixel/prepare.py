@@ -34,18 +34,18 @@ def prepare(scene: Scene, data: Any, rgb: bool = True) -> Prepared:
     Args:
         scene: The scene.
         data: Poses of one environment, as in `render_planes`.
-        rgb: Whether colours are rendered.
+        rgb: True if colours are rendered.
     """
     return _prepare(rgb, scene, {name: getattr(data, name) for name in _POSES if hasattr(data, name)})
 
 
 def check_poses(scene: Any, data: Any, rgb: bool) -> None:
-    """Check scene and poses: JAX would silently substitute the last geom's pose for missing ones.
+    """Check scene and poses, because JAX would silently substitute the last geom's pose for missing ones.
 
     Args:
         scene: The scene.
         data: Poses, see `render_planes`.
-        rgb: Whether colours are rendered.
+        rgb: True if colours are rendered.
 
     Raises:
         ValueError: ``scene`` is not a Scene, or ``data`` has no poses, poses that kinematics has not computed yet, those of
@@ -90,7 +90,7 @@ def _check_array(data: Any, name: str, row_shapes: tuple[tuple[int, ...], ...], 
 
 
 def _check_filled(data: Any) -> None:
-    """Check that concrete poses have been computed: a rotation is never all zeros."""
+    """Check that concrete poses have been computed: rotation matrices are never all zeros."""
     rotations = data.geom_xmat
     if isinstance(rotations, jax.Array) and (isinstance(rotations, jax.core.Tracer) or not rotations.is_fully_addressable):
         return
@@ -101,7 +101,7 @@ def _check_filled(data: Any) -> None:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _prepare(rgb: bool, scene: Scene, poses: dict[str, Any]) -> Prepared:
-    """Compute `Prepared`. Jitted to be traced only once, however many programs contain it, and compiled as a whole."""
+    """Compute `Prepared`. Jitted to be traced only once for all programs that contain it, and compiled as a whole."""
     data = SimpleNamespace(**poses)
     position, rotation, finite = camera.camera_pose(scene, data)
     unit = shapes.unit_shapes(scene, data, position, rotation, finite)

@@ -24,7 +24,7 @@ from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import maximum, minimum
 from jaxrl_vis_envs.render.scene import Scene
 
-# Keeps a division by a ray component of exactly 0 finite; too small to change any other number.
+# Added to divisors so that division by a ray component of exactly 0 is finite; too small to affect other values.
 _TINY = 1e-20
 
 # Maximum number of primitives in unrolled code. Beyond it, only types with at most _MAX_UNROLLED_PER_TYPE are unrolled.
@@ -47,7 +47,7 @@ def code_mask(scene: Scene) -> int:
 
 
 def primitive_rows(scene: Scene, transparent: bool) -> list[int]:
-    """Return the rows of the rendered primitives that are, or can be, transparent or opaque."""
+    """Return the rows of the rendered primitives that can be transparent or, unless ``transparent``, that can be opaque."""
     fine = (shapes.MESH, shapes.HFIELD)
     wanted = (CLEAR, CLEAR_FROM_BEHIND) if transparent else (SOLID, CLEAR_FROM_BEHIND)
     return [
@@ -63,7 +63,7 @@ def is_behind(unit: shapes.UnitShapes, row: int) -> jax.Array:
 
 
 def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) -> tuple[jax.Array, jax.Array]:
-    """Return `row_entry` for objects that are opaque from this side, beyond the near plane."""
+    """Compute `row_entry`, with hits only where the object is opaque from this side and beyond the near plane."""
     t, meets = row_entry(scene, unit, row, rays)
     meets = meets & (t > scene.znear)
     if scene.transparent[row] == CLEAR_FROM_BEHIND:
@@ -72,13 +72,15 @@ def _solid_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) ->
 
 
 def decode(scene: Scene, key: jax.Array, row: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-    """Return depth (m, float32, relatively up to a few 1e-6 too small, not differentiable) and row (-1 for the sky, int32) of
-    keys.
+    """Decode keys to depths and rows. Not differentiable.
 
     Args:
         scene: The scene.
         key: [P] int32.
         row: [P] int32 if the scene `has_separate_rows`, otherwise None.
+
+    Returns:
+        Depth [P] float32 (m), too small by a relative error of up to a few 1e-6, and row [P] int32, -1 for the sky.
     """
     if row is not None:
         return jax.lax.bitcast_convert_type(key, jnp.float32), row
@@ -88,7 +90,7 @@ def decode(scene: Scene, key: jax.Array, row: jax.Array | None) -> tuple[jax.Arr
 
 
 def row_entry(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays) -> tuple[jax.Array, jax.Array]:
-    """Compute the entry of each pixel's ray into the object of a row (t, planar depth in metres), and a hit mask; [P] each."""
+    """Compute where each pixel's ray enters the object of a row (t, planar depth in metres), and a hit mask; [P] each."""
     start, direction, inverse_square = camera.ray_parts(scene, rays)
     kind = scene.object_types[row]
     bare_ball = kind == shapes.SPHERE and scene.atlas.mappings[row] == 0
@@ -144,12 +146,12 @@ def entry(kind: int, values: tuple, start: tuple, direction: tuple, inverse_squa
 
 
 def sky_key(scene: Scene, mask: int) -> jax.Array:
-    """Return the key of a ray without intersection, [] int32; ``mask`` is `code_mask`, or 0 for depths alone."""
+    """Return the key of a ray without intersection, [] int32; ``mask`` is that of `code_mask`, or 0 for keys without rows."""
     return (jax.lax.bitcast_convert_type(scene.zfar, jnp.int32) & ~mask) | mask
 
 
 def object_key(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays, missed: jax.Array, mask: int) -> jax.Array:
-    """Return the keys of one opaque object, [P] int32, and ``missed`` where a ray misses it; ``mask`` as in `sky_key`."""
+    """Return the keys of one opaque object, [P] int32, or ``missed`` where a ray misses it; ``mask`` as in `sky_key`."""
     t, meets = _solid_entry(scene, unit, row, rays)
     return jnp.where(meets, (jax.lax.bitcast_convert_type(t, jnp.int32) & ~mask) | (row & mask), missed)
 
@@ -157,7 +159,7 @@ def object_key(scene: Scene, unit: shapes.UnitShapes, row: int, rays: Rays, miss
 def nearest_key(scene: Scene, unit: shapes.UnitShapes, rays: Rays, labelled: bool = True) -> jax.Array:
     """Return the key of the nearest opaque primitive along every ray, [P] int32.
 
-    Unless ``labelled``, a key is only the bits of the depth. If the scene `has_separate_rows`, it always is; see `nearest_row`.
+    Unless ``labelled``, or if the scene `has_separate_rows` (see `nearest_row`), a key consists of the bits of the depth only.
 
     Small numbers of objects are unrolled into one pass. Otherwise, objects whose bounding spheres intersect the pyramid of the
     rays are selected by type, and a loop runs over them; the rays should then be close together.
@@ -176,7 +178,7 @@ def nearest_key(scene: Scene, unit: shapes.UnitShapes, rays: Rays, labelled: boo
 
 
 def _rows_by_type(scene: Scene, rows: list[int]) -> dict[int, np.ndarray]:
-    """Return the rows of each type with enough objects for a loop. Planes fill the image: a loop would not help."""
+    """Return the rows of each type with enough objects for a loop. Planes are excluded: they fill the image."""
     kinds = np.array(scene.object_types)[rows]
     counted = {int(kind): np.array(rows)[kinds == kind] for kind in np.unique(kinds) if kind != shapes.PLANE}
     return {kind: type_rows for kind, type_rows in counted.items() if len(type_rows) > _MAX_UNROLLED_PER_TYPE}
@@ -200,7 +202,7 @@ class _Selection(NamedTuple):
     Attributes:
         table: [objects, 15] float32, candidates first: origin, axes, extra, extra_square, row.
         count: [] int32, number of candidates.
-        bare_ball: Whether the type is a ball without texture.
+        bare_ball: True if the objects are balls without texture.
     """
 
     table: jax.Array
@@ -228,7 +230,7 @@ def _select(scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, 
 
 
 def _intersect_selected(scene: Scene, kind: int, selection: _Selection, step: jax.Array, rays: Rays) -> tuple:
-    """Intersect rays with the object at one index of the table; return t and a hit mask, [P] each, and the row, [] int32."""
+    """Intersect rays with the object at index ``step`` of the table; return t and hit mask, [P] each, and row, [] int32."""
     start, direction, inverse_square = camera.ray_parts(scene, rays)
     values = jax.lax.dynamic_slice(selection.table, (step, np.int32(0)), (1, selection.table.shape[1]))[0]
     origin, axes = [values[i] for i in range(3)], [[values[3 + 3 * i + j] for j in range(3)] for i in range(3)]
@@ -255,9 +257,9 @@ def _nearest_looped(
 def _nearest_row_looped(
     scene: Scene, unit: shapes.UnitShapes, kind: int, rows: np.ndarray, rays: Rays, best: jax.Array, row: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Update minimum depth (as bits, [P]) and its row [P] with the objects ``rows``, all of one type.
+    """Update the minimum depth (as bits, [P]) and its row [P] with the objects ``rows``, all of one type.
 
-    Of objects at the same depth, the lower row wins.
+    Of objects at the same depth, the one with the lower row is kept.
     """
     selection = _select(scene, unit, kind, rows, rays)
     none = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
@@ -278,7 +280,7 @@ def _nearest_row_looped(
 
 
 def nearest_distance(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.Array:
-    """Return the depth alone, [P] float32 (m), differentiable as is: cheaper if nothing else is requested."""
+    """Return only the depth of the nearest opaque primitive, [P] float32 (m); differentiable, and cheaper than keys."""
     depth = jnp.broadcast_to(scene.zfar, rays.u.shape)
     for row in primitive_rows(scene, transparent=False):
         t, meets = _solid_entry(scene, unit, row, rays)
@@ -286,11 +288,11 @@ def nearest_distance(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> jax.A
     return depth
 
 
-# The intersections take the ray's start and direction in the unit shape's frame.
+# Arguments of the following functions: start and direction of the ray in the unit shape's frame.
 
 
 def _safe_root(square: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the square root where positive, else 1 so that no gradient is infinite; and the mask of positive values."""
+    """Return the square root of positive values, 1 for others (to keep gradients finite), and the mask of positive values."""
     positive = square > 0.0
     return jnp.sqrt(jnp.where(positive, square, 1.0)), positive
 
@@ -298,8 +300,8 @@ def _safe_root(square: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _sphere(origin: tuple, ray: tuple, radius: jax.Array, inverse_square) -> tuple:
     """Intersect the unit ball without rotation: the ray's direction is still in metres, so t comes out in radii.
 
-    The ray is first followed to its point nearest to the centre. Subtracting there, not between the large terms of the usual
-    quadratic formula, keeps a small, distant ball accurate in float32.
+    The point of the ray nearest to the centre is computed first. Subtracting there, instead of between the large terms of the
+    usual quadratic formula, keeps small, distant balls accurate in float32.
     """
     middle = -(origin[0] * ray[0] + origin[1] * ray[1] + origin[2] * ray[2]) * inverse_square
     x, y, z = (origin[axis] + middle * ray[axis] for axis in range(3))
@@ -326,7 +328,7 @@ def _tube(origin: tuple, ray: tuple) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _capsule(origin: tuple, ray: tuple, half_length: jax.Array, inverse) -> tuple:
-    """Intersect a tube with a ball at each end: if the ray enters the tube beyond an end, that end's ball decides."""
+    """Intersect a tube with a ball at each end: if the ray enters the tube beyond an end, the ball of that end is used."""
     middle, root, meets = _tube(origin, ray)
     side = middle - root
     height = origin[2] + side * ray[2]
@@ -340,7 +342,7 @@ def _capsule(origin: tuple, ray: tuple, half_length: jax.Array, inverse) -> tupl
 
 
 def _cylinder(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
-    """Intersect the tube and the slab |z| <= 1: inside both from the later entry to the earlier exit."""
+    """Intersect the tube and the slab |z| <= 1: the ray is inside both from the later entry to the earlier exit."""
     del extra, scaled_inverse
     middle, root, meets = _tube(origin, ray)
     inverse = 1.0 / (ray[2] + _TINY)
@@ -351,7 +353,7 @@ def _cylinder(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tu
 
 
 def _box(origin: tuple, ray: tuple, extra: jax.Array, scaled_inverse) -> tuple:
-    """Intersect three slabs: inside all of them from the latest entry to the earliest exit."""
+    """Intersect three slabs: the ray is inside all of them from the latest entry to the earliest exit."""
     del extra, scaled_inverse
     enters, leaves = [], []
     for axis in range(3):

@@ -15,8 +15,8 @@ class Texels(Protocol):
     """Reader of a texture atlas: from arrays (`ArrayTexels`), or from blocks of memory in a kernel.
 
     Attributes:
-        few_textures: Whether to check first if any pixel has a texture at all.
-        differentiable: Whether derivatives with respect to texture coordinates exist.
+        few_textures: True to check first if any pixel has a texture at all.
+        differentiable: True if derivatives with respect to texture coordinates exist.
     """
 
     few_textures: bool
@@ -52,7 +52,7 @@ class ArrayTexels:
 
 
 def atlas_reader(scene: Scene) -> Texels:
-    """Return the reader of the scene's atlas: a kernel substitutes its own reader for the texels."""
+    """Return the reader of the scene's atlas: ``scene.texels`` if a kernel has replaced them by its own reader."""
     own: Any = scene.texels
     return own if hasattr(own, "quad") else ArrayTexels(own, scene.atlas.levels)
 
@@ -71,12 +71,12 @@ def sample(
 
     Args:
         texels: Atlas reader.
-        first_level: [P] int32 or a number: first level of the texture.
-        level_count: [P] int32 or a number: its number of levels.
-        face: [P] int32 or a number: face of a cube.
+        first_level: [P] int32 or an int, first level of the texture.
+        level_count: [P] int32 or an int, number of its levels.
+        face: [P] int32 or an int, face of a cube.
         coordinates: Horizontal and vertical texture coordinates, [P] float32 each; 0 to 1 is the whole image.
         spread_square: [P] float32, squared footprint of a pixel in texels of the finest level.
-        repeats: [P] bool or a bool: repeat the image beyond its border, or clamp to the border.
+        repeats: [P] bool or a bool, True to repeat the image beyond its border, False to clamp to the border.
         alpha: Also return alpha.
 
     Returns:
@@ -118,9 +118,9 @@ def _mix_alpha(corners: tuple, right: jax.Array, below: jax.Array) -> jax.Array:
 
 
 def _mix(corners: tuple, right: jax.Array, below: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Interpolate red, green and blue between four texels, with weights in units of 1/256 as in graphics hardware.
+    """Interpolate red, green and blue between four texels, with weights quantised to 1/256 as in graphics hardware.
 
-    Two channels then fit into one integer product.
+    Two channels then share one integer product.
     """
     right, below = ((256.0 * share + 0.5).astype(jnp.int32) for share in (right, below))
     both = (right * below + 128) >> 8
@@ -142,7 +142,7 @@ _mixed = jax.custom_jvp(_mix)
 
 @_mixed.defjvp
 def _mix_tangents(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    """Differentiate the underlying interpolation: the integers themselves have no slope."""
+    """Differentiate the interpolation in floating point, since the integer arithmetic has no derivative."""
     corners, right, below = primals
     _, right_tangent, below_tangent = tangents
     colour_tangents = []
@@ -155,13 +155,13 @@ def _mix_tangents(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
 
 
 def cube_coordinates(direction: tuple) -> tuple[jax.Array, tuple[jax.Array, jax.Array], tuple]:
-    """Look up a direction in a cube map, as OpenGL does.
+    """Compute the face and the coordinates of a direction in a cube map, as in OpenGL.
 
     Args:
-        direction: Three [P] float32, of any length.
+        direction: Three [P] float32, of any norm.
 
     Returns:
-        Face [P] int32, coordinates on it (horizontal and vertical, [P] each), and the axis choice for `cube_tangent`.
+        Face [P] int32, horizontal and vertical coordinates on it ([P] each), and the choice of axes for `cube_tangent`.
     """
     x, y, z = direction
     ax, ay, az = jnp.abs(x), jnp.abs(y), jnp.abs(z)

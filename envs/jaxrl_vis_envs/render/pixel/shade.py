@@ -30,7 +30,7 @@ _SKY_DISTANCE = 0.7
 
 
 def shade(scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, rays: Rays) -> Vector:
-    """Compute the colour of surfaces, including their textures."""
+    """Compute the colour of surfaces, including their textures; arguments and result as in `light_surface`."""
     colour = light_surface(scene, unit, lights, row, hit, rays)
     texture = texturing.texture_colour(scene, row, hit)
     return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
@@ -43,7 +43,7 @@ def light_surface(
 
     Args:
         scene: The scene.
-        unit: Rendered objects, for shadows; None if no light casts any.
+        unit: Rendered objects, for shadows; None if no light casts shadows.
         lights: Lights in the camera's frame.
         row: Object at each pixel.
         hit: Intersection at each pixel.
@@ -55,7 +55,7 @@ def light_surface(
     if hit.triangle is None:
         u, v = rays
         if scene.projection == "orthographic":
-            to_camera = normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point nevertheless
+            to_camera = normalized(tuple(-p for p in hit.point))  # OpenGL's viewer is a point even so
         else:
             to_camera = normalized((-u, -v, jnp.ones_like(u)))
         return _light_points(scene, unit, lights, row, hit, to_camera)
@@ -87,7 +87,7 @@ def _light_points(
 
 
 def _shadow_mask(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hit: Hit) -> jax.Array:
-    """Return 0 where a geom is between the point and the light, else 1: [P] float32. Sites cast no shadow."""
+    """Return 0 where a geom or tendon occludes the light, else 1: [P] float32. Sites cast no shadow."""
     assert unit is not None
     to_light, distance, _ = lighting.light_vector(light, hit.point)
     start = tuple(jax.lax.stop_gradient(p) for p in hit.point)
@@ -148,13 +148,13 @@ def _pitches(scene: Scene) -> tuple[jax.Array, jax.Array]:
 
 
 def haze(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, colour: Vector) -> Vector:
-    """Blend the haze at the horizon over the colours; MuJoCo draws it as a wide funnel around the camera.
+    """Blend the haze at the horizon over the colours; MuJoCo renders it as a wide funnel around the camera.
 
     Args:
         scene: Scene with a hazy plane.
         unit: Rendered objects.
         rays: [P].
-        depth: [P] float32, depth of the visible surface, metres, which occludes the funnel.
+        depth: [P] float32, metres, depth of the visible surface, which may occlude the funnel.
         colour: Three [P] float32.
     """
     plane, width = scene.haze

@@ -1,8 +1,8 @@
 """Unit shapes: every rendered object in the camera's frame, once per environment.
 
-An affine map of the camera's frame turns an object into a unit shape (ball, cylinder, cube, square; a mesh keeps metric units).
-Per pixel and object, this leaves a ray that is linear in the pixel's (u, v), and a handful of operations. The maps are stored
-in a few small tables with one row per object, which any other method of finding the nearest hit could also use.
+An affine map of the camera's frame transforms an object to a unit shape (ball, cylinder, cube, square; a mesh keeps metric
+units). A ray in the shape's frame is linear in the pixel's (u, v), so only a handful of operations per pixel and object remain.
+The maps are stored in a few small tables with one row per object, which other methods of finding the nearest hit can also use.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
-# Hidden objects are moved this far behind the camera, in metres: no ray intersects them, and no NaN remains.
+# Distance by which hidden objects are moved behind the camera, metres, so that no ray intersects them and no NaN remains.
 _BEHIND = 1e6
 # Distance that MuJoCo assigns to planes when sorting, metres.
 FAR_AWAY = 1e10
@@ -60,7 +60,8 @@ def unit_shapes(
 
     Args:
         scene: The scene.
-        data: Has ``geom_xpos`` [ngeom, 3] and ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and the same for rendered sites.
+        data: Physics data with ``geom_xpos`` [ngeom, 3] and ``geom_xmat`` [ngeom, 3, 3] or [ngeom, 9], and the same for
+            rendered sites.
         camera_position: [3] float32, metres, world.
         camera_rotation: [3, 3] float32, columns are the camera's axes in the world.
         camera_finite: [] bool; if False, nothing is visible.
@@ -71,7 +72,7 @@ def unit_shapes(
     finite &= ~_without_area(kinds[:, 0], size)
     position = jnp.where(finite[:, None], position, 0.0)
     rotation = jnp.where(finite[:, None, None], rotation, 0.0)
-    # Not matrix products, which accelerators would compute at low precision, and a CPU on one core.
+    # Not matrix products, which accelerators would compute at low precision and CPUs on one core.
     from_camera = position - camera_position
     offset = _sum3(lambda k: from_camera[:, k, None] * camera_rotation[k])  # [G, 3] in the camera's frame
     relative = _sum3(lambda k: rotation[:, k, :, None] * camera_rotation[k])  # [G, shape axis, camera axis]
@@ -93,9 +94,7 @@ def unit_shapes(
 
 
 def _distances(scene: Scene, from_camera: jax.Array) -> jax.Array:
-    """Return distances [G] (m) computed exactly as in MuJoCo, so that the same objects are equally distant; planes are far
-    away.
-    """
+    """Return sorting distances [G] (m), computed exactly as in MuJoCo so that ties agree; planes are at `FAR_AWAY`."""
     # The clamp prevents fused multiply-adds, which would round the three squares differently.
     x, y, z = (jnp.minimum(from_camera[:, axis] * from_camera[:, axis], 1e37) for axis in range(3))
     near = jnp.sqrt(x + y + z) - scene.bound[np.array(scene.object_ids)]
@@ -150,7 +149,7 @@ def _objects(scene: Scene, data: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     rows = np.flatnonzero(ids >= first)
     if not len(rows):
         return position[ids], rotation[ids], scene.size[ids]
-    # Objects are in descending order but for a reflecting one: the capsules of each tendon follow one another.
+    # Objects are in descending order except for a reflecting one, so the capsules of each tendon are contiguous.
     cord = cords.capsules(scene, data, tuple(dict.fromkeys((ids[rows] - first).tolist())))
     others = np.where(ids < first, ids, 0)
     width = scene.size[ids[rows], 0]

@@ -97,20 +97,20 @@ def _override_gradient(triangle: TriangleRow, gradient: Vector) -> Vector:
 
 
 def barycentric(triangle: TriangleRow, point: Vector, is_tangent: bool = False) -> list[jax.Array]:
-    """Compute barycentric coordinates of the 2nd and 3rd corner at a point, or (``is_tangent``) their change along a vector."""
+    """Compute the barycentric coordinates of corners 2 and 3 at a point, or (``is_tangent``) their change along a vector."""
     base = 0.0 if is_tangent else 1.0
     return [dot(map_[:3], point) + base * map_[3] for map_ in triangle.maps[:2]]
 
 
 def mix(corners: tuple, parts: list[jax.Array], is_tangent: bool = False) -> list[jax.Array]:
-    """Interpolate vectors between corners by `barycentric` coordinates, or (``is_tangent``) the change of the vectors."""
+    """Interpolate vectors between corners by `barycentric` coordinates, or (``is_tangent``) compute the vectors' change."""
     base = 0.0 if is_tangent else 1.0
     second, third = parts
     return [base * a + second * (b - a) + third * (c - a) for a, b, c in zip(*corners, strict=True)]
 
 
 def corners(row: Row, hit: Hit) -> list[tuple[jax.Array, Hit]]:
-    """Return the corners of a triangle, each with its barycentric weight [P], because OpenGL lights corners instead of points.
+    """Return the corners of each pixel's triangle as hits, with barycentric weights [P], because OpenGL lights the corners.
 
     Where no mesh is hit, all corners are the hit point itself. (The triangles of a height field are small and flat.)
     """

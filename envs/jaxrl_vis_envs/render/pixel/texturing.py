@@ -13,9 +13,9 @@ from jaxrl_vis_envs.render.scene import Scene
 
 
 def texture_colour(scene: Scene, row: Row, hit: Hit, alpha: bool = False) -> Vector | None:
-    """Compute the texture's red, green and blue, by which the colour is multiplied, [P] each in [0, 1]; None without textures.
+    """Compute the texture's red, green and blue ([P] each, in [0, 1]), factors of the surface colour; None without textures.
 
-    With ``alpha``, it is the fourth component; all textures must have it.
+    With ``alpha``, a fourth component is the texture's alpha, which all textures must have.
     """
     if not scene.atlas.used:
         return None

@@ -1,6 +1,6 @@
 """Transparent objects, blended over the opaque image as in MuJoCo.
 
-MuJoCo sorts them by the distance of their nearest point and draws them twice, front to back and then back to front, so that a
+MuJoCo sorts them by the distance of their nearest point and renders them twice, front to back and then back to front, so that a
 single sheet of alpha a covers 1 - (1 - a)^2 of the background. Of objects at the same distance, the one declared first counts
 as nearer. Every face of an object that faces the camera is blended: for a cup, its outside and its inner back. Depth and
 segmentation treat transparent objects like any other.
@@ -18,11 +18,11 @@ from jaxrl_vis_envs.render.model import reading
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface, texturing, triangles
 from jaxrl_vis_envs.render.scene import Scene
 
-# MuJoCo's factor of a plane's alpha when seen from behind.
+# MuJoCo's factor for the alpha of planes seen from behind.
 _PLANE_BACK = 0.3
 # Relative depth tolerance for visibility behind an opaque surface, which may be the same surface drawn twice.
 _DEPTH_TOLERANCE = 1e-6
-# Number of an object's overlapping faces that contribute to gradients; in images, all do.
+# Maximum number of an object's overlapping faces that contribute to gradients; all contribute to images.
 _MAX_GRADIENT_FACES = 8
 
 
@@ -33,7 +33,7 @@ class Sheet(NamedTuple):
         index: Row of the object.
         row: Its properties.
         hit: Intersections, [P].
-        visible: [P] bool, where they are in front of all opaque objects.
+        visible: [P] bool, True where they are in front of all opaque objects.
     """
 
     index: int
@@ -72,14 +72,14 @@ def intersect_sheets(scene: Scene, unit: shapes.UnitShapes, rows: jax.Array, ray
 
 
 def _max_visible_depth(depth: jax.Array) -> jax.Array:
-    """Return the distances up to which transparent objects are visible, from the depth of opaque ones, [P] metres each."""
+    """Return the depth [P] (m) up to which transparent objects are visible, from the ``depth`` [P] (m) of opaque ones."""
     return jax.lax.stop_gradient(depth) * (1.0 + _DEPTH_TOLERANCE)
 
 
 def nearest(sheets: list[Sheet], depth: jax.Array, index: jax.Array, normal: tuple) -> tuple[jax.Array, jax.Array, tuple]:
-    """Update depth, row and normal of the nearest opaque object with the nearest transparent one; [P] each."""
+    """Update depth, row and normal of the nearest opaque object ([P] each) with those of nearer transparent ones."""
     for sheet in sheets:
-        # Of two at the same depth, the one drawn later wins; rows are in the opposite order.
+        # Of two objects at the same depth, the one drawn later is visible; rows are in the opposite order.
         margin = jnp.where(sheet.index < index, _DEPTH_TOLERANCE, -_DEPTH_TOLERANCE) * depth
         nearer = sheet.visible & (sheet.hit.depth < depth + margin)
         depth = jnp.where(nearer, sheet.hit.depth, depth)
@@ -98,7 +98,7 @@ def blend(
     depth: jax.Array,
     colour: tuple,
 ) -> tuple:
-    """Blend the sheets over the colours [P] (three) of the opaque objects at ``depth`` [P]."""
+    """Blend the sheets over the ``colour`` (three [P]) of the opaque objects at ``depth`` [P]."""
     if not sheets:
         return colour
     declared = sorted(sheets, key=lambda sheet: scene.object_ids[sheet.index])
@@ -133,7 +133,7 @@ def _face_colour(
         image = texturing.texture_colour(scene, sheet.row, sheet.hit, scene.atlas.alpha[sheet.index])
     if image is not None:
         face = tuple(value * texel for value, texel in zip(face, image[:3], strict=True))
-        # A plane that is transparent only from behind has an opaque material in MuJoCo; its texture's alpha counts too.
+        # A plane that is transparent only from behind has an opaque material in MuJoCo; its texture's alpha applies too.
         alpha = alpha * image[3] if scene.atlas.alpha[sheet.index] else alpha
     return face, jnp.where(sheet.visible, alpha, 0.0)
 
@@ -179,14 +179,14 @@ def _blend_next_face(
     row = lookup.read_row(rows[index])
     hit = surface.meet(scene, row, lookup.fetch_triangle(scene, triangle), rays, jnp.where(visible, t, 1.0))
     film = _add_face(film, *_face_colour(scene, unit, light_table, Sheet(index, row, hit, visible), rays))
-    # Where there was none, there is none later.
+    # Pixels without a triangle get none in later steps either.
     after = jnp.where(visible, triangle, jnp.iinfo(jnp.int32).max - 1)
     return film, triangles.next_triangle(scene, jax.lax.stop_gradient(unit), rays, depth, index, after)
 
 
 @_blend_faces.defjvp
 def _blend_faces_jvp(index: int, primals: tuple, tangents: tuple) -> tuple[Film, Film]:
-    """Differentiate through the first faces: a loop with a data-dependent length cannot be transposed."""
+    """Differentiate through the first faces only, since a loop with a data-dependent length cannot be transposed."""
 
     def blend_first(scene: Scene, unit: shapes.UnitShapes, *others: Any) -> Film:
         rows, light_table, rays, depth = others

@@ -16,7 +16,7 @@ from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-# Relative tolerance by which triangles extend beyond their edges, so that no ray passes between two.
+# Relative tolerance by which triangles extend beyond their edges, so that no ray passes between adjacent ones.
 _SEAM = 1e-5
 # Horizontal and vertical offset of a second ray in `next_triangle`, relative to half the image's height. Few edges have that
 # direction, and it is far larger than the rounding error of an edge.
@@ -33,12 +33,12 @@ def nearest_triangle(
         scene: The scene.
         unit: Rendered objects.
         rays: [P]. The pixels should be close together.
-        depth: [P] float32, metres.
-        only: Row of the only object to test; None for all opaque ones.
+        depth: [P] float32, metres, maximum depth.
+        only: Row of the only object to test; None for all opaque objects.
 
     Returns:
-        Depth [P] float32 of the triangle (or ``depth``), its row in `Scene.triangles` and the row of its object, [P] int32, -1
-        if there is none.
+        Depth [P] float32 of the triangle, or ``depth`` if there is none; its row in `Scene.triangles` and the row of its
+        object, [P] int32 each, -1 if there is none.
     """
     # Index of the k-th candidate cluster = number of cumulative counts that are at most k.
     counts = jnp.cumsum(_candidates(scene, unit, rays, depth, only).astype(jnp.int32), dtype=jnp.int32)
@@ -65,7 +65,7 @@ def nearest_triangle(
 
 
 def _candidates(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, only: int | None) -> jax.Array:
-    """Return the mask [K] of clusters that the rays may intersect in front of the depths."""
+    """Return the mask [K] of clusters that the rays may intersect in front of ``depth``."""
     owner = scene.cluster_places[:, 0]
     axes, origin = unit.axes[owner], unit.origin[owner]
     offset = scene.clusters[:, :3] - origin
@@ -89,9 +89,9 @@ def next_triangle(
         scene: The scene.
         unit: Rendered objects.
         rays: [P]. The pixels should be close together.
-        depth: [P] float32, metres.
-        only: Row of the object, a transparent one.
-        after: [P] int32, row in `Scene.triangles` after which to search; -1 for the first.
+        depth: [P] float32, metres, maximum depth.
+        only: Row of the object, which is transparent.
+        after: [P] int32, row in `Scene.triangles` after which to search; -1 for the first triangle.
 
     Returns:
         Depth [P] float32 of the triangle, and its row [P] int32, -1 if there is none.
@@ -123,7 +123,7 @@ def next_triangle(
 
 
 def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
-    """Return the depth [P] of a cluster's nearest triangle, with its index in the lowest bits; infinite for none."""
+    """Return the depth [P] of a cluster's nearest triangle, with its index in the lowest bits; infinite if there is none."""
     best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
     for number, (t, margin, is_front) in enumerate(_intersect_triangles(scene, unit, cluster, rays)):
         meets = is_front & (margin >= -_SEAM)

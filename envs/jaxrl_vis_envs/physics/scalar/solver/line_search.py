@@ -1,4 +1,4 @@
-"""Line search of `scalar_newton` in scalars: the step length of least cost."""
+"""Line search of `scalar_newton` in scalars: the step length of minimum cost."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,20 +23,20 @@ def minimize_along_line(
 ) -> Any:
     """Minimize a convex cost along a line by Newton steps within a shrinking bracket.
 
-    A step that leaves the bracket, or is no shorter than half of the step before, is replaced by the corner nearest to the
-    bracket's middle, or by the middle if there are no corners. Without corners, a slope that changes within a short stretch
-    between two flat ones, as that of dry friction does, is stepped over forever.
+    A step that leaves the bracket, or is not shorter than half of the previous step, is replaced by the corner nearest to the
+    middle of the bracket, or by the middle if there are no corners. Without corners, the search would forever step over a slope
+    that changes only within a short interval, as that of dry friction does.
 
     Args:
-        slope_at: Function from a length to the cost's slope and curvature there; the slope at 0 is not positive.
-        corners: Lengths at which the curvature jumps.
+        slope_at: Function from a step length to the cost's slope and curvature there; the slope at 0 is not positive.
+        corners: Step lengths at which the curvature jumps.
         like: Scalar with the shape and dtype of the batch.
         max_steps: Number of evaluations of ``slope_at``.
         active: Inside a kernel, a mask of the episodes whose result is used: the search ends, after at least two steps, once it
-            has converged for all of these. None outside of kernels: all steps are taken.
+            has converged for all of these. None outside of kernels; all steps are then taken.
 
     Returns:
-        The length of the flatter end of the final bracket.
+        Step length at the end of the final bracket with the smaller absolute slope.
     """
 
     def narrow(_: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -1,7 +1,7 @@
 """Newton's method for constraint forces in scalars: a scalar is an array over a batch of episodes.
 
-The code is unrolled arithmetic without memory in between, and becomes part of one GPU kernel (`steps_kernel`) where a batch of
-small matrices takes a library hundreds of them. Structural zeros generate no operations (`sparse_algebra`).
+The code is unrolled arithmetic without intermediate arrays in memory. It becomes part of one GPU kernel (`steps_kernel`), where
+a library would launch hundreds for a batch of small matrices. Structural zeros generate no operations (`sparse_algebra`).
 
 Source: the primal problem of MuJoCo's documentation, "Computation", constraint model, and its Newton solver.
 """
@@ -47,7 +47,7 @@ class Problem(NamedTuple):
         stiffness: [R], ``efc_D``.
         target: [R], reference accelerations.
         equalities: Number of equality rows, which always act.
-        max_friction: Greatest force of each row of dry friction, by row.
+        max_friction: Maximum force of each row of dry friction, by row.
         cones: Friction of the rows of each elliptic contact, normal first, by the contact's first row.
     """
 
@@ -172,7 +172,7 @@ class _NewtonSolver:
         return cost
 
     def improve(self, step: Any, current: _Iterate) -> _Iterate:
-        """Take Newton step number ``step``: with a line search or, for the exact step, in full or not at all."""
+        """Take Newton step number ``step``: with a line search or, for the exact step, in full if it reduces the gradient."""
         direction = self._direction(current)
         # The cost does not resolve gains below its rounding error; the step is then no longer than Newton's.
         gain = -inner(current.gradient, direction)
@@ -218,14 +218,14 @@ class _NewtonSolver:
         for row, entries in enumerate(problem.jacobian):
             for joint, entry in entries.items():
                 force[joint] = force[joint] + entry * pull[row]
-        # Joints without constraints have the shape of the others, for loops.
+        # Joints without constraints get arrays of the same shape as the others, so that loops can carry them.
         force = [0.0 * value if isinstance(part, float) else part for part, value in zip(force, acceleration, strict=True)]
         inertial = symmetric_product(problem.mass, acceleration)
         gradient = [left - right - pulled for left, right, pulled in zip(inertial, problem.force, force, strict=True)]
         return _Iterate(acceleration, residual, force, gradient)
 
     def _max_friction(self, row: int) -> Any:
-        """Return the greatest force of a row of dry friction; None for other rows."""
+        """Return the maximum force of a row of dry friction; None for other rows."""
         return self._problem.max_friction.get(row)
 
     def _acting_stiffness(self, row: int, residual: Any) -> Any:
@@ -240,7 +240,7 @@ class _NewtonSolver:
         return jnp.where(self._slides(row, residual), 0.0, self._problem.stiffness[row])
 
     def _slides(self, row: int, residual: Any) -> Any:
-        """Return True where dry friction is saturated. As in MJX, friction with a greatest force of 0 never slides."""
+        """Return True where dry friction is saturated. As in MJX, friction with a maximum force of 0 never slides."""
         bound = self._problem.max_friction[row]
         return (jnp.abs(residual) * self._problem.stiffness[row] >= bound) & (bound > 0)
 
@@ -252,7 +252,7 @@ class _NewtonSolver:
         return evaluate_cone(list(self._problem.cones[first]), rows, self._problem.stiffness[first])
 
     def _direction(self, iterate: _Iterate) -> Column:
-        """Return Newton's direction."""
+        """Return the Newton direction."""
         problem = self._problem
         matrix: Matrix = dict(problem.mass)
         stiffness = {row: self._curvature(row, iterate.residual[row]) for row in self._separate}
@@ -266,7 +266,7 @@ class _NewtonSolver:
         return [-part for part in solve_positive(matrix, iterate.gradient)]
 
     def _line_search(self, iterate: _Iterate, direction: Column, is_resolved: Any) -> Any:
-        """Return the step length of least cost; in a kernel, converged only where the gain ``is_resolved``."""
+        """Return the step length of minimum cost; in a kernel, iterate only until it has converged where ``is_resolved``."""
         active = is_resolved if self._in_kernel else None
         problem = self._problem
         along = [row_product(entries, direction) for entries in problem.jacobian]
