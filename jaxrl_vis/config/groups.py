@@ -239,8 +239,7 @@ class NetworkOptions:
 
 @dataclasses.dataclass(frozen=True)
 class StudyOptions:
-    """Options used only in studies: behaviour of the authors' release, variants of replay and targets, and deliberate reward
-    errors."""
+    """Options used only in studies: behaviour of the authors' release, variants of replay and targets, and reward errors."""
 
     replay_mean_age: Count | None = None
     """Mean age of sampled transitions, in transitions: older ones are sampled less often, as if new episodes replaced random

@@ -169,7 +169,7 @@ def to_float32(leaf: jax.Array) -> jax.Array:
 
 
 def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
-    """Split the result of a loss function, or its shapes, into losses and auxiliary output; None without ``has_aux``.
+    """Split the result of a loss function, or its shapes, into losses and auxiliary output (None without ``has_aux``).
 
     Raises:
         RequestError: The result is not of this form, or a loss is not a scalar.
@@ -200,7 +200,7 @@ def check_names(losses: Losses, state: WeightingState) -> None:
 def dot(one: Params, other: Params) -> jax.Array:
     """Compute the scalar inner product of two trees in float32 or wider, regardless of their dtypes.
 
-    Elementwise products are summed instead of using a matrix unit, which on accelerators would round the factors to 10 bits.
+    Elementwise products are summed instead of using a matrix unit, which on accelerators would round factors to 10 bits.
     """
 
     def products(left: jax.Array, right: jax.Array) -> jax.Array:
