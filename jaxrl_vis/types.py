@@ -71,8 +71,8 @@ class Batch(Replaceable):
         action: [B, A] float32.
         state_tp1: [B, G] float32, the true state after the action.
         goal_state: [B, G] float32, the true state depicted by the goal.
-        reward: [B] float32 for reaching that goal, summed over the steps between the first and the last observation; None while
-            goals may still change, and where the learner itself computes the reward (method autoencoder).
+        reward: [B] float32 for reaching that goal, summed over the steps between the first and the last observation; None until
+            it is computed, and if the learner itself computes it (methods autoencoder and classifier).
         discount: [B] float32, discount factor of the value after these steps; None for that of a single step.
         shift: [B, 2] int32, pixels by which to shift the images down and to the right; None for no shift.
         views: [B, ...] images in the observation's dtype, computed by auxiliary tasks, by task (`AuxTask.view`).

@@ -130,7 +130,8 @@ class GoalOptions:
     filter_threshold: float | None = None
     """q0: negatives with Q above this are dropped as false. None: the middle of the valid range, for filtering methods."""
     future_goals: Literal["even", "geometric"] = "even"
-    """Distribution of relabelled goals over the rest of the episode: even, or falling with gamma^k for k further steps."""
+    """Distribution of relabelled goals over the rest of the episode: uniform (even), or proportional to gamma^k after k further
+    steps (geometric)."""
     trivial_goals: Annotated[Share, NEEDS_STATES] = 1.0
     """Fraction of the relabelled goals already reached before the action that is kept; the rest are replaced by observations
     from other episodes."""
@@ -250,14 +251,13 @@ class StudyOptions:
     reward_noise: Annotated[NotNegative, NEEDS_STATES] = 0.0
     """Standard deviation of the noise on the state from which the oracle's reward is computed, in the unit of the state."""
     reward_false_positives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
-    """Fraction of the oracle's negatives that are rewarded as positives."""
+    """Fraction of the oracle's negatives that are turned into positives."""
     reward_false_negatives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
-    """Fraction of the oracle's positives that are rewarded as negatives."""
+    """Fraction of the oracle's positives that are turned into negatives."""
     reward_clutter: Share = 1.0
     """Fraction of the workspace, from the low end of the state's first coordinate, to which the false rewards are confined."""
     normalizers: Literal["shared", "separate"] = "shared"
-    """Statistics that normalise goals: those of all observations (shared), or, as in the authors' release, their own
-    (separate)."""
+    """Statistics for normalising goals: those of all observations (shared) or, as in the authors' release, separate ones."""
     normalizer_source: Literal["rollouts", "relabelled"] = "rollouts"
     """Source of the normalisation statistics: all observations of a rollout, or, as in the authors' release, relabelled
     transitions."""

@@ -1,6 +1,6 @@
 """Validation of configurations, with one-line messages that name the problem and the remedy.
 
-Imports no JAX, so that the command line can reject a request at once.
+Imports no JAX, so that the command line can reject a request without delay.
 """
 
 import math

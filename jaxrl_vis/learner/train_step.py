@@ -90,22 +90,22 @@ class TrainStep:
 
     @property
     def algorithm(self) -> Algorithm:
-        """The algorithm."""
+        """Algorithm whose agents act and learn."""
         return self.acting.algorithm
 
     @property
     def networks(self) -> Networks:
-        """Networks of the algorithm, for tools that look inside it."""
+        """Networks of the algorithm, for tools that inspect them; None if it has none."""
         return self.algorithm.networks
 
     @property
     def steps_per_iteration(self) -> int:
-        """Environment steps of one seed in an iteration."""
+        """Number of environment steps per seed and iteration."""
         return self.config.run.num_envs * self.env.horizon
 
     @property
     def updates_per_iteration(self) -> int:
-        """Gradient steps of one seed in an iteration."""
+        """Number of gradient steps per seed and iteration."""
         return self.config.run.updates_per_iteration
 
     @property
@@ -122,7 +122,7 @@ class TrainStep:
 
     @property
     def replay_bytes(self) -> int:
-        """Bytes of one seed's replay."""
+        """Size of one seed's replay in bytes."""
         return num_bytes(self.replay_spec) * self.layout.shards.count
 
     @property

@@ -54,7 +54,7 @@ def with_cosines(weighting: Weighting) -> Weighting:
     """Add cosines of the losses' gradients in the shared parameters to the metrics of a weighting.
 
     ``cosine/least`` is the minimum over all pairs; ``cosine/NAME`` that of each loss and the main one, if there is one. The
-    result needs the Gramian, whose row of the main loss is passed to a weighting that needs dots.
+    resulting weighting needs the Gramian; a wrapped one that needs dots gets its row of the main loss.
 
     Args:
         weighting: Weighting that does not need whole gradients.

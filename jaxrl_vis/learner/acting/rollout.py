@@ -78,7 +78,7 @@ def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: 
 
 
 def split_keys(keys: jax.Array, num_envs: int, draws: Draws = ONE) -> tuple[jax.Array, jax.Array]:
-    """Split the keys of a rollout, [S], into those of all S x E resets, seed by seed, and those of the policies, [S]."""
+    """Split the keys of a rollout [S] into keys of all resets [S * E], seed by seed, and keys of the policies [S]."""
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     return jax.vmap(lambda key: draws.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
 

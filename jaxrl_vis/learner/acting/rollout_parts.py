@@ -37,7 +37,7 @@ def join_parts(parts: Sequence[Any], count: int, xp: ModuleType = jnp, axis: int
     Args:
         parts: Arrays with P environments along ``axis``.
         count: Number of environments to return.
-        xp: ``jax.numpy`` or ``numpy``, whose arrays these are.
+        xp: ``jax.numpy`` or ``numpy``, according to the type of the arrays.
         axis: Axis of environments, 0 or 1.
     """
     joined = xp.concatenate(parts, axis=axis)

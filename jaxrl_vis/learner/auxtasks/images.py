@@ -60,7 +60,7 @@ _BYTES = 4  # in a word
 def to_words(images: jax.Array) -> jax.Array:
     """Pack four channels into each word: [B, C, H, W] uint8 -> [B, ceil(C / 4), H, W] uint32, padded with zeros.
 
-    A pixel of four channels is then read at once.
+    Four channels of a pixel are then read at once.
     """
     batch, channels, *size = images.shape
     padded = jnp.pad(images, [(0, 0), (0, -channels % _BYTES), (0, 0), (0, 0)]).astype(jnp.uint32)

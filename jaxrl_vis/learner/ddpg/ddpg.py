@@ -7,8 +7,8 @@
 
 The losses are in `objectives`.
 
-Encoding images is most of the work, and `Config` can save some of it: ``encoders="shared"`` lets the actor act on the critic's
-latents, too, ``target_encoder=False`` computes targets with the online encoders, and ``actor_interval`` spares the actor steps.
+Encoding images dominates the cost, and options of `Config` reduce it: with ``encoders="shared"`` the actor uses the critic's
+latents, with ``target_encoder=False`` targets use the online encoders, and ``actor_interval`` reduces the number of actor steps.
 """
 
 import dataclasses
@@ -282,7 +282,7 @@ def make_ddpg(
         if learned_reward is not None and rewarded is not None:
             metrics[f"train/{learned_reward.name}_loss"] = rewarded.loss
         of_model = rewarded.gradient if rewarded is not None else None
-        # The only communication between the shards of a learner in an update, unless critic gradients are reduced early.
+        # Average everything that was not reduced earlier over the shards of a learner, in one all-reduce.
         own_gradient = None if learning.reduces_early else weighted.gradient
         own_gradient, actor_gradient, of_model, metrics, mean_square, counts = shards.mean(
             (own_gradient, actor_gradient, of_model, metrics, mean_square, counts)

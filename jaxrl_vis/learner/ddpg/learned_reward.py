@@ -117,7 +117,7 @@ class LearnedReward:
 
 
 def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
-    """Build the autoencoder, in whose latent space observations are compared."""
+    """Build the autoencoder in whose latent space observations are compared."""
     shape = networks.observation_spec, networks.action_size, config.network.latent_size
     spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]

@@ -86,7 +86,7 @@ _MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
-    """Return functions of the encoder: to the latents of the critic's main loss, and to those of the auxiliary losses.
+    """Return functions from encoder parameters to the latents of the critic's main loss, and to those of auxiliary losses.
 
     Only the main loss reads goals, so separate encodings shorten the backward passes of auxiliary losses.
     """

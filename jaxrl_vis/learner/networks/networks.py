@@ -192,7 +192,7 @@ class Networks:
         return {**critic, "head": jax.tree.map(lambda *leaves: jnp.stack(leaves), critic["head"], *others)}
 
     def init_target(self, online: Params) -> Params:
-        """Copy online parameters for a target network: the head alone if targets have no encoders."""
+        """Copy online parameters for a target network: only the head if targets have no encoders."""
         kept = online if self.config.network.target_encoder else {"head": online["head"]}
         return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
 
