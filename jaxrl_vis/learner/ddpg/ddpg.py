@@ -8,7 +8,7 @@
 The losses are in `objectives`.
 
 Encoding images dominates the cost, and options of `Config` reduce it: with ``encoders="shared"`` the actor uses the critic's
-latents, with ``target_encoder=False`` targets use the online encoders, and ``actor_interval`` reduces the number of actor steps.
+latents, with ``target_encoder=False`` targets use the online encoders, and ``actor_interval`` makes actor steps less frequent.
 """
 
 import dataclasses
