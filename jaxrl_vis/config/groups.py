@@ -126,7 +126,8 @@ class GoalOptions:
     relabel_probability: Share = 0.9
     """p1: fraction of samples whose goal is replaced by an observation from the same episode."""
     balance_probability: Share | None = None
-    """p2: fraction of these whose goal is the next observation, a certain positive. None: 0.5 for balancing methods, else 0."""
+    """p2: fraction of relabelled samples whose goal is the next observation, a certain positive. None: 0.5 for balancing
+    methods, else 0."""
     filter_threshold: float | None = None
     """q0: negatives with Q above this are dropped as false. None: the middle of the valid range, for filtering methods."""
     future_goals: Literal["even", "geometric"] = "even"
