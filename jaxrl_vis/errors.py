@@ -35,4 +35,4 @@ class Terminated(SystemExit):
 
 
 class WorkerError(RuntimeError):
-    """Worker process killed from outside. One line: the cause and the remedy. The command line exits with 1."""
+    """Worker process killed externally. One line: the cause and the remedy. The command line exits with 1."""

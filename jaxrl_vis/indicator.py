@@ -1,13 +1,13 @@
-"""Indicator rewards for a robot of your own: the method of the thesis's section 5.1.4 on plain arrays, without a simulator.
+"""Indicator rewards for your own robot: the method of section 5.1.4 of the thesis on plain arrays, without a simulator.
 
-    goal_slots    which later observation of its episode becomes the goal of a transition: relabelling and balancing
-    rewards       positive where what was reached equals the goal, exactly or but for camera noise
+    goal_slots    choice of a later observation of the same episode as a transition's goal: relabelling and balancing
+    rewards       positive if the achieved observation equals the goal, exactly or up to camera noise
     keep_mask     0 for negatives that the critic contradicts: the filter
-    Learner       all of these in a learner that is fed with episodes, recorded ones or those that it has just played
-    learn         a learner trained on an .npz file of recorded episodes
+    Learner       all of these in a learner trained on episodes, recorded or collected with its own policy
+    learn         training of a learner on an .npz file of recorded episodes
 
-Observations are images [H, W, C] uint8 or vectors [S] float32, actions [A] lie in [-1, 1], and all episodes have equally many
-steps.
+Observations are images [H, W, C] uint8 or vectors [S] float32, actions [A] lie in [-1, 1], and all episodes have the same
+number of steps.
 """
 
 import functools
@@ -40,17 +40,17 @@ from jaxrl_vis_envs.goals import indicator_reward as rewards
 __all__ = ["Learner", "goal_slots", "keep_mask", "learn", "rewards"]
 
 _INSERT, _UPDATE = 0x696E73, 0x757064  # folded into the seed's key
-# Metrics that compare rewards with true states, which nobody knows here.
+# Metrics that compare rewards with true states, which are unknown here.
 _NEED_TRUTH = ("false_", "filtered_false")
 
 
 def _planar(images: np.ndarray) -> np.ndarray:
-    """Convert images [..., H, W, C] to [..., C, H, W]; vectors stay as they are."""
+    """Convert uint8 images [..., H, W, C] to [..., C, H, W], and vectors to float32."""
     return np.moveaxis(images, -1, -3) if images.dtype == np.uint8 else images.astype(np.float32)
 
 
 class Learner:
-    """Off-policy learner that is fed with whole episodes.
+    """Off-policy learner trained on complete episodes that the caller adds.
 
     Example::
 
@@ -60,7 +60,7 @@ class Learner:
         action = learner.act(observation, goal)
 
     Attributes:
-        config: All settings.
+        config: Validated configuration.
         episodes: Number of episodes added so far.
     """
 
@@ -71,14 +71,14 @@ class Learner:
 
         Args:
             observation_shape: (H, W, C) of images, or (S,) of vectors.
-            action_size: A.
-            horizon: T, steps of an episode.
-            capacity: Number of episodes that are kept.
+            action_size: A, number of action components.
+            horizon: T, number of steps in an episode.
+            capacity: Number of episodes that the replay holds.
             **options: Options of `jaxrl-vis train`, by name: ``preset`` (``cpu`` if not given), ``seed``, ``method``
                 (``indicator_balance_filter``, or with a ``tolerance`` ``indicator_tolerance``), ``algorithm``, ...
 
         Raises:
-            RequestError: A size or an option is wrong, or needs true states.
+            RequestError: A size or an option is invalid, or an option needs true states.
         """
         if len(observation_shape) not in (1, 3) or min(*observation_shape, action_size, horizon, capacity) < 1:
             raise RequestError(
@@ -118,15 +118,15 @@ class Learner:
         return array.astype(dtype)
 
     def add(self, observations: Any, actions: Any, goal: Any = None) -> None:
-        """Add an episode to the replay; the oldest one gives way once it is full.
+        """Add an episode to the replay, replacing the oldest one once it is full, and update the observation statistics.
 
         Args:
-            observations: [T+1, ...] before the first action, and after each.
-            actions: [T, A] as executed, in [-1, 1].
-            goal: [...] what the robot was to reach; None: nothing, and its last observation takes the place.
+            observations: [T+1, ...] observations before the first action and after each one.
+            actions: [T, A] executed actions in [-1, 1]; others are clipped.
+            goal: [...] goal of the episode; None if it had none: the last observation is used instead.
 
         Raises:
-            RequestError: A shape, a type or a number is wrong.
+            RequestError: A shape or dtype is wrong, or a value is not finite.
         """
         dtype = np.dtype(self._spec.dtype)
         seen = self._checked("observations", observations, (self._horizon + 1, *self._given_shape), dtype)
@@ -151,10 +151,10 @@ class Learner:
         return jax.jit(insert, donate_argnums=0)
 
     def update(self, count: int) -> dict[str, float]:
-        """Take ``count`` gradient steps, and return means of their metrics (docs/learner.md).
+        """Take ``count`` gradient steps and return the means of their metrics (docs/learner.md).
 
         Raises:
-            RequestError: There are no episodes yet.
+            RequestError: No episode has been added yet, or ``count`` is invalid.
         """
         if self.episodes == 0:
             raise RequestError("there is nothing to learn from yet: add episodes first")
@@ -177,7 +177,7 @@ class Learner:
         """Compute the policy's action [A] float32 in [-1, 1], without exploration, for an observation and a goal [...].
 
         Raises:
-            RequestError: A shape or a type is wrong.
+            RequestError: A shape or dtype is wrong, or a value is not finite.
         """
         dtype = np.dtype(self._spec.dtype)
         seen, aim = (self._checked(*each, self._given_shape, dtype) for each in (("observation", observation), ("goal", goal)))
@@ -196,13 +196,13 @@ def learn(recordings: Path | str, updates: int = 5000, **options: Any) -> Learne
     """Train a learner on recorded episodes.
 
     Args:
-        recordings: An .npz file with ``observations`` [N, T+1, ...], ``actions`` [N, T, A], and possibly ``goals`` [N, ...]; or
-            the folder of a LeRobot dataset (`jaxrl_vis.recordings`).
-        updates: Number of gradient steps, rounded up to whole hundreds if it is more than that.
-        **options: As of `Learner`.
+        recordings: An .npz file with ``observations`` [N, T+1, ...], ``actions`` [N, T, A] and optionally ``goals`` [N, ...];
+            or the folder of a LeRobot dataset (`jaxrl_vis.recordings`).
+        updates: Number of gradient steps, rounded up to a multiple of 100 if greater than 100.
+        **options: As for `Learner`.
 
     Raises:
-        RequestError: The file is missing or has no such arrays, or an option is wrong.
+        RequestError: The file is missing or lacks these arrays, or an option is invalid.
     """
     recorded = read(recordings)
     count, shape = recorded.count, recorded.observations.shape[2:]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 
 import jax
 
-Params = Any  # a nested dict of arrays, as flax.linen makes it
+Params = Any  # nested dict of arrays, as in flax.linen
 Metrics = dict[str, jax.Array]
 
 
@@ -33,7 +33,7 @@ class Episodes(Replaceable):
     observation of the same episode, T+1 the original goal.
 
     Attributes:
-        observations: [E, T+2, ...] after 0, 1, ... T steps, then the goal's.
+        observations: [E, T+2, ...] observations after 0, 1, ..., T steps, then that of the goal.
         states: [E, T+2, G] float32, the true goal-space states at the same times.
         actions: [E, T, A] float32, as executed (with exploration noise).
         stored: [E, T, ...] uint8 or float32, values that auxiliary tasks computed for each step, by task (`AuxTask.episode`).
@@ -66,16 +66,16 @@ class Batch(Replaceable):
     """Batch of B sampled and relabelled transitions, each with a goal.
 
     Attributes:
-        observations: [3, B, ...] before the action, of the goal (relabelled or original), and after the action: contiguous, in
-            the order in which the networks take them, to avoid a copy.
+        observations: [3, B, ...] observation before the action, of the goal (relabelled or original), and after the action;
+            contiguous and in the order in which the networks process them, to avoid a copy.
         action: [B, A] float32.
         state_tp1: [B, G] float32, the true state after the action.
         goal_state: [B, G] float32, the true state depicted by the goal.
-        reward: [B] float32 for reaching that goal, summed over the steps between the first and the last observation; None while
-            goals may still change, and where the learner itself computes the reward (method autoencoder).
-        discount: [B] float32, discount of the value after these steps; None: that of one step.
-        shift: [B, 2] int32, pixels by which to shift the images down and to the right; None: no shift.
-        views: [B, ...] images in the observation's dtype that auxiliary tasks have computed, by task (`AuxTask.view`).
+        reward: [B] float32 for reaching that goal, summed over the steps between the first and the last observation; None until
+            it is computed, and if the learner itself computes it (methods autoencoder and classifier).
+        discount: [B] float32, discount factor of the value after these steps; None for that of a single step.
+        shift: [B, 2] int32, pixels by which to shift the images down and to the right; None for no shift.
+        views: [B, ...] images in the observation's dtype, computed by auxiliary tasks, by task (`AuxTask.view`).
         targets: Targets of auxiliary tasks, by task.
         reached: [B, ...] the observation after the action in the form of a goal, if the forms differ (stacked images); else
             None.
@@ -119,7 +119,7 @@ class NormalizerState(Replaceable):
     Attributes:
         count: [] float32, number of observations.
         mean: [...] float32, in the observation's own unit (0 to 255 for images).
-        sum_of_squares: [...] float32, of deviations from the mean.
+        sum_of_squares: [...] float32, sum of the squared deviations from the mean.
     """
 
     count: jax.Array
@@ -131,8 +131,8 @@ class Statistics(NamedTuple):
     """Observation statistics of a learner.
 
     Attributes:
-        observations: Statistics of observations; of goals, too, unless they have their own.
-        own_goals: Those of goals alone; None where they have not.
+        observations: Statistics of observations; also used for goals, unless these have their own.
+        own_goals: Separate statistics of goals; None if they share ``observations``.
     """
 
     observations: NormalizerState
@@ -140,7 +140,7 @@ class Statistics(NamedTuple):
 
     @property
     def goals(self) -> NormalizerState:
-        """Statistics that goals are normalised with."""
+        """Statistics with which goals are normalised."""
         return self.observations if self.own_goals is None else self.own_goals
 
 
@@ -150,7 +150,7 @@ class TrainState(Replaceable):
     """State of the learner: an agent, and observation statistics.
 
     Attributes:
-        agent: State of the algorithm, a pytree of its own (`learner.algorithm`).
+        agent: State of the algorithm, a pytree that it defines (`learner.algorithm`).
         normalizer: Observation statistics.
         goal_normalizer: Separate statistics of goals; None if they share ``normalizer``.
     """
@@ -161,7 +161,7 @@ class TrainState(Replaceable):
 
     @property
     def statistics(self) -> Statistics:
-        """Both statistics."""
+        """Statistics of observations and goals."""
         return Statistics(self.normalizer, self.goal_normalizer)
 
 
@@ -171,10 +171,12 @@ class LoopState(Replaceable):
     """State carried from one training iteration to the next, with a leading seed axis S on every leaf except ``iteration``.
 
     Attributes:
-        train: The learner, [S, ...].
-        replay: The episodes, [S, N, ...].
-        key: [S] typed keys, constant: iteration k draws from ``fold_in(key, k)``, so that a resumed run is reproduced exactly.
-        iteration: [] int32, iterations completed; shared by all seeds, so that the replay is written with one contiguous slice.
+        train: [S, ...] state of the learner.
+        replay: [S, N, ...] stored episodes.
+        key: [S] typed keys, constant: iteration k samples with ``fold_in(key, k)``, so that a resumed run is reproduced
+            exactly.
+        iteration: [] int32, number of completed iterations; shared by all seeds, so that the replay is written with one
+            contiguous slice.
     """
 
     train: TrainState

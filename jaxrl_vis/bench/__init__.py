@@ -1,4 +1,4 @@
-"""Benchmarks of this machine, with records that tell a change of the code from noise and from another machine.
+"""Benchmarks of this machine, with records that distinguish effects of code changes from noise and from other machines.
 
     settings -> render | physics | env | update | train -> Measurement -> record
 
@@ -32,7 +32,7 @@ def run(benchmark: str, results: Path | None = None, json: Path | None = None, *
         **settings: Fields of `Settings`.
 
     Raises:
-        RequestError: A setting cannot be met, or the file of stored records holds something else.
+        RequestError: A setting cannot be met, or the file of stored records is invalid.
     """
     measure = importlib.import_module(f"jaxrl_vis.bench.{benchmark}").measure
     return keep_records(benchmark, measure, Settings(**settings), results, json)
@@ -45,19 +45,19 @@ def keep_records(
     results: Path | None = None,
     json: Path | None = None,
 ) -> list[Measurement]:
-    """Take every measurement that ``measure`` yields under the watch of `conditions`; print and store the records.
+    """Run ``measure`` while monitoring `conditions`; print and store a record of every measurement that it yields.
 
     Args:
         benchmark: Name in the file of records.
         measure: Generator of measurements, called with the settings for this device.
-        settings: Settings as the user gave them.
+        settings: Settings given by the user.
         results: See `run`.
         json: See `run`.
 
     Raises:
         RequestError: See `run`.
     """
-    load(results_path(benchmark, results))  # first: a figure that cannot be stored is lost
+    load(results_path(benchmark, results))  # fail before measuring if records cannot be stored
     measurements, records = [], []
     device_settings, watch = settings.for_this_device(), Watch()
     for measurement in measure(device_settings):

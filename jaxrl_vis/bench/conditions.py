@@ -1,8 +1,8 @@
-"""Conditions of a measurement: the machine, its load and its speed, which decide if two figures are comparable.
+"""Conditions of a measurement: the machine, its load and its speed, which determine whether two results are comparable.
 
-Many machines of different speeds share a name such as "AMD EPYC, 2 cores", and one machine is slower while others use it. A
+Many machines of different speeds share a name such as "AMD EPYC, 2 cores", and a machine is slower while others use it. A
 record therefore stores an identifier of the machine, its load from other programs before the benchmark, and its speed on a
-fixed workload (a calibration) before and after. Figures are compared only if they come from one idle machine at one speed; for
+fixed workload (a calibration) before and after. Results are compared only if they come from one idle machine at one speed; for
 any other pair the reason is printed.
 """
 
@@ -22,15 +22,15 @@ import jax.numpy as jnp
 from jaxrl_vis_envs.cores import num_cores
 
 SAME_SPEED = 0.1
-"""Largest relative difference of two calibrations that count as the same speed."""
+"""Maximum relative difference between two calibrations that count as the same speed."""
 BUSY_CORES = 0.3
-"""Largest share of the available cores that other programs may use."""
+"""Maximum fraction of the available cores that other programs may use."""
 
 _SAMPLE_S, _CALIBRATION_S, _REPEATS = 0.4, 0.04, 5
 
 
 def machine() -> str:
-    """Identifier of this machine: 12 hexadecimal digits, different for machines of the same name."""
+    """Return an identifier of this machine: 12 hexadecimal digits, different for machines of the same name."""
     words = [platform.node()]
     for file in ("/etc/machine-id", "/var/lib/dbus/machine-id"):
         if os.path.exists(file):
@@ -70,13 +70,13 @@ def calibrate() -> dict[str, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """A fixed workload.
+    """Fixed workload.
 
     Attributes:
         program: Compiled program.
-        arguments: Arrays. They are not constants of the program: XLA folds constants while it compiles, which takes minutes
-            for a product of large matrices and leaves nothing to measure.
-        amount: Work of one call, in 1e9 of its unit.
+        arguments: Argument arrays. They are not constants of the program, because XLA folds constants during compilation,
+            which takes minutes for a product of large matrices and leaves nothing to measure.
+        amount: Work of one call, in 1e9 operations or bytes.
     """
 
     program: Callable[..., jax.Array]
@@ -84,12 +84,12 @@ class Work:
     amount: float
 
     def __call__(self) -> jax.Array:
-        """Dispatch one call; wait for its result."""
+        """Dispatch one call and return its result, which may not be ready yet."""
         return self.program(*self.arguments)
 
 
 def calibrations() -> dict[str, Work]:
-    """Return the workloads of `calibrate` by the name of the figure."""
+    """Return the workloads of `calibrate` by the name of the measured quantity."""
     on_cpu = jax.default_backend() == "cpu"
     size, length = (384, 2**22) if on_cpu else (4096, 2**27)
     matrix = jnp.ones((size, size), jnp.float32 if on_cpu else jnp.bfloat16)
@@ -111,7 +111,7 @@ def _seconds(call: Callable[[], Any]) -> float:
         start = time.perf_counter()
         result = None
         for _ in range(calls):
-            result = call()  # the one before is let go: results of half a gigabyte each would fill the device
+            result = call()  # releases the previous result: half a gigabyte each would fill the device
         jax.block_until_ready(result)
         return (time.perf_counter() - start) / calls
 
@@ -128,7 +128,7 @@ class Watch:
         self._cores = num_cores()
 
     def conditions(self) -> dict[str, Any]:
-        """Conditions of a record: machine, cores, load of other programs before the benchmark, and two calibrations."""
+        """Return the conditions of a record: machine, cores, load before the benchmark, and calibrations around it."""
         before, self._before = self._before, calibrate()
         return {
             "machine": machine(),
@@ -139,7 +139,7 @@ class Watch:
 
 
 def why_not_comparable(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str | None:
-    """Explain in words why two figures are not comparable; return None if they are.
+    """Return the reason why two results are not comparable, in words; None if they are.
 
     Args:
         new, old: Conditions from `Watch`; None for a record without conditions.

@@ -1,17 +1,17 @@
-"""Data-sheet limits of devices."""
+"""Peak performance of devices from their data sheets."""
 
 import dataclasses
 
 
 @dataclasses.dataclass(frozen=True)
 class Peak:
-    """Limits of a device: dense matrix products without sparsity, other arithmetic, and memory.
+    """Peak performance of a device: dense matrix products without sparsity, other arithmetic, and memory.
 
     Attributes:
-        bfloat16: Floating-point operations per second in matrix products.
-        float32: The same for float32 inputs (TF32, the default of XLA).
+        bfloat16: Floating-point operations per second in matrix products of bfloat16 inputs.
+        float32: Floating-point operations per second in matrix products of float32 inputs (TF32, the default of XLA).
         vector: Single-precision operations per second outside the matrix units.
-        memory: Bytes per second.
+        memory: Memory bandwidth in bytes per second.
     """
 
     bfloat16: float
@@ -20,7 +20,7 @@ class Peak:
     memory: float
 
 
-# The longest name that is a prefix of the device's kind counts.
+# A device's entry is the longest name that is a prefix of its kind.
 PEAKS = {
     "NVIDIA H100 80GB HBM3": Peak(989e12, 494e12, 67e12, 3.35e12),
     "NVIDIA H100 PCIe": Peak(756e12, 378e12, 51e12, 2.0e12),
@@ -31,6 +31,6 @@ PEAKS = {
 
 
 def device_peak(device_kind: str) -> Peak | None:
-    """Limits of a device; None if unknown."""
+    """Return the peak performance of a device; None if unknown."""
     names = [name for name in PEAKS if device_kind.startswith(name)]
     return PEAKS[max(names, key=len)] if names else None

@@ -18,17 +18,17 @@ ACCELERATOR_COUNTS = (256, 1024, 4096, 8192)
 
 
 def start_states(env: GoalEnv, count: int) -> State:
-    """Make ``count`` different initial states, without images."""
+    """Create ``count`` different initial states, without images."""
     keys = jax.random.split(jax.random.key(1), count)
     return jaxrl_vis_envs.jit(jax.vmap(lambda key: env.reset(key).replace(obs=None)))(keys)
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield environment steps per second."""
+    """Yield environment steps per second for each batch size."""
     env = settings.make_env()
     steps = env.horizon if settings.on_accelerator else 10
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
-    # One program makes all initial states; smaller batches use the first of them.
+    # One program creates all initial states; smaller batches use the first of them.
     states = start_states(env, max(counts))
 
     def advance(states: State, key: jax.Array) -> State:

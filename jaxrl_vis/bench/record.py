@@ -21,13 +21,13 @@ REVISION_DIGITS = 12
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """One figure.
+    """Result of one measurement.
 
     Attributes:
         name: Measured quantity, as ``benchmark/quantity``.
-        value: Figure; larger is better.
-        unit: Unit of the figure.
-        config: Requested configuration. Two figures are comparable only if this and the device agree.
+        value: Measured value; larger is better.
+        unit: Unit of the value.
+        config: Requested configuration. Two values are comparable only if this and the device agree.
         details: Further observations: compilation time, spread, roofline.
     """
 
@@ -39,7 +39,7 @@ class Measurement:
 
 
 def to_record(measurement: Measurement, conditions: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Record of a measurement: the figure, its provenance and its conditions (see `conditions`)."""
+    """Return the record of a measurement: the value, its provenance and its conditions (see `conditions`)."""
     return {
         "schema": SCHEMA,
         **dataclasses.asdict(measurement),
@@ -52,12 +52,12 @@ def to_record(measurement: Measurement, conditions: dict[str, Any] | None = None
 
 
 def user_folder() -> Path:
-    """Folder of a user's records."""
+    """Return the folder of a user's records."""
     return user_cache() / "bench"
 
 
 def results_path(benchmark: str, folder: Path | None = None) -> Path:
-    """File of one benchmark on this device."""
+    """Return the path of the file for one benchmark on this device."""
     slug = re.sub(r"[^a-z0-9]+", "-", provenance.device_name().lower().replace("(r)", "").replace("(tm)", "")).strip("-")
     return (folder or user_folder()) / f"{benchmark}-{slug}.json"
 
@@ -66,7 +66,7 @@ def load(path: Path) -> list[dict[str, Any]]:
     """Read the records of a file; return an empty list if it is missing.
 
     Raises:
-        RequestError: The file holds something else.
+        RequestError: The file does not hold records of this schema.
     """
     if not path.exists():
         return []
@@ -82,7 +82,7 @@ def read_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        RequestError: The file holds something else, or cannot be read.
+        RequestError: The file is not JSON, or cannot be read.
     """
     return files.read_json(path, object, "move it away, or put back what it held")
 
@@ -103,7 +103,7 @@ def write_json(path: Path, records: list[dict[str, Any]]) -> None:
 
 def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
     """Store a record in a file; return the record of the same configuration and device that it replaces, if any."""
-    record = json.loads(json.dumps(record))  # as it will be read back: tuples are lists
+    record = json.loads(json.dumps(record))  # as it will be read back: tuples become lists
     records = load(path)
     previous = next((old for old in records if _key(old) == _key(record)), None)
     records = [old for old in records if _key(old) != _key(record)] + [record]
@@ -112,7 +112,7 @@ def keep(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
-    """Describe a record in one line: quantity, configuration, figure, and its change if the two are comparable."""
+    """Describe a record in one line: quantity, configuration, value, and its change if the two are comparable."""
     config = " ".join(f"{name}={value}" for name, value in record["config"].items())
     line = f"{record['name']:24} {config:72} {format_figure(record['value']):>12} {record['unit']}"
     if previous is None:
@@ -128,7 +128,7 @@ def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
 
 
 def format_figure(value: float) -> str:
-    """Format a figure with at least three significant digits and thousands separators."""
+    """Format a value with up to four significant digits, or as an integer with thousands separators from 1000 on."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
@@ -139,7 +139,7 @@ def compare_and_keep(
 
     Args:
         benchmark: Name of the benchmark.
-        measurement: Figure to store.
+        measurement: Measurement to store.
         folder: Folder of records; None for `user_folder`.
         conditions: See `conditions.Watch`.
     """

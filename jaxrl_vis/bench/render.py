@@ -1,7 +1,7 @@
-"""Benchmark of images alone, without physics: the observations of an environment, or the scenes of `scenes`.
+"""Benchmark of rendering alone, without physics: the observations of an environment, or the scenes of `scenes`.
 
-All poses of a batch differ, and calls alternate between two batches, so that no renderer can reuse an image; that the images
-differ is asserted.
+All poses of a batch differ, and calls alternate between two batches, so that no renderer can reuse an image; the benchmark
+asserts that images differ.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ _STEPS = 5  # random control steps from the common start, after which no two rob
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield images per second of each size, output and batch: of the scene if there is one, else of the environment."""
+    """Yield images per second for each size, output and batch: of the scene if one is set, else of the environment."""
     if settings.scene is not None:
         yield from scene_images.measure(settings, image_sizes(settings))
         return
@@ -56,7 +56,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
 
 def image_sizes(settings: Settings) -> tuple[int, ...]:
-    """Image sizes to measure: the defaults for this kind of device, or only the requested one if it is not among them."""
+    """Return the image sizes to measure: the defaults for this kind of device, or only a requested one not among them."""
     sizes = ACCELERATOR_SIZES if settings.on_accelerator else CPU_SIZES
     if settings.image_size is not None and settings.image_size not in sizes:
         return (settings.image_size,)
@@ -64,7 +64,7 @@ def image_sizes(settings: Settings) -> tuple[int, ...]:
 
 
 def poses(settings: Settings, count: int, seed: int = 4) -> Any:
-    """Make states of ``count`` environments in different poses."""
+    """Create states of ``count`` environments in different poses."""
     env = settings.make_env()
 
     def scatter(state: Any, key: jax.Array) -> Any:

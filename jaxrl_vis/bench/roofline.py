@@ -1,4 +1,4 @@
-"""Minimum cost of a gradient step, and the achieved share of the device's peak.
+"""Minimum cost of a gradient step, and the achieved fraction of the device's peak.
 
 There are two counts: the compiler's own count of the program (`Compiled.cost_analysis`), and a lower bound from the shapes of
 the layers, which holds for every implementation of the algorithm.
@@ -23,9 +23,9 @@ class Cost:
 
 
 def compiler_cost(compiled: Any, steps: int = 1) -> Cost | None:
-    """Cost per gradient step from the compiler's count of a program of ``steps`` of them; None if there is no count.
+    """Return the cost per gradient step from the compiler's count for a program of ``steps`` steps; None if unavailable.
 
-    The body of a loop counts once: pass a program with one turn.
+    The compiler counts the body of a loop once, so pass a program with a single iteration.
     """
     analysis = compiled.cost_analysis()
     if isinstance(analysis, list):
@@ -36,7 +36,7 @@ def compiler_cost(compiled: Any, steps: int = 1) -> Cost | None:
 
 
 def encoder_products(networks: Networks) -> tuple[int, int]:
-    """Multiply-adds of one encoder for one image: total, and first layer."""
+    """Return the number of multiply-adds of one encoder for one image: total, and first layer."""
     if not networks.sees_images:
         return 0, 0
     channels, height, width = networks.observation_spec.shape
@@ -52,12 +52,12 @@ def encoder_products(networks: Networks) -> tuple[int, int]:
 
 
 def head_products(sizes: tuple[int, ...]) -> int:
-    """Multiply-adds of a stack of dense layers for one row: [first inputs, ..., last outputs]."""
+    """Return the number of multiply-adds per row of a stack of dense layers, of sizes (first inputs, ..., last outputs)."""
     return sum(first * second for first, second in zip(sizes, sizes[1:], strict=False))
 
 
 def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
-    """Lower bound from the shapes of the layers, averaged over the actor's update interval.
+    """Return a lower bound of the cost from the shapes of the layers, averaged over the actor's update interval.
 
     Products: every online encoder runs forward and backward on two images per transition (backward costs twice a forward pass,
     minus the gradient with respect to the image), and every target encoder runs forward on two; without target encoders, every
@@ -70,7 +70,7 @@ def least_cost(networks: Networks, params: Any, batch_size: int) -> Cost:
     Args:
         networks: Networks of the parameters.
         params: Online actor and critic parameters.
-        batch_size: Transitions in a gradient step.
+        batch_size: Number of transitions in a gradient step.
     """
     config = networks.config
     encoder, first_layer = encoder_products(networks)
@@ -98,7 +98,7 @@ def _bytes(tree: Any) -> int:
 
 
 def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[str, Any]:
-    """Achieved TFLOP/s and GB/s, with their shares of the device's peak if that is known."""
+    """Return the achieved TFLOP/s and GB/s, with their fractions of the device's peak if that is known."""
     achieved = {
         "gflop": round(cost.flops / 1e9, 3),
         "mbyte": round(cost.bytes / 1e6, 3),

@@ -1,4 +1,4 @@
-"""Settings of a benchmark, with defaults that suit the device."""
+"""Settings of a benchmark, with device-dependent defaults."""
 
 import dataclasses
 from typing import Any, Self
@@ -11,7 +11,7 @@ from jaxrl_vis_envs import registry
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Settings of a benchmark. None and the empty tuple stand for a default that suits the device.
+    """Settings of a benchmark. None and the empty tuple stand for device-dependent defaults.
 
     Attributes:
         env: Name of the environment.
@@ -19,13 +19,13 @@ class Settings:
         envs: Batch sizes in environments (or images), with one measurement for each.
         image_size: Height and width of images.
         pixels: Channels: rgbd, rgb or depth.
-        batch_size: Transitions per gradient step.
-        seeds: Learners in one program.
+        batch_size: Number of transitions per gradient step.
+        seeds: Number of learners in one program.
         devices: Number of devices.
         data_devices: Number of devices that share each learner; see `Config`.
         repeats: Maximum number of timed repeats; see `timing.measure`.
         aux_tasks, weighting: Auxiliary losses of the gradient steps, and their weighting.
-        scene: Scene of `scenes.models`, or path of an MJCF file, to draw instead of an environment.
+        scene: Scene of `scenes.models`, or path of an MJCF file, to render instead of an environment.
         on_accelerator: True if JAX runs on an accelerator; set by `for_this_device`.
     """
 
@@ -55,7 +55,7 @@ class Settings:
         )
 
     def counts(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
-        """Batch sizes to measure: the requested ones, or the defaults for this kind of device."""
+        """Return the batch sizes to measure: the requested ones, or the defaults for this kind of device."""
         return self.envs or (accelerator if self.on_accelerator else cpu)
 
     @property
@@ -64,10 +64,10 @@ class Settings:
         return "pixels" in {field.name for field in dataclasses.fields(registry.config_class(self.env))}
 
     def make_env(self, **overrides: Any) -> Any:
-        """Make the environment, with these image settings if its observations are images.
+        """Build the environment, with these image settings if its observations are images.
 
         Raises:
-            RequestError: There is no such environment, or it refuses the settings.
+            RequestError: The environment is unknown, or rejects the settings.
         """
         images = dict(image_size=self.image_size, pixels=self.pixels) | overrides
         try:
@@ -76,27 +76,27 @@ class Settings:
             raise RequestError(str(error)) from error
 
     def image_config(self) -> dict[str, Any]:
-        """Entries of a record for the measured environment."""
+        """Return the entries of a record for the measured environment."""
         if not self.has_images:
             return {"env": self.env}
         return dict(env=self.env, image_size=self.image_size, pixels=self.pixels)
 
     def preset_config(self) -> dict[str, str]:
-        """Entry of a record for the preset; empty for the default of the device."""
+        """Return the entry of a record for the preset; empty for the default of the device."""
         return {} if self.preset is None else {"preset": self.preset}
 
     def seeds_config(self) -> dict[str, int]:
-        """Entry of a record for the number of learners; empty for one."""
+        """Return the entry of a record for the number of learners; empty for one."""
         return {"seeds": self.seeds} if self.seeds > 1 else {}
 
     def devices_config(self) -> dict[str, int]:
-        """Entries of a record for the devices; empty for one."""
+        """Return the entries of a record for the devices; empty for one."""
         if self.devices == 1:
             return {}
         return {"devices": self.devices} | ({} if self.data_devices is None else {"data_devices": self.data_devices})
 
     def auxiliary_config(self) -> dict[str, Any]:
-        """Entries of a record for auxiliary losses; empty without them."""
+        """Return the entries of a record for auxiliary losses; empty without them."""
         if self.weighting == "none":
             return {}
         return dict(weighting=self.weighting, aux_tasks=" ".join(self.aux_tasks))

@@ -1,4 +1,4 @@
-"""Timing of compiled programs: warmed up, synchronised and repeated."""
+"""Timing of compiled programs, with warm-up, synchronisation and repeats."""
 
 import dataclasses
 import statistics
@@ -15,10 +15,10 @@ _LEAST_SECONDS = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Seconds of one call.
+    """Duration of one call.
 
     Attributes:
-        median_s: Median of the repeats.
+        median_s: Median duration of the repeats in seconds.
         spread: (slowest - fastest) / median.
         repeats: Number of repeats.
     """
@@ -28,7 +28,7 @@ class Timing:
     repeats: int
 
     def details(self, compile_s: float, **more: Any) -> dict[str, Any]:
-        """Details of a record: repeats, spread and seconds of compilation, with further entries."""
+        """Return the details of a record: repeats, spread and seconds of compilation, with further entries."""
         timing = {"repeats": self.repeats, "spread": round(self.spread, 4), "compile_s": round(compile_s, 2)}
         return {**timing, **more}
 
@@ -56,8 +56,8 @@ def measure(
     Args:
         call: Workload; returns arrays.
         repeats: Maximum number of timed repeats. The minimum is three, or ``repeats`` if that is less.
-        budget_s: Seconds after which no further repeat starts.
-        wait: Synchronises all calls up to the one whose result it receives.
+        budget_s: Time in seconds after which no further repeat starts.
+        wait: Function that waits for all calls up to the one whose result it receives.
     """
 
     def seconds_per_call(calls: int) -> float:
@@ -69,7 +69,7 @@ def measure(
         return (time.perf_counter() - start) / calls
 
     wait(call())
-    # A call of a few milliseconds is repeated until a clock and a scheduler can tell it from noise.
+    # Repeat short calls until their duration is well above the noise of clock and scheduler.
     calls = max(1, min(1000, round(_LEAST_SECONDS / max(seconds_per_call(1), 1e-6))))
     seconds: list[float] = []
     while len(seconds) < repeats and (len(seconds) < 3 or sum(seconds) * calls < budget_s):

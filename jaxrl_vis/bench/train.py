@@ -1,13 +1,14 @@
 """Benchmark of whole training iterations, as `jaxrl-vis train` runs them, with a breakdown of their time.
 
     iteration    rollout, insert and updates, the host reading the metrics of one iteration during the next
-    parts        each of the three alone, and the share of evaluations and of the host in an iteration
-    promise      time that `bench env` and `bench update` give for the same environments and the same gradient steps
+    parts        each of the three alone, and the time of evaluations and of the host per iteration
+    promise      sum of the times of the same environments and gradient steps, measured as in `bench env` and `bench update`
 
-    efficiency   on several devices: time of one device with its share of the seeds, or of the batch and the environments,
+    efficiency   on several devices: time of one device with its part of the seeds, or of the batch and the environments,
                  divided by the time of all devices together
 
-An iteration that takes longer than the promise loses time between its parts, to the policy in the rollout, or to the replay.
+If an iteration takes longer than the promise, time is lost between its parts, in the policy during the rollout, or in the
+replay.
 """
 
 import time
@@ -41,8 +42,8 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
         repeats: Maximum number of timed repeats.
 
     Returns:
-        The trained state, the timing of an iteration whose metrics the host reads during the next one, and seconds of
-        ``compile`` and ``host``, the cost of that reading.
+        The trained state; the timing of an iteration whose metrics the host reads during the next one; and the seconds of
+        ``compile`` (compilation) and ``host`` (reading metrics).
 
     Raises:
         FloatingPointError: A metric is not finite.
@@ -84,7 +85,7 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
 
     Args:
         programs: Programs of the parts.
-        loop: Training state, which is donated.
+        loop: Training state; its buffers are donated.
         repeats: Maximum number of timed repeats.
 
     Returns:
@@ -127,7 +128,7 @@ def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
 
 
 def share_of_one(config: Config) -> Config:
-    """Return the configuration of one device's share of a run, as a run on one device."""
+    """Return the configuration of one device's part of a run, as a run on one device."""
     parts = data_devices(config)
     return config.replace(
         devices=1,
@@ -146,9 +147,9 @@ def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield environment steps and gradient steps per second of all seeds together."""
+    """Yield the total environment steps and gradient steps per second of all seeds."""
     env = settings.make_env()
-    for count in settings.counts((0,), (0,)):  # 0: the preset's own number of environments
+    for count in settings.counts((0,), (0,)):  # 0: the preset's number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))
         program, started = make_train_step(env, config), time.perf_counter()
         programs = Programs(config, program, cache=False)

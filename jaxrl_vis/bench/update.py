@@ -19,7 +19,7 @@ from jaxrl_vis.types import LoopState, ReplayState
 
 
 def training_config(settings: Settings, **overrides: Any) -> Config:
-    """Configuration of the requested preset, or of this device's, with the environment, images and sizes of the benchmark."""
+    """Return the requested preset, or this device's, with the environment, images and sizes of the benchmark."""
     if settings.has_images:
         overrides |= changes(image_size=settings.image_size, pixels=settings.pixels)
     if settings.batch_size is not None:
@@ -51,7 +51,7 @@ def fill_replay(replay: ReplayState, key: jax.Array) -> ReplayState:
 
 
 def seed_keys(program: TrainStep, seed: int) -> jax.Array:
-    """Make typed keys [S], one per learner, on its devices."""
+    """Create typed keys [S], one per learner, on its devices."""
     keys = jax.random.split(jax.random.key(seed), program.config.run.seeds)
     return program.layout.put(keys, program.layout.by_seed)
 
@@ -83,18 +83,18 @@ def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Tim
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield gradient steps per second of all seeds together, and their distance from the roofline."""
+    """Yield the total gradient steps per second of all seeds, with their distance from the roofline."""
     config = training_config(settings, updates_per_iteration=updates_per_call(settings))
     yield measure_program(make_train_step(settings.make_env(), config), settings)
 
 
 def updates_per_call(settings: Settings) -> int:
-    """Number of gradient steps in one timed call."""
+    """Return the number of gradient steps in one timed call."""
     return 200 if settings.on_accelerator else 20
 
 
 def measure_program(program: TrainStep, settings: Settings) -> Measurement:
-    """Measure gradient steps per second of all seeds together, and their distance from the roofline.
+    """Measure the total gradient steps per second of all seeds, and their distance from the roofline.
 
     Args:
         program: Learner, one call of which takes ``updates_per_iteration`` gradient steps.
@@ -125,9 +125,9 @@ def measure_program(program: TrainStep, settings: Settings) -> Measurement:
 
 
 def _costs(program: TrainStep, seconds: float) -> dict[str, Any]:
-    """Cost of a gradient step of ``seconds``, by the lower bound (``roofline``) and by the compiler's count (``compiler``)."""
+    """Return the cost of a gradient step of ``seconds``, by the lower bound (``roofline``) and the compiler (``compiler``)."""
     config = program.config
-    # The fewest possible gradient steps of one learner, compiled for their cost alone: the count covers one turn of the loop.
+    # Minimum number of gradient steps of one learner, compiled for their cost alone: the count covers one loop iteration.
     steps = math.lcm(config.ddpg.actor_interval, program.auxiliary.weighting.interval)
     single = make_train_step(program.env, config.replace(updates_per_iteration=steps, seeds=1))
     shapes = jax.eval_shape(single.init, seed_keys(single, 0))

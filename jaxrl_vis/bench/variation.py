@@ -1,4 +1,4 @@
-"""Checks that no benchmark measures copies: results differ within a batch and between calls."""
+"""Checks that benchmarks do not measure copies: results must differ within a batch and between calls."""
 
 import itertools
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import numpy as np
 def assert_varied(rows: Any, what: str) -> None:
     """Assert that [N, ...] ``rows`` are not copies: more than half of them are distinct.
 
-    A benchmark whose environments all do the same measures one environment and a broadcast.
+    If all environments of a benchmark behave the same, it measures one environment and a broadcast.
     """
     rows = np.asarray(rows)
     count = rows.shape[0]
@@ -21,7 +21,7 @@ def assert_varied(rows: Any, what: str) -> None:
 
 
 def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:
-    """Return a call without arguments that draws the batches in turn."""
+    """Return a function without arguments that renders the batches in turn."""
     turns = itertools.cycle(batches)
     return lambda: draw(next(turns))
 
@@ -31,7 +31,7 @@ def assert_new_images(draw: Callable[[Any], Any], batches: list[Any]) -> None:
 
     Args:
         draw: Function from a batch to arrays [N, ...] or a tree of them.
-        batches: Two or more.
+        batches: Two or more batches.
     """
     drawn = [image_bytes(draw(batch)) for batch in batches]
     for rows in drawn:
@@ -45,6 +45,6 @@ def assert_new_images(draw: Callable[[Any], Any], batches: list[Any]) -> None:
 
 
 def image_bytes(images: Any) -> np.ndarray:
-    """Bytes of a tree of arrays [N, ...] as one array [N, bytes] uint8."""
+    """Return the bytes of a tree of arrays [N, ...] as one array [N, bytes] uint8."""
     planes = [np.ascontiguousarray(plane) for plane in jax.tree.leaves(jax.device_get(images))]
     return np.concatenate([plane.reshape(len(plane), -1).view(np.uint8) for plane in planes], axis=1)

@@ -1,9 +1,9 @@
 """Configuration of a training run: options in groups, presets and checks.
 
     fields       annotations of options: types, bounds, names
-    methods      reward methods, and names of the parts of a learner
+    methods      reward methods, and names of a learner's components
     groups       the options, with their defaults and help: `Config`
-    presets      values of each preset, and of tasks in it
+    presets      presets and their task-specific values
     validation   checks of a whole configuration
 
 Imports no JAX.

@@ -1,7 +1,7 @@
 """Validation of dataclass fields against their annotations, for values read from JSON or from a command line.
 
-Annotations may be bool, int, float, str, Path, a Literal of words, a word that is annotated with `Names`, an optional one of
-these, or a tuple of any length. Numbers may be annotated with `Bounds`.
+Supported annotations are bool, int, float, str, Path, a Literal of strings, a str annotated with `Names`, any of these made
+optional, and variable-length tuples of them. Numbers may be annotated with `Bounds`.
 """
 
 import dataclasses
@@ -18,17 +18,17 @@ from typing import Annotated, Any, Literal, NoReturn
 
 from jaxrl_vis.errors import RequestError, nearest
 
-_LONGEST = 200  # characters of a value that a message quotes
+_LONGEST = 200  # maximum number of characters of a value quoted in a message
 _TRUTH = {"true": True, "false": False}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a word", Path: "a path"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Names:
-    """Marks a word that names a part: one of these, or ``module:Name``.
+    """Annotation of a string that names a component: a built-in one, or ``module:Name``.
 
     Attributes:
-        known: Names of the built-in parts.
+        known: Names of the built-in components.
     """
 
     known: tuple[str, ...]
@@ -39,9 +39,9 @@ class Bounds:
     """Range of a number, or of every number of a tuple.
 
     Attributes:
-        low: Smallest value.
-        high: Largest value; None: unbounded.
-        exclusive: Exclude ``low`` itself.
+        low: Minimum value.
+        high: Maximum value; None if unbounded.
+        exclusive: Whether ``low`` itself is excluded.
     """
 
     low: float
@@ -81,10 +81,10 @@ class Field:
 
     Attributes:
         name: Name of the field.
-        hint: Plain annotation, as `check` and `read` take it.
+        hint: Annotation without metadata other than `Names`, as accepted by `check` and `read`.
         extras: Metadata of `typing.Annotated`.
-        default: Default value; `dataclasses.MISSING` without one.
-        record: Dataclass in which it is declared.
+        default: Default value; `dataclasses.MISSING` if there is none.
+        record: Dataclass that declares the field.
         group: Field of the outer dataclass that holds ``record``; empty for a field of the outer dataclass itself.
     """
 
@@ -97,7 +97,7 @@ class Field:
 
 
 def describe(record: type, group: str = "") -> list[Field]:
-    """List the fields of a dataclass. A field that is a dataclass itself is a group: its fields stand for it."""
+    """List the fields of a dataclass, with groups (fields that are dataclasses themselves) replaced by their fields."""
     annotated = typing.get_type_hints(record, include_extras=True)
     described = []
     for field in dataclasses.fields(record):
@@ -110,7 +110,7 @@ def describe(record: type, group: str = "") -> list[Field]:
 
 
 def hints(record: type) -> dict[str, Any]:
-    """Field name -> annotation, without what `typing.Annotated` adds, but for `Names`; groups of fields are flattened."""
+    """Return annotations by field name, without `typing.Annotated` metadata other than `Names`; groups are flattened."""
     return {field.name: field.hint for field in describe(record)}
 
 
@@ -126,7 +126,7 @@ def _plain(hint: Any) -> Any:
 
 
 def _extras(hint: Any) -> tuple[Any, ...]:
-    """Collect the metadata of an annotation, of an optional value and of a tuple's items, too."""
+    """Collect the metadata of an annotation, including that of an optional value and of a tuple's items."""
     inner = typing.get_args(hint)[:1] if typing.get_origin(hint) is Annotated else typing.get_args(hint)
     if typing.get_origin(hint) is Literal:
         return ()
@@ -138,7 +138,7 @@ def check_bounds(field: Field, value: Any) -> None:
     """Check a value of the right type against its field's `Bounds`.
 
     Raises:
-        RequestError: It is out of range. The message names the field.
+        RequestError: The value is out of range. The message names the field.
     """
     for extra in field.extras:
         if isinstance(extra, Bounds):
@@ -146,12 +146,12 @@ def check_bounds(field: Field, value: Any) -> None:
 
 
 def _names(hint: Any) -> Names | None:
-    """Return the `Names` of an annotation of one value; None where it is of another kind."""
+    """Return the `Names` in the annotation of a single value; None if it has none."""
     return next((extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Names)), None)
 
 
 def _is_own(name: Any) -> bool:
-    """Return True if a name is written ``module:Name``."""
+    """Return True if ``name`` is a string of the form ``module:Name``."""
     if not isinstance(name, str):
         return False
     module, colon, part = name.partition(":")
@@ -159,7 +159,7 @@ def _is_own(name: Any) -> bool:
 
 
 def unwrap(hint: Any) -> tuple[Any, bool, bool]:
-    """Split an annotation.
+    """Unwrap optional and tuple annotations.
 
     Returns:
         The annotation of a single value, True if None is allowed, and True if the field holds several values.
@@ -174,7 +174,7 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
 
 
 def names_parts(hint: Any) -> bool:
-    """Return True if a field with this annotation names a part, or several."""
+    """Return True if a field with this annotation names one or several components."""
     return _names(unwrap(hint)[0]) is not None
 
 
@@ -188,7 +188,7 @@ def is_known(hint: Any) -> bool:
 
 
 def choices(hint: Any) -> tuple[str, ...]:
-    """The words that a field allows, where it is a Literal or `Names`, optional or not, or a tuple of them; else none."""
+    """Return the strings that a Literal or `Names` lists, possibly optional or in a tuple; empty for other annotations."""
     hint, _, _ = unwrap(hint)
     if names := _names(hint):
         return names.known
@@ -196,7 +196,7 @@ def choices(hint: Any) -> tuple[str, ...]:
 
 
 def check(label: str, hint: Any, value: Any) -> Any:
-    """Check a value and convert it to its field's type: lists to tuples, whole numbers to floats.
+    """Check a value and convert it to its field's type: lists to tuples, integers to floats.
 
     Args:
         label: Name of the field in error messages.
@@ -234,15 +234,15 @@ def check(label: str, hint: Any, value: Any) -> Any:
 
 
 def read(label: str, hint: Any, words: Sequence[str]) -> Any:
-    """Parse the words of a command line.
+    """Parse the command-line arguments of an option.
 
     Args:
         label: Name of the option in error messages.
-        hint: The annotation of its field.
-        words: Words after the option: one, or any number if the field is a tuple.
+        hint: Annotation of its field.
+        words: Arguments of the option: exactly one, or any number if the field is a tuple.
 
     Raises:
-        RequestError: The words cannot be parsed.
+        RequestError: The arguments cannot be parsed.
     """
     one, optional, several = unwrap(hint)
     if several:
@@ -279,7 +279,7 @@ def _quote(value: Any) -> str:
 
 
 def _suggestion(one: Any, value: Any) -> str:
-    """Suggest the integer spelling of a whole number written otherwise, such as 1e6."""
+    """Return a hint with the integer spelling of a whole number written otherwise, such as 1e6; empty if not applicable."""
     try:
         number = float(value) if one is int and not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):

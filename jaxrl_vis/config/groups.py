@@ -1,7 +1,7 @@
-"""Configuration of a training run: frozen dataclasses in groups. Names of fields are unique across groups, and are the options
-of the command line; bounds and scope of a field stand in its annotation, its help in the docstring below it.
+"""Configuration of a training run: frozen dataclasses in groups. Field names are unique across groups and are the options of
+the command line. A field's annotation gives its bounds and scope, the docstring below it its help text.
 
-Imports no JAX, so that the command line can print its help at once.
+Imports no JAX, so that the command line can print its help without delay.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ from jaxrl_vis.config.methods import (
 )
 from jaxrl_vis.errors import RequestError, nearest
 
-# Values that a field allows, for checks, the command line and its help.
+# Allowed values of fields, for validation, the command line and its help.
 Pixels = Literal["rgbd", "rgb", "depth"]
 Randomized = Literal["camera", "lights", "colours", "dynamics"]
 BestBy = Literal["success", "goal_distance", "goal_distance_median"]
@@ -62,16 +62,17 @@ class RunOptions:
     seeds: Count = 1
     """Number of seeds trained in parallel in one program: seed, seed + 1, ..."""
     devices: Annotated[Count, RESUMABLE] = 1
-    """Number of devices. Multiple seeds are spread over them; with a single seed, its batches and environments are."""
+    """Number of devices. Multiple seeds are distributed over them; a single seed has its batches and environments
+    distributed."""
     data_devices: Annotated[Count | None, RESUMABLE] = None
     """Number of devices that share one learner: its environments, replay and batches. None: 1 with several seeds, all devices
     with a single seed."""
     num_envs: Annotated[Count, DIVIDED] = 100
-    """Environments in a rollout; each plays one episode per iteration."""
+    """Number of environments in a rollout; each runs one episode per iteration."""
     env_steps: Annotated[int, Bounds(1, None), HOST, RESUMABLE, UNMEASURED] = 200_000
-    """Environment steps to train for; rounded up to whole iterations of num_envs * horizon."""
+    """Number of environment steps to train for, rounded up to whole iterations of num_envs * horizon."""
     updates_per_iteration: Count = 200
-    """Gradient steps after each rollout."""
+    """Number of gradient steps after each rollout."""
     batch_size: Annotated[Count, DIVIDED] = 512
     """Transitions in a gradient step."""
     replay_transitions: Count = 200_000
@@ -79,17 +80,17 @@ class RunOptions:
     eval_interval: Annotated[Count, HOST, RESUMABLE] = 2
     """Iterations between evaluations; a last one runs at the end of training."""
     eval_episodes: Annotated[Count, RESUMABLE, DIVIDED] = 1000
-    """Number of episodes of an evaluation, always the same ones."""
+    """Number of episodes in an evaluation; they are the same every time."""
     checkpoint_interval: Annotated[Count, HOST, RESUMABLE, UNMEASURED] = 5
     """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
     full_checkpoint_interval: Annotated[int, Bounds(0, LARGEST_COUNT), HOST, RESUMABLE, UNMEASURED] = 0
     """Iterations between full checkpoints (with the replay, for an exact resume). 0: only when a run is interrupted."""
     best_by: Annotated[BestBy | None, HOST, RESUMABLE, UNMEASURED] = None
-    """Metric of the evaluations whose best learner is kept as a further checkpoint, for `--checkpoint best`; of several seeds,
-    its mean. None: none is kept."""
+    """Evaluation metric (mean over seeds) by which the best learner is kept as an additional checkpoint, for
+    `--checkpoint best`. None: no such checkpoint."""
     stop_at: Annotated[NotNegative | None, HOST, RESUMABLE, UNMEASURED] = None
-    """Stop early, after the first evaluation where the metric of best_by (success if that is None) is at least this, or, of a
-    distance, at most."""
+    """Threshold for early stopping: training ends after the first evaluation where the metric of best_by (success if that is
+    None) is at least this or, for a distance, at most this."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,14 +109,14 @@ class EnvironmentOptions:
     image_size: Count = 64
     """Height and width of the image, in pixels."""
     frame_stack: Count | None = None
-    """Number of latest images stacked in an observation. None: the environment's own number."""
+    """Number of most recent images stacked in an observation. None: the environment's default."""
     randomize: tuple[Randomized, ...] = ()
     """Properties randomised between episodes, in training and in evaluation."""
     randomize_strength: Positive = 1.0
     """Strength of the randomisation, in multiples of the typical ranges (`jaxrl_vis_envs.randomization.KINDS`)."""
     observation_noise: NotNegative = 0.0
-    """Standard deviation of the camera noise, in the observation's unit (grey levels for images); drawn anew for every
-    frame."""
+    """Standard deviation of the camera noise, in the observation's unit (grey levels for images); sampled independently for
+    every frame."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,14 +126,16 @@ class GoalOptions:
     relabel_probability: Share = 0.9
     """p1: fraction of samples whose goal is replaced by an observation from the same episode."""
     balance_probability: Share | None = None
-    """p2: fraction of those whose goal is the next observation, a certain positive. None: 0.5 for balancing methods, else 0."""
+    """p2: fraction of relabelled samples whose goal is the next observation, a certain positive. None: 0.5 for balancing
+    methods, else 0."""
     filter_threshold: float | None = None
-    """q0: negatives with Q above it are dropped as false. None: the middle of its valid range, for filtering methods."""
+    """q0: negatives with Q above this are dropped as false. None: the middle of the valid range, for filtering methods."""
     future_goals: Literal["even", "geometric"] = "even"
-    """Distribution of relabelled goals over the rest of the episode: even, or falling with gamma^k for k further steps."""
+    """Distribution of relabelled goals over the rest of the episode: uniform (even), or proportional to gamma^k after k further
+    steps (geometric)."""
     trivial_goals: Annotated[Share, NEEDS_STATES] = 1.0
-    """Fraction kept of relabelled goals that are already reached before the action; the rest are replaced by observations from
-    other episodes."""
+    """Fraction of the relabelled goals already reached before the action that is kept; the rest are replaced by observations
+    from other episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +150,7 @@ class RewardOptions:
     reward_negative: float | None = None
     """R-. None: 0 for autoencoder, classifier and features, -1 for other methods."""
     tolerance: Annotated[NotNegative, OfMethod("indicator_tolerance")] = 8.0
-    """Difference up to which two elements count as equal, in the observation's unit (grey levels for images)."""
+    """Maximum difference of elements that count as equal, in the observation's unit (grey levels for images)."""
     tolerance_share: Annotated[Share, OfMethod("indicator_tolerance")] = 0.99
     """Fraction of the elements that must be equal."""
     reward_encoder: Annotated[str | None, OfMethod("features")] = None
@@ -165,7 +168,7 @@ class DDPGOptions:
     critic_learning_rate: Positive = 1e-3
     """Adam step size of the critic."""
     target_decay: Share = 0.99
-    """Decay of a target network: the fraction of its parameters kept at each of its updates."""
+    """Decay rate of the target networks: weight of the old target parameters in each target update."""
     target_update_interval: Count = 1
     """Gradient steps between target updates."""
     actor_interval: Count = 1
@@ -179,7 +182,7 @@ class DDPGOptions:
     clip_targets_above: bool = True
     """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
     random_action_probability: Share = 0.3
-    """Exploration: fraction of actions drawn uniformly."""
+    """Exploration: fraction of actions sampled uniformly."""
     action_noise: NotNegative = 0.2
     """Exploration: standard deviation of the Gaussian noise added to the other actions."""
 
@@ -190,7 +193,7 @@ class ContrastiveOptions:
 
     contrastive_form: Annotated[Literal["nce", "stable"], OfAlgorithm(("contrastive",))] = "stable"
     """Form of the critic and its loss. nce: binary cross-entropy (Eysenbach et al., 2022). stable: symmetric InfoNCE with a
-    penalty on log-sum-exp, layer normalisation, and outputs near 0 at first."""
+    penalty on log-sum-exp, layer normalisation, and outputs near 0 at initialisation."""
     representation_size: Annotated[Count, OfAlgorithm(("contrastive",))] = 64
     """Size of the representations whose inner product is the critic."""
 
@@ -222,66 +225,63 @@ class NetworkOptions:
     hidden_sizes: tuple[Count, ...] = (256, 256, 256)
     """Hidden layers of the actor's and the critic's heads."""
     encoders: Literal["separate", "shared"] = "separate"
-    """Give the actor a separate encoder, or let it act on the latents of the critic's encoder, which it cannot change."""
+    """Encoder of the actor: its own (separate), or the critic's, which the actor's loss does not update (shared)."""
     target_encoder: bool = True
-    """Give target networks slowly updated encoders of their own; if false, the target heads read the latents of the online
-    encoders."""
+    """Use slowly updated target encoders; if false, the target heads read the latents of the online encoders."""
     random_shift: Annotated[int, Bounds(0, LARGEST_COUNT)] = 0
-    """Random shift augmentation: largest shift in pixels per axis, the same for the three images of a transition (Kostrikov et
+    """Random shift augmentation: maximum shift in pixels per axis, the same for the three images of a transition (Kostrikov et
     al., 2020)."""
     compute_dtype: ComputeDtype = "auto"
     """Precision of the networks' arithmetic; parameters and losses are float32. auto: bfloat16 on accelerators."""
     normalizer_floor: Positive = 0.01
-    """Smallest standard deviation that an observation is divided by, in the observation's unit (grey levels for images)."""
+    """Minimum standard deviation by which observations are divided, in the observation's unit (grey levels for images)."""
     normalizer_clip: Positive = 5.0
-    """Bound to which normalised observations are clipped: plus and minus this."""
+    """Maximum magnitude to which normalised observations are clipped."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StudyOptions:
-    """Departures that only studies make: of the authors' release, in replay and targets, and errors of rewards on purpose."""
+    """Options used only in studies: behaviour of the authors' release, variants of replay and targets, and reward errors."""
 
     replay_mean_age: Count | None = None
-    """Mean age of sampled transitions, in transitions: older ones become rarer, as if new episodes replaced random ones. None:
-    uniform sampling."""
+    """Mean age of sampled transitions, in transitions: older ones are sampled less often, as if new episodes replaced random
+    ones. None: uniform sampling."""
     n_step: Annotated[Count, NEEDS_STATES] = 1
     """Number of rewards summed in a target before it bootstraps. More than 1 needs true states and a method without a
     filter."""
     reward_noise: Annotated[NotNegative, NEEDS_STATES] = 0.0
     """Standard deviation of the noise on the state from which the oracle's reward is computed, in the unit of the state."""
     reward_false_positives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
-    """Fraction of the oracle's negatives that are rewarded as positives."""
+    """Fraction of the oracle's negatives that are turned into positives."""
     reward_false_negatives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
-    """Fraction of the oracle's positives that are rewarded as negatives."""
+    """Fraction of the oracle's positives that are turned into negatives."""
     reward_clutter: Share = 1.0
-    """Fraction of the workspace, from the low end of the state's first coordinate, to which these false rewards are
-    confined."""
+    """Fraction of the workspace, from the low end of the state's first coordinate, to which the false rewards are confined."""
     normalizers: Literal["shared", "separate"] = "shared"
-    """Statistics that normalise goals: those of all observations (shared), or, as in the authors' release, their own
-    (separate)."""
+    """Statistics for normalising goals: those of all observations (shared) or, as in the authors' release, separate ones."""
     normalizer_source: Literal["rollouts", "relabelled"] = "rollouts"
     """Source of the normalisation statistics: all observations of a rollout, or, as in the authors' release, relabelled
     transitions."""
     weighting_main_grad: Annotated[Literal["main", "total"], OL_AUX] = "main"
-    """Gradient with which OL-AUX compares those of the auxiliary losses: that of the main loss, or, as in the authors' release,
-    that of the total loss."""
+    """Gradient with which OL-AUX compares the auxiliary gradients: that of the main loss or, as in the authors' release, of the
+    total loss."""
     weighting_window: Annotated[Count, OL_AUX] = 1
-    """Gradient steps over which OL-AUX averages gradients before it compares them; 4 in the authors' release."""
+    """Number of gradient steps over which OL-AUX averages gradients before comparing them; 4 in the authors' release."""
     weighting_log: Annotated[bool, OfWeighting(LOG_WEIGHTINGS)] = False
-    """Minimise the logarithms of the losses, with a weighting that takes none by itself."""
+    """Minimise the logarithms of the losses, with a weighting that does not do so by default."""
     weighting_heads: Annotated[Literal["weighted", "always"] | None, OfWeighting(HEAD_WEIGHTINGS)] = None
-    """Weights of the losses for the auxiliary tasks' heads: those of the encoder (weighted), or 1 (always). None: weighted with
-    OL-AUX and GradNorm, otherwise always, with cosine as in the thesis."""
+    """Loss weights in the auxiliary tasks' heads: those of the encoder (weighted), or 1 (always). None: weighted with OL-AUX
+    and GradNorm; always otherwise, as in the thesis for cosine."""
     weighting_eps: Annotated[Positive | None, OfWeighting(EPS_WEIGHTINGS)] = None
-    """Number added to auxiliary losses before their logarithm is taken. None: 0.02, and 1e-8 with db_mtl."""
+    """Constant added to auxiliary losses before taking their logarithm. None: 0.02, or 1e-8 with db_mtl."""
     weighting_task_eps: Annotated[tuple[Positive, ...], OfWeighting(EPS_WEIGHTINGS)] = ()
-    """The same for each auxiliary loss, in the order of aux_tasks, in place of weighting_eps."""
+    """Constants for the individual auxiliary losses, in the order of aux_tasks, instead of weighting_eps."""
     weighting_maximum: Annotated[Positive | None, OfWeighting(LIMITED_WEIGHTINGS)] = None
-    """Greatest weight of a loss; of an auxiliary one, where the main one's is 1. None: unbounded."""
+    """Maximum weight of a loss, except of a main loss whose weight is always 1. None: unbounded."""
     weighting_total: Annotated[Positive | None, OfWeighting(LIMITED_WEIGHTINGS)] = None
-    """Sum to which the weights are scaled, without that of a main loss that is 1 by rule. None: not scaled."""
+    """Sum to which the weights are scaled, excluding a main loss whose weight is always 1. None: not scaled."""
     weighting_cosines: Annotated[bool, OfWeighting()] = False
-    """Log the cosines of the losses' gradients in the critic's encoder, for which all of them are compared."""
+    """Log the cosines between the losses' gradients in the critic's encoder; this computes the dot products of all pairs."""
     aux_form: Annotated[Literal["thesis", "release"], OfWeighting()] = "thesis"
     """Form of the auxiliary tasks' targets, where the thesis and the authors' release differ (`auxtasks.Options`)."""
 
@@ -304,10 +304,10 @@ class Config:
         """Return a copy with some options changed.
 
         Args:
-            **changes: Values by name of a field, whatever its group.
+            **changes: New values by field name, regardless of the group.
 
         Raises:
-            RequestError: A name is no field of a group.
+            RequestError: A name is not a field of any group.
         """
         by_group: dict[str, dict[str, Any]] = {}
         for name, value in check_names(changes).items():
@@ -316,11 +316,11 @@ class Config:
         return dataclasses.replace(self, **groups)
 
     def flat(self) -> dict[str, Any]:
-        """Return the values of all groups, by the names of their fields."""
+        """Return the values of all groups, by field name."""
         return {name: self.value(name) for name in OPTIONS}
 
     def value(self, name: str) -> Any:
-        """Return the value of the field ``name``, whatever its group."""
+        """Return the value of the field ``name``, regardless of its group."""
         return getattr(getattr(self, OPTIONS[name].group), name)
 
 
@@ -329,26 +329,26 @@ OPTIONS: Mapping[str, fields.Field] = {field.name: field for field in fields.des
 
 
 def marked(mark: Mark) -> tuple[str, ...]:
-    """Return the names of the fields with a property."""
+    """Return the names of the fields annotated with ``mark``."""
     return tuple(name for name, field in OPTIONS.items() if mark in field.extras)
 
 
 def of_weightings() -> dict[str, tuple[str, ...]]:
-    """Return the fields that are read only by weightings, with the names of these; no names for any weighting."""
+    """Map each field that is read only if losses are weighted to its weightings; an empty tuple stands for any weighting."""
     marks = {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, OfWeighting)}
     return {name: mark.names for name, mark in marks.items()}
 
 
 def read_by(kind: type[T]) -> dict[str, T]:
-    """Return the fields with an annotation of this class, `OfAlgorithm` or `OfMethod`, and the annotations."""
+    """Map each field annotated with an instance of ``kind``, `OfAlgorithm` or `OfMethod`, to that instance."""
     return {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, kind)}
 
 
 def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return ``changes`` if every name is that of a field.
+    """Return ``changes`` unmodified if every key is the name of a field.
 
     Raises:
-        RequestError: One is not.
+        RequestError: A key is not.
     """
     for name in changes:
         if name not in OPTIONS:
@@ -357,10 +357,10 @@ def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def changes(**values: Any) -> dict[str, Any]:
-    """Return values for `Config.replace`, with their names checked at once.
+    """Return values for `Config.replace` as a dictionary, checking their names immediately.
 
     Raises:
-        RequestError: A name is no field of a group.
+        RequestError: A name is not a field of any group.
     """
     return dict(check_names(values))
 
@@ -378,7 +378,8 @@ def config_from_dict(values: Any) -> Config:
     Missing groups and fields take their defaults.
 
     Raises:
-        RequestError: ``values`` is no dictionary of groups, or a field is unknown or of the wrong type. The message names it.
+        RequestError: ``values`` is not a dictionary of groups, or a field is unknown or of the wrong type. The message names
+            it.
     """
     if not isinstance(values, Mapping):
         raise RequestError(f"a configuration must be a dictionary of groups, not {type(values).__name__}")

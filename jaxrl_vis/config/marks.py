@@ -1,14 +1,14 @@
-"""Properties of options, for the annotations of their fields: scope, and which parts of a learner read them."""
+"""Properties of options, as field annotations: their scope, and which components of a learner read them."""
 
 import dataclasses
 
 
 @dataclasses.dataclass(frozen=True)
 class Mark:
-    """Property of a field, for its annotation; `marked` lists the fields that have it.
+    """Property of a field, used as an annotation; `marked` lists the fields that have it.
 
     Attributes:
-        meaning: Its meaning.
+        meaning: Description of the property.
     """
 
     meaning: str
@@ -24,10 +24,10 @@ FALSE_REWARD = Mark("fraction of rewards that are false")
 
 @dataclasses.dataclass(frozen=True)
 class OfWeighting:
-    """Property of a field that is read only if losses are weighted, or have logarithms.
+    """Property of a field that is read only if losses are weighted or their logarithms are minimised.
 
     Attributes:
-        names: Weightings that the field is an option of; empty for any.
+        names: Weightings that read the field; empty for any.
     """
 
     names: tuple[str, ...] = ()
@@ -38,7 +38,7 @@ class OfAlgorithm:
     """Property of a field that only some of the built-in algorithms read.
 
     Attributes:
-        names: These algorithms.
+        names: Algorithms that read the field.
     """
 
     names: tuple[str, ...]
@@ -49,7 +49,7 @@ class OfMethod:
     """Property of a field that only one of the built-in methods reads.
 
     Attributes:
-        name: The method.
+        name: Method that reads the field.
     """
 
     name: str

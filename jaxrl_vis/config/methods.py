@@ -1,7 +1,7 @@
-"""Names of the parts that a learner can be trained with, and its reward methods as data.
+"""Names of a learner's built-in components, and definitions of the reward methods.
 
-A method says where rewards come from, and which of them are trusted. A person's own is a `Method` in a module, named
-``module:Name``, with a function for its reward. Imports no JAX.
+A method defines the source of rewards, and which of them are trusted. A custom one is a `Method` in your own module, named
+``module:Name``, with a function as its reward. Imports no JAX.
 """
 
 import dataclasses
@@ -12,18 +12,18 @@ from jaxrl_vis.config.fields import Names
 
 RewardName = Literal["oracle", "autoencoder", "classifier", "features", "indicator", "indicator_tolerance"]
 RewardFunction = Callable[..., Any]
-"""(`types.Batch`; [B, ...] what was reached, as a goal would show it; R+; R-) -> rewards [B] float32."""
+"""Function of a `types.Batch`, achieved observations [B, ...] in the form of a goal, R+ and R-; returns rewards [B] float32."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """One method (thesis, section 5.1.4).
+    """Reward method (thesis, section 5.1.4).
 
     Attributes:
-        reward: oracle: distance of the true states; autoencoder: cosine similarity of the latents of an autoencoder that is
-            trained along; classifier: probability of a success classifier that is; features: cosine similarity in a frozen
-            encoder; indicator: equality of observations; indicator_tolerance: the same but for camera noise. Or a function.
-            Rewards are computed anew at every sample, so it must read nothing else than its arguments.
+        reward: Source of rewards. oracle: distance between true states; autoencoder: cosine similarity of the latents of an
+            autoencoder trained alongside; classifier: probability from a success classifier trained alongside; features:
+            cosine similarity in a frozen encoder; indicator: equality of observations; indicator_tolerance: equality up to
+            camera noise. Or a function, which must depend only on its arguments, as rewards are recomputed for every sample.
         filter: Whether negatives that the critic contradicts are dropped as false.
         reward_positive, reward_negative: Defaults of R+ and R-.
         balance_probability: Default of p2.
@@ -37,17 +37,17 @@ class Method:
 
     @property
     def balance(self) -> bool:
-        """True if samples are balanced: some take the very next observation as their goal, which is a sure positive."""
+        """True if samples are balanced: some use the next observation as their goal, which is a certain positive."""
         return self.balance_probability > 0.0
 
     @property
     def needs_images(self) -> bool:
-        """True if rewards are made from images, so that the environment must show some."""
+        """True if rewards are computed from images, so that the environment must provide them."""
         return self.is_learned or self.reward == "features"
 
     @property
     def is_learned(self) -> bool:
-        """True if rewards are those of a model that is trained along."""
+        """True if rewards are computed by a model trained alongside."""
         return self.reward in ("autoencoder", "classifier")
 
 
@@ -62,7 +62,7 @@ METHODS: dict[str, Method] = {
 }
 
 MethodName = Annotated[str, Names(tuple(METHODS))]
-# Weightings of losses by what they need (`jaxrl_vis.weighting`), and by the options that they have.
+# Loss weightings, grouped by their inputs (`jaxrl_vis.weighting`) and by the options that apply to them.
 MAIN_WEIGHTINGS = ("none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation")
 LOSS_WEIGHTINGS = ("uniform", "random", "uncertainty", "imtl_l", "dwa", "geometric_mean", "stch", "famo")
 GRAMIAN_WEIGHTINGS = (

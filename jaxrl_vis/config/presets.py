@@ -1,4 +1,4 @@
-"""Presets, and what they have otherwise for some tasks."""
+"""Presets and their task-specific values."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -65,8 +65,8 @@ class TaskValues:
 
     Attributes:
         always: Values for every method.
-        images: Values for image observations, unless a model that is trained along compares them.
-        oracle: Values for rewards from the true state: other methods cannot read it, and have a balance of their own.
+        images: Values for image observations, except with a reward model trained alongside, which compares images.
+        oracle: Values for rewards from the true state, which other methods cannot read; they have their own balancing.
         images_and_oracle: Values for images with rewards from the true state.
     """
 
@@ -81,7 +81,7 @@ class TaskValues:
         return {**self.always, **self.images, **self.oracle, **self.images_and_oracle}
 
     def choose(self, shows_images: bool, method_name: str) -> dict[str, Any]:
-        """Return the values that apply.
+        """Return the values that apply to the observations and the method.
 
         Args:
             shows_images: True if observations are images.
@@ -142,7 +142,7 @@ TASKS: Mapping[tuple[str, str], TaskValues] = {
     ("fast", "FingerTurn"): _FINGER,
     ("cpu", "FingerTurn"): _FINGER,
 }
-"""(preset, task without ``Visual``) -> values that this preset has otherwise for the task."""
+"""Task-specific values of presets, by (preset, task without ``Visual``)."""
 
 
 def preset(name: str, **overrides: Any) -> Config:
@@ -150,10 +150,10 @@ def preset(name: str, **overrides: Any) -> Config:
 
     Args:
         name: ``paper``, ``fast``, ``cpu`` or ``debug`` (`PRESETS`). Some have task-specific values (`TASKS`).
-        **overrides: Options and their values, by name of a field, whatever its group.
+        **overrides: Option values by field name, regardless of the group; they take precedence.
 
     Raises:
-        RequestError: There is no such preset, or no such option.
+        RequestError: The preset or an option is unknown.
     """
     if name not in PRESETS:
         raise RequestError(f"unknown preset {name!r}{nearest(name, list(PRESETS))}")
@@ -167,15 +167,15 @@ def preset(name: str, **overrides: Any) -> Config:
 
 
 def _algorithm_overrides(config: Config, algorithm: str) -> dict[str, Any]:
-    """Return the values that an algorithm has otherwise than DDPG."""
-    if algorithm == "td3":  # the actor and the targets wait
+    """Return the values in which an algorithm differs from DDPG."""
+    if algorithm == "td3":  # delayed updates of the actor and the targets
         return {name: max(2, config.value(name)) for name in ("actor_interval", "target_update_interval")}
-    if algorithm == "contrastive":  # goals are future states, and the truth about them is not read
+    if algorithm == "contrastive":  # goals are future states; true states are not read
         return {"future_goals": "geometric", "relabel_probability": 1.0, "balance_probability": 0.0, "trivial_goals": 1.0}
     return {}
 
 
 def general_values(name: str, task: str) -> dict[str, Any]:
-    """Return what a preset has for other tasks, for the options that have values of their own for ``task``."""
+    """Return a preset's general values of those options for which ``task`` has values of its own."""
     values = TASKS.get((name, task.removeprefix("Visual")), TaskValues())
     return {option: PRESETS[name].value(option) for option in values.all}

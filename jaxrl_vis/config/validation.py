@@ -1,6 +1,6 @@
 """Validation of configurations, with one-line messages that name the problem and the remedy.
 
-Imports no JAX, so that the command line can reject a request at once.
+Imports no JAX, so that the command line can reject a request without delay.
 """
 
 import math
@@ -22,7 +22,7 @@ from jaxrl_vis.config.groups import (
 from jaxrl_vis.config.methods import ALGORITHMS, METHODS
 from jaxrl_vis.errors import RequestError
 
-_LARGEST_SEED = 2**32 - 1  # a random key uses 32 bits of it: larger seeds would repeat smaller ones
+_LARGEST_SEED = 2**32 - 1  # random keys use 32 bits of the seed: larger seeds would repeat smaller ones
 
 
 def validate(config: Config) -> Config:
@@ -77,7 +77,7 @@ def _is_changed(config: Config, name: str) -> bool:
 
 
 def _validate_auxiliary(config: Config) -> None:
-    """Raise a RequestError for an option of another weighting, or one of auxiliary tasks without any tasks."""
+    """Raise a RequestError for an option of another weighting, or for one of auxiliary tasks if there are none."""
     weighting = config.auxiliary.weighting
     for name, weightings in of_weightings().items():
         if weightings and _is_changed(config, name) and weighting not in weightings:

@@ -1,13 +1,13 @@
-"""Interface of an algorithm: all that rollouts, evaluations, checkpoints and policies know about a learner.
+"""Interface of an algorithm, through which rollouts, evaluations, checkpoints and policies access a learner.
 
-    init            a fresh agent: a pytree of the algorithm's own
-    update          all gradient steps of an iteration, from batches that were chosen by the replay
-    policy_params   the part of an agent that acting reads: small, and all that a policy is made of
+    init            initial agent, a pytree that the algorithm defines
+    update          all gradient steps of an iteration, on batches sampled from the replay
+    policy_params   the part of an agent needed for acting: small, and sufficient for a policy
     act             actions without exploration
 
-An algorithm is made by a function of a `Setup`, which has the configuration and the sizes of the task. DDPG, TD3 and
-contrastive RL are built in (`train_step.ALGORITHMS`); ``--algorithm module:Name`` names another one. `networks.policy` has
-``act``, ``aim`` and ``policy_params`` for those whose actor is that of the shared networks.
+An algorithm is built by a function of a `Setup`, which holds the configuration and the sizes of the task. DDPG, TD3 and
+contrastive RL are built in (`train_step.ALGORITHMS`); ``--algorithm module:Name`` selects a custom one. `networks.policy`
+provides ``act``, ``aim`` and ``policy_params`` for algorithms whose actor is that of the shared networks.
 """
 
 import dataclasses
@@ -29,14 +29,14 @@ PolicyParams = Any
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """Configuration and sizes that an algorithm is built for.
+    """Configuration and sizes for which an algorithm is built.
 
     Attributes:
-        config: The run.
+        config: Configuration of the run.
         resolved: Discount, rewards, bounds of targets.
         observation_spec: Shape and dtype of an observation: [C, H, W] uint8 or [S] float32.
         action_size: A; actions lie in [-1, 1].
-        auxiliary: Auxiliary tasks of the run and their weighting; an algorithm may leave them alone.
+        auxiliary: Auxiliary tasks of the run and their weighting; an algorithm may ignore them.
         shards: Shards of the learner: batches are those of one shard, gradients and metrics must be those of the whole.
     """
 
@@ -50,7 +50,7 @@ class Setup:
 
 @dataclasses.dataclass(frozen=True)
 class Batches:
-    """Batches of an iteration, drawn together and read one at a time.
+    """Batches of an iteration, sampled together and read one at a time.
 
     Attributes:
         choices: Tree of arrays [U, ...], one row for each gradient step.
@@ -72,12 +72,12 @@ class Algorithm(NamedTuple):
         act: (policy parameters, observations [E, ...], aim) -> actions [E, A] float32 in [-1, 1].
         update: (agent, Statistics, Batches, key) -> (agent after a gradient step on every batch, means of metrics, [] float32
             by name).
-        policy_params: (agent, Statistics) -> the parameters that ``act`` and ``aim`` read.
-        aim: (policy parameters, goals [E, ...]) -> tree of arrays [E, ...] that ``act`` reads of goals. Goals are constant, so
-            this is computed once per episode. The goals themselves if not given.
+        policy_params: (agent, Statistics) -> parameters that ``act`` and ``aim`` read.
+        aim: (policy parameters, goals [E, ...]) -> tree of arrays [E, ...], the representation of goals that ``act`` takes.
+            Goals are constant, so it is computed once per episode. By default the goals themselves.
         diagnose: (agent, Statistics, goals [E, ...] of a rollout) -> further metrics, [] float32 by name, averaged over the
-            parts of a learner.
-        networks: Networks of the algorithm, for tools that look inside (`networks.Networks`); None for none.
+            shards of a learner.
+        networks: Networks of the algorithm (`networks.Networks`), for tools that inspect them; None if it has none.
     """
 
     init: Callable[[jax.Array], Agent]
@@ -89,10 +89,10 @@ class Algorithm(NamedTuple):
     networks: Any = None
 
     def of_policies(self, statistics: Statistics) -> "Algorithm":
-        """Return the same algorithm for agents that are policy parameters alone: they act, and cannot learn.
+        """Return the algorithm for agents that consist of policy parameters only: they can act, but not learn.
 
         Args:
-            statistics: Those of a learner that has seen nothing.
+            statistics: Initial observation statistics.
         """
 
         def update(*_: Any) -> tuple[Agent, Metrics]:

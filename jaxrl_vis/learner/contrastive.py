@@ -1,16 +1,16 @@
 """Contrastive reinforcement learning (Eysenbach et al., 2022, arXiv 2206.07568): no rewards, and no targets.
 
-    critic    logit f(s, a, g) = phi(s, a) . psi(g), learned to tell the goals that follow (s, a) from those of other
-              transitions of the batch; the best f is log p(g follows s, a) - log p(g), up to a constant of g
-    actor     the action that maximises f, for goals that follow and for those of other transitions
+    critic    logit f(s, a, g) = phi(s, a) . psi(g), trained to discriminate goals that follow (s, a) from those of other
+              transitions of the batch; the optimal f is log p(g follows s, a) - log p(g), up to a function of g
+    actor     trained to maximise f, for goals that follow and for those of other transitions
 
-The goals that follow are future states, k steps ahead with probability in proportion to gamma^k: ``future_goals="geometric"``
-with every goal relabelled, as presets set for this algorithm.
+Goals that follow are future states, k steps ahead with probability proportional to gamma^k: ``future_goals="geometric"`` with
+every goal relabelled, as set by presets for this algorithm.
 
-Form ``nce`` is the original's: binary cross-entropy of every pair. Form ``stable`` has what makes it steadier: layer
-normalisation and cold initialisation (Zheng et al., 2024, arXiv 2306.03346), symmetric InfoNCE and a penalty on log-sum-exp
-(Bortkiewicz et al., 2024, arXiv 2408.11052). Unlike in both, the policy is deterministic, explores with the noise of all
-algorithms here, and pays for large actions (``action_penalty``) instead of earning entropy.
+Form ``nce`` is the original: binary cross-entropy of every pair. Form ``stable`` adds stabilising measures: layer normalisation
+and cold initialisation (Zheng et al., 2024, arXiv 2306.03346), symmetric InfoNCE and a penalty on log-sum-exp (Bortkiewicz et
+al., 2024, arXiv 2408.11052). Unlike in both, the policy is deterministic, explores with the same noise as all algorithms here,
+and is penalised for large actions (``action_penalty``) instead of being rewarded for entropy.
 """
 
 import dataclasses
@@ -36,8 +36,8 @@ class Agent(Replaceable):
     """Networks and their optimisers.
 
     Attributes:
-        actor: Parameters as of `Networks.init_actor`.
-        critic: ``sa`` and ``g``, heads for phi and psi; for images their ``encoder``, too.
+        actor: Parameters from `Networks.init_actor`.
+        critic: ``sa`` and ``g``, heads for phi and psi; for images also their ``encoder``.
         actor_optimizer, critic_optimizer: optax states.
     """
 
@@ -51,18 +51,18 @@ def contrastive_loss(logits: jax.Array, form: str) -> jax.Array:
     """Compute the critic's loss: [] float32.
 
     Args:
-        logits: [B, B] float32, of B transitions (rows) and the goals of each (columns); those on the diagonal follow.
-        form: ``nce`` or ``stable``, as of ``contrastive_form``.
+        logits: [B, B] float32, for B transitions (rows) and their goals (columns); pairs on the diagonal are positives.
+        form: ``nce`` or ``stable``, see ``contrastive_form``.
     """
     following = jnp.diagonal(logits)
-    if form == "nce":  # log-sigmoid of what follows, and of minus what does not
+    if form == "nce":  # log-sigmoid of positives, and of the negated negatives
         return jnp.mean(jax.nn.softplus(logits)) - jnp.sum(following) / logits.size
     of_rows, of_columns = (jax.nn.logsumexp(logits, axis=axis) for axis in (1, 0))
     return jnp.mean(of_rows + of_columns - 2.0 * following) + LOGSUMEXP_PENALTY * jnp.mean(jnp.square(of_rows))
 
 
 def _check(setup: Setup) -> None:
-    """Raise a RequestError for what this algorithm does not read, and for goals that it cannot learn from."""
+    """Raise a RequestError for options that this algorithm ignores, and for goals that it cannot learn from."""
     config = setup.config
     if config.reward.method != "oracle":
         raise RequestError(f"contrastive reads no rewards: leave out --method {config.reward.method}")
@@ -84,7 +84,7 @@ def make(setup: Setup) -> Algorithm:
     """Build contrastive RL.
 
     Raises:
-        RequestError: The configuration has rewards, auxiliary losses or goals that it does not learn from.
+        RequestError: The configuration sets rewards, auxiliary losses or goals that the algorithm does not support.
     """
     _check(setup)
     config, form = setup.config, setup.config.contrastive.contrastive_form
@@ -142,7 +142,7 @@ def make(setup: Setup) -> Algorithm:
 
 
 def _with_other_goals(latents: jax.Array) -> jax.Array:
-    """Repeat B transitions with the goals of others: latents [2, B, latent] -> [2, 2 B, latent]."""
+    """Append the B transitions with the goals of others: latents [2, B, latent] -> [2, 2 B, latent]."""
     observations, goals = latents
     return jnp.stack([jnp.concatenate([observations, observations]), jnp.concatenate([goals, jnp.roll(goals, 1, axis=0)])])
 
@@ -155,7 +155,7 @@ def _step(params: Params, gradient: Params, state: Any, learning_rate: float) ->
 
 
 def _metrics(logits: jax.Array) -> Metrics:
-    """Compute the share of transitions whose own goal has the greatest logit, and mean logits."""
+    """Compute the fraction of transitions whose own goal has the largest logit, and mean logits."""
     size, following = len(logits), jnp.diagonal(logits)
     return {
         "accuracy": jnp.mean((jnp.argmax(logits, axis=1) == jnp.arange(size)).astype(jnp.float32)),

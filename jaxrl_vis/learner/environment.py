@@ -1,4 +1,4 @@
-"""Environment of a configuration."""
+"""Construction of the environment that a configuration describes."""
 
 import dataclasses
 from typing import Any
@@ -26,7 +26,7 @@ def locate_env(config: Config) -> Config:
     """Return ``config`` with the folder of its ``module:Name`` parts filled in.
 
     Raises:
-        RequestError: There is no such environment, its module cannot be imported, or the modules are in several folders.
+        RequestError: The environment is unknown, its module cannot be imported, or the modules are in several folders.
     """
     validate(config)
     try:
@@ -47,7 +47,7 @@ def make_env(config: Config) -> GoalEnv:
     """Build the environment of a configuration.
 
     Raises:
-        RequestError: There is no such environment, or it cannot be made like that.
+        RequestError: The environment is unknown, or does not support the options.
     """
     locate_env(config)
     try:
@@ -71,7 +71,7 @@ def _read_options(environment: EnvironmentOptions) -> dict[str, Any]:
     """Convert ``env_options`` to the fields of the environment's configuration.
 
     Raises:
-        RequestError: One is not ``name=value``, names no field, or has a value that does not suit.
+        RequestError: An option is not of the form ``name=value``, or has an unknown name or an invalid value.
     """
     if not environment.env_options:
         return {}

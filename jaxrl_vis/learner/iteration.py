@@ -1,10 +1,10 @@
 """Second half of a training iteration, after the rollout, for one learner: pure functions, not yet compiled.
 
-    insert      one contiguous slice of the replay; observation statistics
+    insert      write one contiguous slice of the replay; update the observation statistics
     update      scan over U: sample, relabel, reward, gradient step, target networks
     learn       both, and metrics: fixed-shape means
 
-All draw from ``fold_in(seed's key, iteration)``.
+Random keys are derived from ``fold_in(key of the seed, iteration)``.
 """
 
 import dataclasses
@@ -24,14 +24,14 @@ from jaxrl_vis.learner.parallel.sharding import Layout
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, TrainState
 
 Insert = Callable[[TrainState, ReplayState, Episodes, jax.Array, jax.Array], tuple[TrainState, ReplayState]]
-"""(TrainState, ReplayState, Episodes, key [], iteration []) -> what it makes of the first two."""
+"""(TrainState, ReplayState, Episodes, key [], iteration []) -> updated TrainState and ReplayState."""
 
 Update = Callable[[TrainState, ReplayState, jax.Array, jax.Array], tuple[TrainState, Metrics]]
-"""(TrainState, ReplayState, key [], iteration []) -> the learner after all gradient steps, and means of their metrics."""
+"""(TrainState, ReplayState, key [], iteration []) -> TrainState after all gradient steps, and means of their metrics."""
 
-# Folded into an iteration's key for what draws statistics. Large, because small numbers give the keys of `jax.random.split`.
+# Folded into an iteration's key for sampling statistics. Large, because small numbers give the keys of `jax.random.split`.
 _STATISTICS = 0x73656E
-# The same for what an algorithm draws.
+# Folded into an iteration's key for the algorithm's sampling.
 _UPDATES = 0x757064
 
 
@@ -39,7 +39,7 @@ class Learned(NamedTuple):
     """Result of an iteration.
 
     Attributes:
-        loop: The state that the next iteration begins with.
+        loop: State at the start of the next iteration.
         metrics: [S] float32 by name.
     """
 
@@ -53,7 +53,7 @@ def split_key(key: jax.Array, iteration: jax.Array) -> jax.Array:
 
 
 def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> Batches:
-    """Choose the batches of all gradient steps at once: inside the loop, sampling would take a dozen tiny kernels per step."""
+    """Choose the batches of all gradient steps at once: within the loop, sampling would run a dozen tiny kernels per step."""
     keys = jax.random.split(key, config.run.updates_per_iteration)
     choices = jax.vmap(lambda update_key: sampler.choose(replay, update_key, iteration))(keys)
     return Batches(choices, lambda choice: sampler.batch(replay, choice))
@@ -66,7 +66,7 @@ def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, co
         if train.goal_normalizer is not None:
             observations = observations[:, :-1]
         axes = (0, 1)
-    else:  # as the authors' release: as many transitions as the rollout has, relabelled
+    else:  # as in the authors' release: as many relabelled transitions as the rollout has
         count = config.run.num_envs * sampler.replay.horizon
         latest = sampler.replay._replace(num_rollouts=1, mean_age=None)
         sampler = dataclasses.replace(sampler, config=config.replace(batch_size=count), replay=latest)
@@ -83,7 +83,7 @@ def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, co
 
 
 def make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Insert:
-    """Build the function that adds a rollout to the replay and the statistics."""
+    """Build the function that adds a rollout to the replay and to the observation statistics."""
 
     def insert(
         train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
@@ -96,7 +96,7 @@ def make_insert(config: Config, sampler: Sampler, auxiliary: Auxiliary) -> Inser
 
 
 def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Update:
-    """Build the gradient steps of an iteration alone, for timing."""
+    """Build the function that takes the gradient steps of an iteration alone, for timing."""
 
     def update(train: TrainState, replay: ReplayState, key: jax.Array, iteration: jax.Array) -> tuple[TrainState, Metrics]:
         batches = choose_batches(config, sampler, replay, key, iteration)
@@ -112,8 +112,8 @@ def make_learn(
     """Build the second half of an iteration.
 
     Returns:
-        (LoopState, the rollout's parts in their order) -> `Learned`, of one learner or one shard of it, whose replay lies as
-        ``layout`` says. Environments of the last part that are not the rollout's are left out.
+        (LoopState, parts of the rollout in order) -> `Learned`, for one learner or one shard of it, whose replay has the given
+        ``layout``. Surplus environments of the last part are dropped.
     """
     shards, num_envs = sampler.shards, sampler.replay.num_envs
 

@@ -1,4 +1,4 @@
-"""Values that follow from a configuration and an environment's horizon: discount, rewards, filter, bounds of targets."""
+"""Values derived from a configuration and an environment's horizon: discount, rewards, filter, bounds of targets."""
 
 import dataclasses
 import math
@@ -11,16 +11,16 @@ from jaxrl_vis.host.plugins import call, find
 
 @dataclasses.dataclass(frozen=True)
 class Resolved:
-    """Values that follow from a `Config` and the environment's horizon: no None left.
+    """Values derived from a `Config` and the environment's horizon, with all defaults filled in.
 
     Attributes:
         method: Source of rewards.
-        horizon: T, control steps in an episode.
+        horizon: T, number of control steps in an episode.
         discount: gamma.
         reward_positive, reward_negative: R+ and R-.
         balance_probability: p2.
-        filter_threshold: q0; infinity where the method does not filter.
-        critic_output_bias: What the critic predicts before it has learned anything.
+        filter_threshold: q0; infinity if the method does not filter.
+        critic_output_bias: Initial bias of the critic's output, about its prediction before training.
         target_minimum, target_maximum: Bounds of the critic's targets.
     """
 
@@ -39,12 +39,13 @@ class Resolved:
 def resolve(config: Config, horizon: int) -> Resolved:
     """Fill in the defaults that depend on the method and the horizon.
 
-    The filter's band is R- + gamma R+/(1-gamma) < q0 < R+/(1-gamma) (thesis, section 5.1.4); its middle is the default. A
-    critic that starts at or above q0 would drop every negative before it has learned from one, and so never come down. With
-    rewards 0/-1 a fresh critic (Q near 0) does: there it starts at R-/(1-gamma), the least value any state can have.
+    The valid range of the filter threshold is R- + gamma R+/(1-gamma) < q0 < R+/(1-gamma) (thesis, section 5.1.4); its middle
+    is the default. A critic that starts at or above q0 would drop every negative before learning from any, and its values would
+    never decrease. A newly initialised critic (Q near 0) does so if q0 <= 0, as with rewards 0/-1: it then starts at
+    R-/(1-gamma), the minimum value of any state.
 
     Raises:
-        RequestError: The discount or the filter threshold lies outside its range, or there is no such method.
+        RequestError: The discount or the filter threshold is out of range, or the method is unknown.
     """
     method = find("method", config.reward.method, METHODS, config.environment.env_folder)
     method = call("method", config.reward.method, method, of=Method)

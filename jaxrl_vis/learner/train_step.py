@@ -1,12 +1,12 @@
 """One training iteration, for one or several seeds, as two compiled programs that are called in turn.
 
-    keys        random numbers that this iteration's rollout draws from: fold_in(seed's key, iteration)
-    play        reset, then scan over T: act, advance, observe            -> episodes, of all environments or of a few
+    keys        random keys of this iteration's rollout, derived from fold_in(key of the seed, iteration)
+    play        reset, then scan over T: act, advance, observe            -> episodes of all environments or of one part
     learn       replay, statistics, gradient steps, metrics (`iteration`)
 
-XLA compiles the two in parallel, and the division costs nothing: episodes are in the device's memory in either case, and
-neither program waits for the host. `vmap` over the seeds' axis trains several learners at once. `learn` is donated the loop
-state, so the replay is updated in place. On several devices (`sharding`) each runs all of this on its part of the seeds,
+XLA compiles the two in parallel, and splitting them costs nothing: episodes are in the device's memory in either case, and
+neither program waits for the host. `vmap` over the seed axis trains several learners at once. The loop state is donated to
+`learn`, so the replay is updated in place. On several devices (`sharding`) each runs all of this on its part of the seeds,
 or of one learner.
 """
 
@@ -42,10 +42,10 @@ from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_default_device
 
 JIT_OPTIONS: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "learn": {"donate_argnums": 0}}
-"""Arguments of `jaxrl_vis_envs.jit` for the programs that have some."""
+"""Further arguments of `jaxrl_vis_envs.jit`, by program."""
 
 ALGORITHMS: dict[str, Callable[[Setup], Algorithm]] = dict(ddpg=ddpg.make, td3=td3.make, contrastive=contrastive.make)
-"""Functions that make the built-in algorithms."""
+"""Constructors of the built-in algorithms, by name."""
 
 # A leading seed axis on everything but the iteration, which all seeds share (see `replay`).
 _SEED_AXES = LoopState(train=0, replay=0, key=0, iteration=None)  # type: ignore[arg-type]
@@ -56,12 +56,12 @@ class TrainStep:
     """Programs of a run, jitted but not yet compiled, and their ingredients; see `make_train_step`.
 
     Attributes:
-        env, config, resolved, acting, auxiliary: Parts that the programs were built from.
+        env, config, resolved, acting, auxiliary: Components from which the programs were built.
         replay: Sizes of one device's part of a learner's replay.
-        layout: Placement of seeds and shards; all programs take and return arrays placed there.
-        exploration: Noise of training; an evaluation has none.
-        plays_any: True if ``play`` can begin with any environment, and so evaluate, too; else it plays a whole rollout.
-        part_size: P, environments that one call of ``play`` plays, on all devices together.
+        layout: Placement of seeds and shards; all programs take and return arrays with this placement.
+        exploration: Exploration noise of training; evaluations have none.
+        plays_any: True if ``play`` can start at any environment, and thus also evaluate; otherwise it runs a whole rollout.
+        part_size: P, number of environments that one call of ``play`` steps, on all devices together.
         init: keys [S] -> LoopState.
         keys: (keys [S], iteration []) -> keys [S] of this iteration's rollout.
         play: (TrainState, keys [S], number [] int32 of the first environment, `Exploration`) -> `Played`.
@@ -90,27 +90,27 @@ class TrainStep:
 
     @property
     def algorithm(self) -> Algorithm:
-        """The algorithm."""
+        """Algorithm whose agents act and learn."""
         return self.acting.algorithm
 
     @property
     def networks(self) -> Networks:
-        """Networks of the algorithm, for tools that look inside it."""
+        """Networks of the algorithm, for tools that inspect them; None if it has none."""
         return self.algorithm.networks
 
     @property
     def steps_per_iteration(self) -> int:
-        """Environment steps of one seed in an iteration."""
+        """Number of environment steps per seed and iteration."""
         return self.config.run.num_envs * self.env.horizon
 
     @property
     def updates_per_iteration(self) -> int:
-        """Gradient steps of one seed in an iteration."""
+        """Number of gradient steps per seed and iteration."""
         return self.config.run.updates_per_iteration
 
     @property
     def num_iterations(self) -> int:
-        """Iterations that `Config.env_steps` takes."""
+        """Number of iterations needed for the configured ``env_steps``."""
         return math.ceil(self.config.run.env_steps / self.steps_per_iteration)
 
     @property
@@ -122,19 +122,19 @@ class TrainStep:
 
     @property
     def replay_bytes(self) -> int:
-        """Bytes of one seed's replay."""
+        """Size of one seed's replay in bytes."""
         return num_bytes(self.replay_spec) * self.layout.shards.count
 
     @property
     def parts_spec(self) -> list[Played]:
-        """Shapes and placement of what `learn` takes: the parts of a rollout."""
+        """Shapes and placement of the parts of a rollout, as `learn` takes them."""
         spec = played_spec(self.env, self.part_size, self.config.run.seeds)
         spec = self.layout.with_shardings(spec, self.layout.by_environment)
         return [spec] * math.ceil(self.config.run.num_envs / self.part_size)
 
     @functools.cached_property
     def insert(self) -> Any:
-        """The first component of `learn` as a program, to be timed.
+        """First component of `learn` as a separate program, for timing.
 
         (TrainState, ReplayState, Episodes, keys [S], iteration) -> (TrainState, ReplayState), the first two donated.
         """
@@ -157,7 +157,7 @@ class TrainStep:
 
     @functools.cached_property
     def update_many(self) -> Any:
-        """The second component of `learn` as a program, to be timed.
+        """Second component of `learn` as a separate program, for timing.
 
         (TrainState, ReplayState, keys [S], iteration) -> (TrainState, metrics) after ``updates_per_iteration`` gradient steps,
         the first donated.
@@ -184,9 +184,9 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
 
     Args:
         env: The environment.
-        config: The run; what belongs to the environment is taken from ``env``.
-        layout: Placement on devices; None: as ``config`` says.
-        policy_alone: Agents are policy parameters (`Algorithm.of_policies`), for what plays and does not train.
+        config: Configuration of the run; properties of the environment are taken from ``env``.
+        layout: Placement on devices; None for that of ``config``.
+        policy_alone: Whether agents are policy parameters only (`Algorithm.of_policies`), for acting without training.
 
     Raises:
         RequestError: The configuration is contradictory.
@@ -218,7 +218,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         return TrainState(algorithm.init(key), *unseen)
 
     def init(keys: jax.Array) -> LoopState:
-        # Of all seeds at once. Those of one seed, repeated under `vmap`, would lie in memory beside them.
+        # Allocate the replays of all seeds at once: under `vmap`, that of one seed would take memory in addition.
         empty = jax.tree.map(lambda leaf: jnp.zeros((len(keys), *leaf.shape), leaf.dtype), replay_spec)
         return LoopState(
             train=jax.vmap(init_learner)(keys),

@@ -1,7 +1,7 @@
-"""Runs of figure ``goals``: ways to learn from goal images, without reward or with rewards of every kind, on one bench.
+"""Runs of figure ``goals``: comparison of methods that learn from goal images, with all kinds of rewards or without any.
 
-All have the preset's settings for any task, and no others: none of them was tuned, on any task. Images are not shifted, because
-methods that compare images cannot have that.
+All use the preset's general settings without tuning for a method or task. Images are not shifted, because methods that compare
+images do not support that.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""Runs of figures 5.1 and 5.2 of the thesis, and of its claims without a figure.
+"""Runs of figures 5.1 and 5.2 of the thesis, and of claims in it that have no figure.
 
     5.1          oracle, autoencoder, indicator, indicator with balancing and filtering: Reacher and FetchReach
     5.2          the same without the autoencoder: SawyerReach

@@ -24,7 +24,7 @@ _AUX_COLOURS: dict[AuxTaskName, str] = {
     "optical_flow": "#1f8fb0",
 }
 AUX_TASKS: tuple[AuxTaskName, ...] = tuple(_AUX_COLOURS)
-"""Auxiliary tasks of the thesis, in its order. Others that a learner may have are not in these figures."""
+"""Auxiliary tasks of the thesis, in its order. Further tasks of a learner are not part of these figures."""
 
 _ALL: dict[str, Any] = {"aux_tasks": AUX_TASKS}
 
@@ -85,7 +85,7 @@ VARIANTS: dict[str, Variant] = {
 
 FETCH, HAND, FINGER = "VisualFetchReach", "VisualHandReach", "VisualFingerTurn"
 LEVELS: dict[str, tuple[float, ...]] = {FETCH: (0.5, 0.9), FINGER: (0.3, 0.5, 0.9), HAND: (0.2, 0.3, 0.4)}
-"""Environment -> levels of success for which tables give the steps."""
+"""Levels of success for which tables give the steps, by environment."""
 
 # The authors did not stack images of the finger, and evaluated these two every 40 k steps.
 _OF_TASK: dict[tuple[str, str], dict[str, Any]] = {
@@ -142,11 +142,11 @@ STUDIES: dict[str, Study] = {
 }
 
 WEIGHTS = "5.6"
-"""Figure of weights, which shows those of one method."""
+"""Name of the figure of weights, which shows those of one method."""
 
 
 def check_weights(variants: Sequence[str]) -> None:
-    """Check that the figure `WEIGHTS` can be drawn for these variants; none selects its own.
+    """Check that the figure `WEIGHTS` can show these variants; an empty sequence selects its default.
 
     Raises:
         RequestError: There are several variants, or one without learned weights.

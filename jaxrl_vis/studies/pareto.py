@@ -1,10 +1,10 @@
 """Paths of gradient descent on two losses whose Pareto front is known, by several weightings.
 
     a    (x + 1)^2 + 2 y^2
-    b    4 ((x - 1)^2 + 2 y^2), of longer gradients
+    b    4 ((x - 1)^2 + 2 y^2), with larger gradients
 
-Where neither loss can fall without the other's rising, their gradients are opposed: on the line from (-1, 0) to (1, 0).
-Learning rates fall, because some steps do not shorten towards the front.
+The Pareto front, where neither loss can decrease without an increase of the other and their gradients are opposed, is the
+segment from (-1, 0) to (1, 0). The learning rate decays, because the steps of some methods do not shrink near the front.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ from jaxrl_vis.weighting import Weighting, make_weighting, weighted_grad
 
 STARTS = ((-1.6, 1.7), (0.2, 1.8), (1.8, 1.2), (-0.4, -1.8), (1.2, -1.5))
 STEPS = 400
-STEP_SIZE = 0.03  # at first; halved after 40 steps, and so on as 1 / (1 + t / 40)
+STEP_SIZE = 0.03  # initial; decays as 1 / (1 + t / 40)
 NAMES = ("a", "b")
 DRAWN = (
     "sum",
@@ -46,7 +46,7 @@ class Paths(NamedTuple):
 
     Attributes:
         points: [5, STEPS + 1, 2] float32, x and y.
-        losses: [5, STEPS + 1, 2] float32, of a and b.
+        losses: [5, STEPS + 1, 2] float32, losses a and b.
     """
 
     points: np.ndarray
@@ -85,10 +85,10 @@ def distance_to_front(points: np.ndarray) -> np.ndarray:
 
 
 def draw(path: Path) -> None:
-    """Draw the paths of `DRAWN`.
+    """Write a figure of the paths of the weightings in `DRAWN`.
 
     Args:
-        path: A .png, or any other format that Matplotlib can write.
+        path: Path of the file, .png or any other format that Matplotlib can write.
     """
     figure = Figure(figsize=(12.5, 9.4), dpi=100, facecolor="white")
     for place, (axes, name) in enumerate(zip(figure.subplots(3, 4).flat, DRAWN, strict=True)):

@@ -1,11 +1,11 @@
 """Quadratic example of OL-AUX (Lin et al., 2019): adaptive weights of three losses of a point in the plane.
 
     main        x^2 + y^2
-    shifted     (x - 1/2)^2 + (y - 1/2)^2, which helps at a distance and misleads near the minimum
-    opposed     minus the main loss, which always misleads
+    shifted     (x - 1/2)^2 + (y - 1/2)^2, helpful far from the main minimum and misleading near it
+    opposed     minus the main loss, always misleading
 
 Weights start at 1 and follow the authors' rule for this example after every step, on the losses themselves: w_i <- w_i + beta
-<w_i g_i, g_main>, unbounded. With weights constant at 1, main and opposed cancel, and every path ends in the minimum of the
+<w_i g_i, g_main>, unbounded. With constant weights of 1, main and opposed cancel, and every path ends in the minimum of the
 shifted loss.
 """
 
@@ -74,10 +74,10 @@ def descend(weighting: Weighting) -> Paths:
 
 
 def draw(path: Path) -> None:
-    """Draw the paths with fixed and adaptive weights, and the weights.
+    """Write a figure of the paths with fixed and adaptive weights, and of the weights.
 
     Args:
-        path: A .png, or any other format that Matplotlib can write.
+        path: Path of the file, .png or any other format that Matplotlib can write.
     """
     fixed, adaptive = descend(make_weighting("sum")), descend(authors_rule())
     figure = Figure(figsize=(13.5, 4.9), dpi=110, facecolor="white")

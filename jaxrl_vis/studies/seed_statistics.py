@@ -52,7 +52,7 @@ def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
         raise ValueError(f"an exact test takes at most ten seeds in each group, not {len(first)} and {len(second)}")
     pooled = np.concatenate([first, second])
     sums = pooled[_choices(len(pooled), len(first))].sum(axis=1)
-    # Of equal scores, sums differ by rounding alone.
+    # Sums of equal scores may differ by rounding errors.
     margin = 1e-12 * np.abs(pooled).sum()
     rarer = min(np.mean(sums <= first.sum() + margin), np.mean(sums >= first.sum() - margin))
     return min(1.0, 2.0 * float(rarer))
@@ -60,8 +60,8 @@ def permutation_p_value(first: np.ndarray, second: np.ndarray) -> float:
 
 @functools.cache
 def _choices(count: int, size: int) -> np.ndarray:
-    """Return all ways to choose ``size`` of ``count`` places, [ways, size] uint8.
+    """Return all combinations of ``size`` out of ``count`` indices, [combinations, size] uint8.
 
-    `scipy.stats.permutation_test` finds them anew in each call, one by one, which takes 0.3 s for two groups of ten.
+    `scipy.stats.permutation_test` enumerates them in each call, one by one, which takes 0.3 s for two groups of ten.
     """
     return np.array(list(itertools.combinations(range(count), size)), np.uint8)

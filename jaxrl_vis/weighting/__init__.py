@@ -1,4 +1,4 @@
-"""Weightings of several losses that share parameters: a library of its own, of JAX and optax alone.
+"""Weightings of several losses that share parameters: a self-contained library based on JAX and optax alone.
 
     import jaxrl_vis.weighting as jw
 
@@ -8,14 +8,14 @@
     result = gradient(params, state, ...)                       # result.gradient for the optimiser, result.state
 
 base            the interface, `Weighting`, and the logarithm of a loss
-constant        weights that are given; cosine
-ol_aux          weights that learn; `ol_aux_variants`: as in the authors' release, and the ablation of figure 5.7
-loss_values     those that read the losses' values alone
-gramian_based   those that need the inner products of all gradients; also `surgery` and `learned`. `solvers`: what they solve
-directions      those that need whole gradients, and give a direction
-limits          bounds and cosines around any of them
-registry        all of them by name
-gradients       `weighted_grad`: anybody's losses and parameters, differentiated, weighted and added up
+constant        constant weights; cosine
+ol_aux          OL-AUX; `ol_aux_variants`: the rule of the authors' release, and the ablation of figure 5.7
+loss_values     weightings that read only the losses' values
+gramian_based   weightings that need the inner products of all gradients; also `surgery` and `learned`. `solvers`: their solvers
+directions      weightings that need whole gradients, and return a direction
+limits          bounds on the weights, and logging of cosines, for any weighting
+registry        all weightings by name
+gradients       `weighted_grad`: weighted gradient of any dictionary of losses
 """
 
 from jaxrl_vis.weighting.base import MAIN, Direction, Weighting, WeightingState, weighted_sum

@@ -2,17 +2,17 @@
 
 One gradient step with losses L_i, shared parameters theta and a weighting:
 
-    c_i = w_i s_i,  s_i = 1, or d log(L_i + eps) / d L_i where the weighting takes logarithms     `Weighting.coefficients`
-    gradient = sum over i of c_i grad L_i, over all parameters; the optimiser takes it. Where ``heads`` is always, weights apply
-        to theta alone, and s_i takes the place of c_i for all other parameters
-    statistics = what the weighting needs of the gradients with respect to theta alone
+    c_i = w_i s_i,  s_i = 1, or d log(L_i + eps) / d L_i if the weighting uses logarithms         `Weighting.coefficients`
+    gradient = sum over i of c_i grad L_i, for all parameters, passed to the optimiser. If ``heads`` is always, weights apply
+        to theta alone, and s_i replaces c_i for all other parameters
+    statistics = functions of the gradients with respect to theta alone, as the weighting needs them
 
-Some weightings have a main loss, which the others are to help (`Weighting.main`); to the rest, all losses are alike. Arrays
-over the losses, such as the Gramian [K, K], are in the sorted order of their names (`loss_order`). A weighting that cannot be
-written as weights of the losses gives a `Direction` in the shared parameters instead.
+Some weightings have a main loss, which the others are meant to help (`Weighting.main`); the rest treat all losses alike. Arrays
+over the losses, such as the Gramian [K, K], are in the sorted order of their names (`loss_order`). A weighting whose step is
+not a weighted sum of the losses' gradients returns a `Direction` in the shared parameters instead.
 
-Losses, dots and gradients cross this interface as they are, without logarithms; the weighting multiplies them by s_i itself.
-So they can be averaged over devices or minibatches first, which would be wrong for logarithms.
+Losses, dot products and gradients are passed without logarithms; the weighting multiplies them by s_i itself. They can thus be
+averaged over devices or minibatches first, which would be wrong for logarithms.
 """
 
 import dataclasses
@@ -27,21 +27,21 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.types import Metrics, Params, Replaceable
 
 MAIN = "main"
-"""Name of the loss that the others are to help, for weightings that have such a one. Its weight is 1 there."""
+"""Name of the main loss, which the others are meant to help, for weightings that have one. Its weight is always 1."""
 
 Needs = Literal["losses", "dots", "gramian", "gradients"]
 Heads = Literal["weighted", "always"]
 Losses = Mapping[str, jax.Array]  # [] floats by name
 Weights = dict[str, jax.Array]
-Eps = float | Mapping[str, float]  # one for all auxiliary losses, or one for each by its name
+Eps = float | Mapping[str, float]  # one value for all auxiliary losses, or one for each by name
 
 
 class Direction(NamedTuple):
-    """Step of a weighting that is no weighted sum of the current gradients.
+    """Step of a weighting that is not a weighted sum of the current gradients.
 
     Attributes:
-        shared: What takes the place of the gradient in the shared parameters: a tree like these, float32 or wider.
-        weights: [] float32 by name, weights of the losses for all other parameters, and for whatever can take only weights.
+        shared: Replacement for the gradient in the shared parameters: a tree of the same structure, float32 or wider.
+        weights: [] float32 by name, weights of the losses for all other parameters, and wherever only weights can be used.
     """
 
     shared: Params
@@ -54,14 +54,14 @@ class WeightingState(Replaceable):
     """State of a weighting. All shapes are fixed, so it can be scanned, mapped, sharded and saved like parameters.
 
     Attributes:
-        weights: [] float32 by name, for all losses; of a main loss, 1. The next gradients are combined with them, unless the
-            weighting decides by these gradients (`cosine`, and all that need a Gramian); then the latest.
-        updates: [] int32, calls of `Weighting.update` so far.
-        sums: Sums over the calls since the weights last moved; None where nothing is summed up.
-        window: The latest gradients by name, [window, ...] each; None without a moving average.
-        params: Parameters at which losses and gradients are compared; None: those of each step.
-        memory: What else the weighting remembers, such as the state of an optax rule; None for nothing.
-        key: [] typed key of a weighting that draws; None if it does not.
+        weights: [] float32 by name, for all losses; 1 for a main loss. Weights for combining the next gradients; or the latest
+            ones, if they are computed from the gradients that they combine (`cosine`, and weightings that need a Gramian).
+        updates: [] int32, number of calls of `Weighting.update` so far.
+        sums: Sums over the calls since the weights last changed; None if unused.
+        window: Latest gradients by name, [window, ...] each; None without a moving average.
+        params: Parameters at which losses and gradients are compared; None for those of each step.
+        memory: Further state, such as that of an optax rule; None if there is none.
+        key: [] typed key of a random weighting; None for a deterministic one.
     """
 
     weights: Weights
@@ -77,31 +77,30 @@ class Weighting(NamedTuple):
     """Rule for the weights of losses. Pure; apart from ``init``, ``update`` and ``hold``, all fields are static.
 
     Attributes:
-        name: As in `make_weighting`.
-        init: (names of all losses; shared parameters or their shapes, which are read where ``needs`` is gradients; where there
-            is ``hold``, also all parameters or their shapes) -> WeightingState. Raises RequestError where names are missing or
-            too many.
+        name: Name, as in `make_weighting`.
+        init: (names of all losses; shared parameters or their shapes, read if ``needs`` is gradients; with ``hold``, also all
+            parameters or their shapes) -> WeightingState. Raises RequestError if names are missing or superfluous.
         update: (losses, statistics, state) -> (weights of this step by name, or a `Direction`; state; metrics of [] float32).
             ``statistics`` is
 
-            - for ``needs`` losses: not read, None will do;
+            - for ``needs`` losses: ignored, may be None;
             - dots: [] float32 for each auxiliary loss, <grad L_main, grad L_i>;
             - gramian: [K, K] float32, <grad L_i, grad L_j>, in the sorted order of the names;
             - gradients: for every loss, grad L_i.
 
-            Gradients are those of the losses as they are, with respect to the shared parameters alone.
+            Gradients are those of the losses without logarithms, with respect to the shared parameters alone.
         needs: Kind of ``statistics``.
-        auxiliary: True if auxiliary losses are learned at all; if not, they weigh 0 and need not be computed.
-        log: True if logarithms of the losses are learned.
-        eps: Added to auxiliary losses before their logarithm is taken: one number, or a number for each by its name.
-        main_eps: Added to the main loss likewise.
-        heads: Weights for parameters that are not shared. weighted: those of the shared ones, so that a head rests while its
-            loss weighs nothing; always: 1.
-        interval: N, calls of ``update`` from one change of the weights to the next.
-        hold: (parameters of this step, WeightingState) -> WeightingState with the ``params`` that losses and statistics of
-            this step must belong to; None: they are those of the step.
-        main: True if one of the losses must be called `MAIN`, and weighs 1.
-        reads_losses: True if the weights depend on the losses' values.
+        auxiliary: Whether auxiliary losses are minimised at all; if not, their weight is 0 and they need not be computed.
+        log: Whether logarithms of the losses are minimised.
+        eps: Constant added to auxiliary losses before taking logarithms: one value for all, or one for each by name.
+        main_eps: Constant added to the main loss before taking its logarithm.
+        heads: Weights for parameters that are not shared. weighted: those of the shared ones, so that a head is not trained
+            while the weight of its loss is 0; always: 1.
+        interval: N, number of calls of ``update`` between changes of the weights.
+        hold: (parameters of this step, WeightingState) -> WeightingState whose ``params`` are those at which losses and
+            statistics of this step must be evaluated; None if these are the parameters of the step.
+        main: Whether one of the losses must be called `MAIN`, and has weight 1.
+        reads_losses: Whether the weights depend on the losses' values.
     """
 
     name: str
@@ -119,7 +118,7 @@ class Weighting(NamedTuple):
     reads_losses: bool = True
 
     def slopes(self, losses: Losses) -> dict[str, jax.Array]:
-        """Compute s_i, the objective's derivative by each loss, [] float32 by name; 1 without logarithms."""
+        """Compute s_i, the derivative of each loss's logarithm, [] float32 by name; 1 without logarithms."""
         return {name: log_slope(loss, self._loss_eps(name)) if self.log else jnp.ones(()) for name, loss in losses.items()}
 
     def coefficients(self, weights: Weights, losses: Losses) -> dict[str, jax.Array]:
@@ -129,7 +128,7 @@ class Weighting(NamedTuple):
     def objective(self, weights: Weights, losses: Losses) -> jax.Array:
         """Return the objective: the weighted sum of the losses or of their logarithms, [] float32.
 
-        Its gradient, weights being constant, is the sum of c_i grad L_i.
+        Its gradient, with constant weights, is the sum of c_i grad L_i.
         """
         weights = jax.lax.stop_gradient(weights)
         learned = {name: log_loss(loss, self._loss_eps(name)) if self.log else loss for name, loss in losses.items()}
@@ -154,7 +153,7 @@ def log_loss(loss: jax.Array, eps: float) -> jax.Array:
 
     Args:
         loss: [] float.
-        eps: Greater than 0.
+        eps: Positive constant.
     """
     return jnp.log(jnp.maximum(loss, 0.0) + eps) + jnp.minimum(loss, 0.0) / eps
 
@@ -170,10 +169,10 @@ def to_float32(leaf: jax.Array) -> jax.Array:
 
 
 def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
-    """Split the result of a loss function, or its shapes, into the losses and the auxiliary output, or None.
+    """Split the result of a loss function, or its shapes, into losses and auxiliary output (None without ``has_aux``).
 
     Raises:
-        RequestError: It is not that, or a loss is not a single number.
+        RequestError: The result is not of this form, or a loss is not a scalar.
     """
     is_pair = isinstance(result, tuple) and len(result) == 2
     losses, extra = result if has_aux and is_pair else (result, None)
@@ -188,10 +187,10 @@ def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
 
 
 def check_names(losses: Losses, state: WeightingState) -> None:
-    """Check that the losses are those that the state was initialised with.
+    """Check that the losses are those with which the state was initialised.
 
     Raises:
-        RequestError: They are not.
+        RequestError: Their names differ.
     """
     if set(losses) != set(state.weights):
         known, expected = (", ".join(sorted(names)) for names in (losses, state.weights))
@@ -199,9 +198,9 @@ def check_names(losses: Losses, state: WeightingState) -> None:
 
 
 def dot(one: Params, other: Params) -> jax.Array:
-    """Compute the inner product of two trees in float32 or wider, whatever their dtypes: [].
+    """Compute the scalar inner product of two trees in float32 or wider, regardless of their dtypes.
 
-    Products are added up one by one instead of in a matrix unit, which on accelerators would round them to 10 bits.
+    Elementwise products are summed instead of using a matrix unit, which on accelerators would round factors to 10 bits.
     """
 
     def products(left: jax.Array, right: jax.Array) -> jax.Array:
@@ -212,15 +211,15 @@ def dot(one: Params, other: Params) -> jax.Array:
 
 
 def scaled(tree: Params, factor: jax.Array | float) -> Params:
-    """Multiply all leaves of a tree by a number."""
+    """Multiply all leaves of a tree by a scalar."""
     return jax.tree.map(lambda leaf: factor * leaf, tree)
 
 
 def weighted_sum(gradients: Mapping[str, Params], coefficients: Mapping[str, jax.Array]) -> Params:
-    """Sum c_i g_i over the losses, in float32 or wider: a tree like each gradient.
+    """Compute the sum of c_i g_i over the losses, in float32 or wider: a tree like each gradient.
 
     Args:
-        gradients: Trees of one structure, by name.
+        gradients: Trees of the same structure, by name.
         coefficients: [] float32 by name.
     """
 
@@ -231,34 +230,34 @@ def weighted_sum(gradients: Mapping[str, Params], coefficients: Mapping[str, jax
 
 
 def loss_order(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names in the order of arrays over the losses."""
+    """Return the names in the order used by arrays over the losses."""
     return tuple(sorted(names))
 
 
 def to_vector(by_name: Mapping[str, jax.Array]) -> jax.Array:
-    """Stack a number for each loss: [K], float32 or wider."""
+    """Stack the scalars of all losses: [K], float32 or wider."""
     return jnp.stack([to_float32(jnp.asarray(by_name[name])) for name in loss_order(by_name)])
 
 
 def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
-    """Split a vector [K] into [] numbers by the names of the losses."""
+    """Split a vector [K] into scalars by the names of the losses."""
     return {name: vector[place] for place, name in enumerate(loss_order(names))}
 
 
 def settled(after: WeightingState, before: WeightingState) -> WeightingState:
-    """Cast a state to the dtypes of the one before, as the carry of a scan must be."""
+    """Cast a state to the dtypes of the previous one, as required for the carry of a scan."""
     return jax.tree.map(lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype), after, before)
 
 
 def all_names(weighting: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of losses that are alike, in the order of arrays over them.
+    """Return the names of the losses, for a weighting without a main loss, in the order used by arrays over them.
 
     Args:
-        weighting: Its name, for the message.
+        weighting: Name of the weighting, for error messages.
         names: Names of all losses.
 
     Raises:
-        RequestError: There are none, or a name is there twice.
+        RequestError: There are none, or a name occurs twice.
     """
     names = tuple(names)
     if not names:
@@ -277,12 +276,12 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
     """Return the names without `MAIN`.
 
     Args:
-        weighting: Its name, for the message.
+        weighting: Name of the weighting, for error messages.
         names: Names of all losses.
-        needed: True if there must be some.
+        needed: Whether there must be at least one auxiliary loss.
 
     Raises:
-        RequestError: `MAIN` is missing, a name is there twice, or there are no others.
+        RequestError: `MAIN` is missing, a name occurs twice, or a required auxiliary loss is missing.
     """
     names = tuple(names)
     _check_unique(names)
@@ -294,10 +293,10 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
 
 
 def checked(weighting: Weighting) -> Weighting:
-    """Check a weighting, and return it.
+    """Check the ``eps`` and ``main_eps`` of a weighting, and return it.
 
     Raises:
-        RequestError: It adds nothing, or something negative, before it takes logarithms.
+        RequestError: One of them is not positive and finite.
     """
     for field in ("eps", "main_eps"):
         values = getattr(weighting, field)
@@ -308,24 +307,24 @@ def checked(weighting: Weighting) -> Weighting:
 
 
 def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> WeightingState:
-    """Return an initial state.
+    """Return the initial state of a weighting with a main loss.
 
     Args:
         names: Names of the auxiliary losses.
-        weights: Their weights.
-        more: Other fields.
+        weights: Initial weights of the auxiliary losses, by name.
+        more: Values of other fields.
     """
     filled = {MAIN: jnp.ones(())} | {name: jnp.asarray(weights[name], jnp.ones(()).dtype) for name in names}
     return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **more)
 
 
 def start_alike(label: str, names: Iterable[str], **more: Any) -> WeightingState:
-    """Return the initial state of a weighting to which all losses are alike: equal weights that sum to 1.
+    """Return the initial state of a weighting without a main loss: equal weights that sum to 1.
 
     Args:
-        label: Its name, for messages.
+        label: Name of the weighting, for error messages.
         names: Names of all losses.
-        more: Other fields.
+        more: Values of other fields.
     """
     ordered = all_names(label, names)
     weights = {name: jnp.full((), 1.0 / len(ordered), jnp.ones(()).dtype) for name in ordered}
@@ -336,22 +335,22 @@ def moved(state: WeightingState, weights: Weights, **more: Any) -> tuple[Weighti
     """Return the state after an update, and metrics ``weight/NAME`` of all losses.
 
     Args:
-        state: The state before.
-        weights: Those of this step, or of the next where the weighting does not decide by this step's gradients.
-        more: Other fields that change.
+        state: Previous state.
+        weights: Weights of this step; or of the next one, if they do not depend on the gradients that they combine.
+        more: New values of other fields.
     """
     after = settled(state.replace(weights=weights, updates=state.updates + 1, **more), state)
     return after, {f"weight/{name}": weight for name, weight in after.weights.items()}
 
 
 def zeros_for(label: str, names: Iterable[str], shared: Params, *leading: int) -> dict[str, Params]:
-    """Return a tree of zeros like the shared parameters for each loss, at least float32.
+    """Return a tree of zeros like the shared parameters for each loss, float32 or wider.
 
     Args:
-        label: Name of the weighting, for the message.
+        label: Name of the weighting, for error messages.
         names: Names of the losses.
-        shared: Arrays or their shapes.
-        leading: Sizes of axes before those of a parameter.
+        shared: Shared parameters or their shapes.
+        leading: Sizes of leading axes to prepend to those of each parameter.
 
     Raises:
         RequestError: ``shared`` is not given.
@@ -366,6 +365,6 @@ def zeros_for(label: str, names: Iterable[str], shared: Params, *leading: int) -
 
 
 def report(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
-    """Return metrics: ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if there are dots."""
+    """Return the metrics ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if ``dots`` is given."""
     shown = {f"weight/{name}": weight for name, weight in weights.items() if name != MAIN}
     return shown | {f"dot/{name}": value for name, value in (dots or {}).items()}

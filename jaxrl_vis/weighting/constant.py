@@ -1,4 +1,4 @@
-"""Weightings without memory: weights are constant, or follow from the gradients of the current step."""
+"""Memoryless weightings: weights are constant, or follow from the gradients of the current step."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -35,12 +35,12 @@ def none_log(main_eps: float = 1e-8) -> Weighting:
 
 
 def plain_sum() -> Weighting:
-    """Add up all losses, of which none need be the main one."""
+    """Sum all losses, with weight 1; no main loss is required."""
     return _constant("sum", 1.0, main=False)
 
 
 def balance(eps: Eps = 0.02, main_eps: float = 1e-8) -> Weighting:
-    """Add up the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing")."""
+    """Sum the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing")."""
     return _constant("balance", 1.0, log=True, eps=eps, main_eps=main_eps)
 
 
@@ -48,12 +48,12 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: Eps
     """Use constant weights, chosen by hand.
 
     Args:
-        weights: One number for all auxiliary losses, or a number for each by its name.
-        log: True if logarithms of the losses are learned.
+        weights: One weight for all auxiliary losses, or a weight for each by name.
+        log: Whether to minimise the logarithms of the losses.
         eps, main_eps: See `Weighting`.
 
     Raises:
-        RequestError: A weight is not finite; from ``init``: there is none for a loss, or no loss for a weight.
+        RequestError: A weight is not finite; from ``init``: a loss has no weight, or a weight has no loss.
     """
     for weight in weights.values() if isinstance(weights, Mapping) else [weights]:
         if not math.isfinite(weight):
@@ -68,10 +68,9 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
     the sign matters, so no norm is needed, and logarithms do not change the weights.
 
     Args:
-        log: True if logarithms of the losses are learned.
+        log: Whether to minimise the logarithms of the losses.
         eps, main_eps: See `Weighting`.
-        heads: See `Weighting`; always in the thesis, so that a loss that is kept out of the shared parameters goes on being
-            learned.
+        heads: See `Weighting`; always in the thesis, so that the head of a loss with weight 0 continues to be trained.
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
@@ -82,7 +81,7 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
         slopes = weighting.slopes(losses)
         dots = {name: slopes[MAIN] * slopes[name] * statistics[name] for name in state.weights if name != MAIN}
         one = state.weights[MAIN]
-        # The sign is that of the dot itself: slopes are positive, but might make a small one vanish.
+        # Use the sign of the dot product itself: slopes are positive, but a small product might underflow.
         weights = {MAIN: one} | {name: jnp.where(statistics[name] >= 0.0, one, 0.0 * one) for name in dots}
         return weights, state.replace(weights=weights, updates=state.updates + 1), report(weights, dots)
 

@@ -1,8 +1,8 @@
-"""Weightings that give a direction in the shared parameters in place of weights, and need whole gradients.
+"""Weightings that return a direction in the shared parameters instead of weights, and need whole gradients.
 
-They keep or mask gradients, so that their step is no weighted sum of the current ones. All losses are alike to them. Memory and
-time grow with K times the shared parameters; all other parameters follow the plain sum, or that of logarithms
-(`Direction.weights`).
+They accumulate or mask gradients, so that their step is not a weighted sum of the current ones. All losses are treated alike.
+Memory and time grow with K times the shared parameters; all other parameters are trained on the plain sum of the losses, or
+that of their logarithms (``heads`` is always).
 """
 
 from collections.abc import Iterable, Mapping
@@ -38,15 +38,15 @@ Result = tuple[Direction, WeightingState, Metrics]
 
 
 def graddrop(leak: float = 0.0, seed: int = 0) -> Weighting:
-    """Keep, in each parameter, the gradients of one sign (GradDrop; Chen et al., 2020, "Just Pick a Sign", algorithm 1).
+    """Keep only gradients of one sign in each parameter (GradDrop; Chen et al., 2020, "Just Pick a Sign", algorithm 1).
 
-    The positive ones with probability P = (1 + sum_i g_i / sum_i |g_i|) / 2, otherwise the negative ones. The paper masks
-    gradients of a layer's activations, with f = identity; this, like others, those of the parameters. Noise that vanishes where
-    losses agree.
+    Positive gradients are kept with probability P = (1 + sum_i g_i / sum_i |g_i|) / 2, otherwise negative ones. The paper masks
+    gradients of a layer's activations, with f = identity; this function, like other implementations, those of the parameters.
+    The noise vanishes where losses agree.
 
     Args:
-        leak: Share of each gradient that is kept whatever its sign.
-        seed: Of the key that the state begins with; replace ``state.key`` where several states should draw apart.
+        leak: Fraction of each gradient that is kept regardless of its sign.
+        seed: Seed of the initial key; replace ``state.key`` to make several states sample independently.
 
     Raises:
         RequestError: ``leak`` is not between 0 and 1.
@@ -73,9 +73,9 @@ def graddrop_direction(gradients: Mapping[str, Params], drawn: Params, leak: flo
     """Compute the direction of `graddrop`: a tree like each gradient.
 
     Args:
-        gradients: Trees of one structure, by name.
-        drawn: A tree like each of them, of uniform numbers between 0 and 1.
-        leak: As of `graddrop`.
+        gradients: Trees of the same structure, by name.
+        drawn: Tree of the same structure, samples of the uniform distribution on [0, 1).
+        leak: See `graddrop`.
     """
 
     def masked(drawn: jax.Array, *leaves: jax.Array) -> jax.Array:
@@ -89,15 +89,15 @@ def graddrop_direction(gradients: Mapping[str, Params], drawn: Params, leak: flo
 
 
 def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: float = 1e-8) -> Weighting:
-    """Balance losses by logarithms, and their averaged gradients by length (DB-MTL; Lin et al., 2023, "Dual-Balancing").
+    """Balance losses by logarithms, and their averaged gradients by norm (DB-MTL; Lin et al., 2023, "Dual-Balancing").
 
-    Each gradient of log(L_i + eps) is averaged over steps, m_i <- g_i + (beta / t^sigma) (m_i - g_i), at first 0; the direction
-    is the sum of all m_i, brought to the length of the longest. For losses of any units. Where one is close to its minimum, its
-    noise is brought to that length, too.
+    Each gradient of log(L_i + eps) is averaged over steps, m_i <- g_i + (beta / t^sigma) (m_i - g_i), initially 0; the
+    direction is the sum of all m_i, each rescaled to the norm of the longest. Suited to losses of any units. The noise of a
+    loss close to its minimum is amplified to that norm as well.
 
     Args:
-        beta: Share of the past in the averages.
-        sigma: Decay of that share.
+        beta: Decay rate of the moving averages.
+        sigma: Exponent of the decrease of that rate with the step t.
         eps, main_eps: See `Weighting`.
 
     Raises:
@@ -131,17 +131,17 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
 
 
 def moco(beta: float = 0.5, gamma: float = 0.1, sigma: float = 0.5, rho: float = 0.0) -> Weighting:
-    """Descend towards the hull's shortest vector, of tracked gradients (MoCo; Fernando et al., 2023, algorithm 1).
+    """Approach the minimum-norm vector in the hull of tracked gradients (MoCo; Fernando et al., 2023, algorithm 1).
 
-    Tracks y_i <- y_i - beta_t (y_i - g_i), at first 0, then moves weights l <- P(l - gamma_t (Y^T Y + rho I) l), P the
-    projection onto the simplex, at first 1 / K; the direction is Y l. MGDA for noisy gradients: its weights are those of a
-    minibatch, with a bias that does not vanish, and these are not.
+    Tracks gradients by y_i <- y_i - beta_t (y_i - g_i), initially 0, then updates weights by
+    l <- P(l - gamma_t (Y^T Y + rho I) l), initially 1 / K, where P is the projection onto the simplex; the direction is Y l.
+    MGDA for noisy gradients: MGDA computes weights from a single minibatch, with a bias that does not vanish; this avoids it.
 
     Args:
-        beta: Step size of y, at first; it falls with t^-sigma.
-        gamma: Step size of l, at first; it falls likewise.
-        sigma: Of both.
-        rho: Pull of l towards equal weights.
+        beta: Initial step size of y; decreases as t^-sigma.
+        gamma: Initial step size of l; decreases as t^-sigma.
+        sigma: Exponent of both decreases.
+        rho: Strength of the regularisation of l towards equal weights.
 
     Raises:
         RequestError: ``beta`` is not between 0 and 1.

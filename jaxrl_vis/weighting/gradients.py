@@ -1,18 +1,20 @@
 """Gradients of several losses, the statistics that weightings need, and the weighted sum.
 
-`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It finds gradients in one of two ways, which
-agree up to rounding:
+`weighted_grad` is to a dictionary of losses what `jax.grad` is to a single one. It computes gradients by one of two methods,
+which agree up to rounding:
 
     per_loss   one `jax.grad` for each loss: the reference, and the default                    losses, dots, gramian, gradients
-    latents    where losses read the shared parameters through latents z alone: each loss is
-               differentiated down to z, g_i, and only the main loss and the weighted sum
-               farther; <grad L_main, grad L_i> = <J grad L_main, g_i>, where J grad L_main
-               is the tangent of z (`latents`)                                                 losses, dots, gramian
+    latents    if losses read the shared parameters only through latents z: each loss is
+               differentiated with respect to z, giving g_i, and only the main loss and
+               the weighted sum with respect to the shared parameters;
+               <grad L_main, grad L_i> = <J grad L_main, g_i>, where J grad L_main is the
+               tangent of z (`latents`)                                                        losses, dots, gramian
 
-The `Weighting.needs` that each can serve are on the right. For dots, the second passes through the shared parameters as often
-for ten losses as for two. For a Gramian it passes once back and once forth for each loss, one after the other, so that no [K,
-parameters] Jacobian is kept. It differentiates no head forwards. What is differentiated forwards must have tangent rules, which
-operations of `jax.custom_vjp` lack: ``forwards`` may be a context in which it is traced without those.
+The values of `Weighting.needs` that each supports are on the right. For dots, the second method makes as many passes through
+the shared parameters for ten losses as for two. For a Gramian it makes one backward and one forward-mode pass per loss, one
+after the other, so that no [K, parameters] Jacobian is stored. Heads are never differentiated in forward mode. Operations that
+are differentiated in forward mode need tangent rules, which `jax.custom_vjp` lacks: ``forwards`` may be a context in which such
+operations are replaced during tracing.
 """
 
 import contextlib
@@ -50,12 +52,12 @@ class Weighted(NamedTuple):
     """Result of `weighted_grad`.
 
     Attributes:
-        gradient: For the optimiser: the weighted sum of all gradients, shaped like the parameters, float32.
+        gradient: Weighted sum of all gradients for the optimiser, shaped like the parameters, float32.
         state: State of the weighting after this step.
         losses: [] float32 by name.
         metrics: [] float32 by name.
-        weights: Weight of each loss in ``gradient``, [] float32 by name; of a `Direction`, those of all other parameters.
-        extra: Further result of the losses' function; None without ``has_aux``.
+        weights: [] float32 by name, weight of each loss in ``gradient``; with a `Direction`, for parameters not shared.
+        extra: Auxiliary output of the loss function; None without ``has_aux``.
     """
 
     gradient: Params
@@ -78,15 +80,15 @@ def loss_gradients(
 
     Args:
         losses_fn: (params, *args) -> [] floats by name; with ``has_aux``, followed by any auxiliary output.
-        params: The parameters to differentiate by.
-        args: More arguments.
+        params: Parameters with respect to which the losses are differentiated.
+        args: Further arguments of ``losses_fn``.
         has_aux: See ``losses_fn``.
 
     Returns:
-        Losses, [] float32 by name; gradients by name, each shaped like the parameters, float32; what else there was.
+        Losses, [] float32 by name; gradients by name, each shaped like the parameters, float32; auxiliary output or None.
 
     Raises:
-        RequestError: ``losses_fn`` does not return a dictionary of numbers.
+        RequestError: ``losses_fn`` does not return a dictionary of scalars.
     """
 
     def compute(params: Params) -> tuple[dict[str, jax.Array], Any]:
@@ -102,9 +104,9 @@ def measure(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params
     """Compute the ``statistics`` that `Weighting.update` takes, from each loss's own gradient.
 
     Args:
-        weighting: Reads them.
+        weighting: Weighting whose ``needs`` determines the kind of statistics.
         losses: [] float32 by name.
-        gradients: Their gradients with respect to the shared parameters alone.
+        gradients: Gradients of the losses with respect to the shared parameters alone, by name.
     """
     if weighting.needs == "losses":
         return None
@@ -119,7 +121,7 @@ def gramian(gradients: Mapping[str, Params]) -> jax.Array:
     """Compute the inner products of all pairs of gradients: [K, K] float32 or wider, in the sorted order of the names.
 
     Args:
-        gradients: Trees of one structure, by name.
+        gradients: Trees of the same structure, by name.
     """
 
     def products(*leaves: jax.Array) -> jax.Array:
@@ -146,27 +148,27 @@ def weighted_grad(
 
     Args:
         losses_fn: (params, *args) -> [] floats by name, of which one is called `MAIN` if the weighting has a main loss; with
-            ``has_aux``, followed by any auxiliary output. A gradient is taken for each loss as a whole, heads and shared
-            parameters alike. With ``encode``: (params, latents, *args).
-        weighting: From `make_weighting`.
-        shared: Selects the parameters in which gradients are compared, for instance ``lambda params: params["encoder"]``. It
-            may only pick: what it returns must be parts of its argument.
-        way: Method of the gradients, see above.
+            ``has_aux``, followed by any auxiliary output. Each loss is differentiated with respect to all parameters, those of
+            heads and shared ones. With ``encode``: (params, latents, *args).
+        weighting: Weighting, such as from `make_weighting`.
+        shared: Function that selects the parameters in which gradients are compared, for instance
+            ``lambda params: params["encoder"]``. It must return parts of its argument unmodified.
+        way: Method of computing gradients, see the module docstring.
         has_aux: See ``losses_fn``.
-        reduce: Applied to losses, gradients and dots before the weighting reads them, where each device has its own part of
-            the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``. Inside `jax.shard_map` that needs
-            ``check_vma=False``, or gradients by what all devices share would be summed up before.
+        reduce: Function applied to losses, gradients and dots before the weighting reads them, for use if each device has its
+            own part of the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``. Inside `jax.shard_map`
+            this needs ``check_vma=False``; otherwise, gradients with respect to replicated parameters are already summed.
         forwards: Factory of the context for tracing forward-mode differentiation.
-        encode: (what ``shared`` selects, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters
-            through these alone. Way latents needs it; the other takes it, too. Or a dictionary of such functions, where latents
-            are a dictionary of the same names: gradients then pass only through those that a loss reads.
+        encode: (shared parameters, *args) -> latents, any tree of arrays. ``losses_fn`` must read the shared parameters only
+            through these. Required by the method latents, optional with per_loss. Or a dictionary of such functions; latents
+            are then a dictionary with the same keys, and gradients pass only through those that a loss reads.
 
     Returns:
         (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``.
 
     Raises:
-        RequestError: There is no such way, or it does not find what the weighting needs; from the function returned: what
-            ``losses_fn`` returns is no dictionary of numbers, or the losses are not those that the state began with.
+        RequestError: The method is unknown, or does not support the weighting; from the returned function: ``losses_fn`` does
+            not return a dictionary of scalars, or the losses are not those with which the state was initialised.
     """
     if way not in get_args(Way):
         raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
@@ -205,7 +207,7 @@ def weighted_grad(
     def find_by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
         assert encode is not None
         through = latents.encode(encode, shared(params), *args)
-        # The losses are traced here, to see which latents and parameters each of them reads.
+        # Trace the losses to find which latents and parameters each of them reads.
         program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
         differentiated = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
         check_names(differentiated.losses, state)
@@ -221,14 +223,14 @@ def weighted_grad(
             with forwards():
                 statistics = reduce(through.gramian(differentiated.at_latents, reduce))
         step, state, metrics = weighting.update(losses, statistics, state)
-        assert not isinstance(step, Direction)  # only those that need whole gradients give one
+        assert not isinstance(step, Direction)  # only weightings that need whole gradients return one
         weights = step
         coefficients = weighting.coefficients(weights, losses)
         rest = coefficients
         if of_main is not None:
             rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
         added = through.backward(differentiated.at_latents, rest)
-        if of_main is not None:  # the main loss's own is known already, and gradients add up
+        if of_main is not None:  # add the main loss's gradient, which is known already
             added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
         in_heads = differentiated.combined(params, weighting.coefficients(weighting.head_weights(weights), losses))
         combined = jax.tree.map(jnp.add, in_heads, _embed(shared, params, added))
@@ -238,7 +240,7 @@ def weighted_grad(
 
 
 def _replaced(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
-    """Take the shared parameters from one tree like the parameters, and all others from another."""
+    """Merge two trees like the parameters: shared parameters from ``inside``, all others from ``outside``."""
     is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(outside)))
     return jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, inside, outside)
 
@@ -248,5 +250,5 @@ def _embed(shared: Selector, params: Params, part: Params) -> Params:
     dtype = jnp.result_type(jnp.float32, *jax.tree.leaves(part))
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype), params)
     part = jax.tree.map(lambda leaf: leaf.astype(dtype), part)
-    (placed,) = jax.linear_transpose(shared, shapes)(part)  # of a function that only picks, the transpose puts back
+    (placed,) = jax.linear_transpose(shared, shapes)(part)  # the transpose of a selection inserts its parts
     return placed

@@ -1,8 +1,9 @@
-"""Weightings that need the inner products of all pairs of gradients, the Gramian [K, K]. All losses are alike to them.
+"""Weightings that need the inner products of all pairs of gradients, the Gramian [K, K]. All losses are treated alike.
 
-Their cost is that of the Gramian, K gradients or K passes back and forth through latents, and of a small problem over the
-losses (`solvers`). They change neither with the order of the losses nor with an orthogonal change of the parameters. `mgda`,
-`upgrad` and `dualproj`, and with more than the least radius `cagrad`, give directions that oppose no gradient.
+Their cost is that of the Gramian (K gradients, or K backward and forward-mode passes through latents) and of a small
+optimisation problem over the losses (`solvers`). They are invariant to the order of the losses and to orthogonal
+transformations of the parameters. `mgda`, `upgrad` and `dualproj`, and `cagrad` with a sufficiently large radius, give
+directions that oppose no gradient.
 """
 
 from collections.abc import Callable, Iterable
@@ -35,8 +36,8 @@ class Options(TypedDict, total=False):
     """Options of all weightings that need a Gramian.
 
     Attributes:
-        log: True if logarithms of the losses are learned and compared, which makes the result independent of their units.
-        eps, main_eps, heads: See `Weighting`. ``heads`` is always if not given: weights apply to the shared parameters alone.
+        log: Whether logarithms of the losses are minimised and compared, which makes the result independent of their units.
+        eps, main_eps, heads: See `Weighting`. Default of ``heads`` is always: weights apply to the shared parameters alone.
     """
 
     log: bool
@@ -58,13 +59,13 @@ def of_gramian(
     """Build a weighting from a function of the Gramian.
 
     Args:
-        label: Its name.
-        solve: (Gramian [K, K] of what is learned, state) -> (weights [K], memory). With ``seed``, it may draw from
-            ``state.key``, folded with ``state.updates``.
-        log: True if logarithms of the losses are learned and compared, which makes the result independent of their units.
+        label: Name of the weighting.
+        solve: (Gramian [K, K] of the losses or, with ``log``, of their logarithms; state) -> (weights [K], new memory). With
+            ``seed``, it may sample with ``state.key``, folded with ``state.updates``.
+        log: Whether logarithms of the losses are minimised and compared, which makes the result independent of their units.
         eps, main_eps, heads: See `Weighting`.
-        memory: (K, dtype) -> what is remembered at first; None for nothing.
-        seed: Of the key that the state begins with; None for none.
+        memory: (K, dtype) -> initial memory; None if there is none.
+        seed: Seed of the initial key; None for no key.
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
@@ -97,16 +98,16 @@ def of_gramian(
 
 
 def _plain(weights: Callable[[jax.Array], jax.Array]) -> Solve:
-    """Return a solver without a memory."""
+    """Build a solver without memory."""
     return lambda gramian, state: (weights(gramian), None)
 
 
 def mgda(**options: Unpack[Options]) -> Weighting:
-    """Take the shortest vector in the convex hull of the gradients (MGDA; Desideri, 2012; Sener and Koltun, 2018, eq. 3).
+    """Use the minimum-norm vector in the convex hull of the gradients (MGDA; Desideri, 2012; Sener and Koltun, 2018, eq. 3).
 
-    Weights minimise |sum_i w_i g_i|, w in the simplex: where no loss can fall without another's rising, the step is 0;
-    elsewhere all fall, to first order at one rate or faster. Small gradients weigh most, so that it slows down near any single
-    minimum. For fronts that are to be reached rather than one optimum.
+    Weights minimise |sum_i w_i g_i|, w in the simplex. If no loss can decrease without another increasing, the step is 0;
+    otherwise all decrease, to first order at a common rate or faster. Small gradients get the largest weights, so that progress
+    is slow near the minimum of any single loss. Suited to reaching a Pareto front rather than one optimum.
 
     Args:
         options: See `Options`.
@@ -117,9 +118,9 @@ def mgda(**options: Unpack[Options]) -> Weighting:
 def upgrad(**options: Unpack[Options]) -> Weighting:
     """Project each gradient onto the cone that opposes none, and average (UPGrad; Quinton and Rey, 2024, "Jacobian Descent").
 
-    K projections onto the dual cone, {d: <g_i, d> >= 0 for all i}. Opposes no gradient, grows linearly with each gradient's
-    length, and is a combination of the gradients: the paper shows that no other known method has all three. A first choice
-    where gradients conflict.
+    K projections onto the dual cone, {d: <g_i, d> >= 0 for all i}. The result opposes no gradient, scales linearly with each
+    gradient's norm, and is a combination of the gradients: the paper shows that no other known method has all three properties.
+    A good first choice for conflicting gradients.
 
     Args:
         options: See `Options`.
@@ -135,8 +136,8 @@ def upgrad(**options: Unpack[Options]) -> Weighting:
 def dualproj(**options: Unpack[Options]) -> Weighting:
     """Project the mean gradient onto the cone that opposes none (DualProj; Lopez-Paz and Ranzato, 2017, eq. 11).
 
-    The direction nearest to the mean gradient, among those that let no loss rise to first order. Cheaper than `upgrad`, but
-    large gradients decide.
+    The direction closest to the mean gradient among those in which no loss increases to first order. Cheaper than `upgrad`, but
+    dominated by large gradients.
 
     Args:
         options: See `Options`.
@@ -151,9 +152,9 @@ def dualproj(**options: Unpack[Options]) -> Weighting:
 def cagrad(radius: float = 0.5, **options: Unpack[Options]) -> Weighting:
     """Improve the worst loss within a ball around the mean gradient (CAGrad; Liu et al., 2021, algorithm 1).
 
-    The direction d of greatest min_i <g_i, d> with |d - g_0| <= c |g_0|, g_0 the mean: g_0 + c |g_0| g_w / |g_w|, where w in
-    the simplex minimises <g_w, g_0> + c |g_0| |g_w|. c = 0 is the mean; for c < 1 it converges to a minimum of the mean loss.
-    For those who want that, and the worst loss to fall on the way.
+    The direction d that maximises min_i <g_i, d> subject to |d - g_0| <= c |g_0|, g_0 the mean: g_0 + c |g_0| g_w / |g_w|,
+    where w in the simplex minimises <g_w, g_0> + c |g_0| |g_w|. c = 0 gives the mean; for c < 1 it converges to a minimum of
+    the mean loss, while improving the worst loss on the way.
 
     Args:
         radius: c.
@@ -172,7 +173,7 @@ def cagrad(radius: float = 0.5, **options: Unpack[Options]) -> Weighting:
         inside, length = solvers.conflict_averse(gramian, radius)
         greatest = jnp.max(jnp.diagonal(gramian))
         of_mean = jnp.sqrt(jnp.maximum(solvers.quadratic(gramian, mean) / jnp.where(greatest > 0.0, greatest, 1.0), 0.0))
-        # Where the hull holds 0, no direction helps all: the paper's step is undefined there, and this one rests.
+        # If the hull contains 0, no direction helps all losses: the paper's step is undefined; return 0 instead.
         is_some = length > 10.0 * jnp.finfo(gramian.dtype).eps ** 0.5
         return jnp.where(is_some, mean + radius * of_mean / jnp.where(is_some, length, 1.0) * inside, 0.0)
 
@@ -180,12 +181,12 @@ def cagrad(radius: float = 0.5, **options: Unpack[Options]) -> Weighting:
 
 
 def imtl_g(**options: Unpack[Options]) -> Weighting:
-    """Give the step the same projection on all gradients (IMTL-G; Liu et al., 2021; for dependent gradients Quinton and
+    """Find the step with equal projections onto all gradients (IMTL-G; Liu et al., 2021; for dependent gradients Quinton and
     Rey, 2024).
 
-    Weights are G^+ d / sum(G^+ d), d_i = |g_i|: they sum to 1 and may be negative. No gradient is favoured for its length or
-    for the company it keeps. Closed form. Where gradients are opposed, as on the Pareto front, the pseudo-inverse jumps, and
-    the step with it.
+    Weights are G^+ d / sum(G^+ d), d_i = |g_i|: they sum to 1 and may be negative. No gradient is favoured for its norm or its
+    similarity to others. Closed form. For opposed gradients, as on the Pareto front, the pseudo-inverse is discontinuous, and
+    so is the step.
 
     Args:
         options: See `Options`.
@@ -205,14 +206,14 @@ def imtl_g(**options: Unpack[Options]) -> Weighting:
 
 
 def nash_mtl(max_norm: float | None = None, **options: Unpack[Options]) -> Weighting:
-    """Take the step that losses would agree on as players of a bargaining game (Nash-MTL; Navon et al., 2022, algorithm 1).
+    """Use the Nash bargaining solution with the losses as players (Nash-MTL; Navon et al., 2022, algorithm 1).
 
-    Weights solve G a = 1 / a, a > 0: the projection of the step on each gradient is in inverse proportion to its weight, and
-    the result does not depend on the losses' units. The step's length is sqrt(K), however small the gradients, so let the
-    learning rate fall. The paper approximates this by a sequence of convex programmes; here it is solved, by Newton's method.
+    Weights solve G a = 1 / a, a > 0: the inner product of the step with each gradient is the inverse of its weight, and the
+    result does not depend on the losses' units. The norm of the step is sqrt(K), no matter how small the gradients, so decay
+    the learning rate. The paper approximates the solution by a sequence of convex programmes; here Newton's method computes it.
 
     Args:
-        max_norm: Greatest length of the step, as in the authors' code, where it is 1; None as in the paper.
+        max_norm: Maximum norm of the step, 1 in the authors' code; None for no maximum, as in the paper.
         options: See `Options`.
 
     Raises:
@@ -235,10 +236,10 @@ def fairgrad(alpha: float = 2.0, **options: Unpack[Options]) -> Weighting:
     """Share the decrease fairly among the losses (FairGrad; Ban and Ji, 2024, eq. 4).
 
     Weights solve G w = w^(-1/alpha): the step maximises the sum of <g_i, d>^(1 - alpha) / (1 - alpha). Alpha = 1 is `nash_mtl`;
-    towards infinity the least decrease counts, as with `mgda`.
+    in the limit of infinity only the smallest decrease counts, as with `mgda`.
 
     Args:
-        alpha: Kind of fairness.
+        alpha: Exponent of alpha-fairness, positive.
         options: See `Options`.
 
     Raises:
@@ -254,11 +255,11 @@ def fairgrad(alpha: float = 2.0, **options: Unpack[Options]) -> Weighting:
 
 
 def aligned_mtl(**options: Unpack[Options]) -> Weighting:
-    """Make the gradients orthogonal and equally long, as little as that takes (Aligned-MTL; Senushkin et al., 2023).
+    """Make the gradients orthogonal and of equal norm with the smallest change (Aligned-MTL; Senushkin et al., 2023).
 
-    With eigenvalues l and eigenvectors V of the Gramian, weights are sqrt(l_min) V l^(-1/2) V^T / K, over the eigenvalues that
-    are not 0: principal components of all gradients get the length of the smallest, so that the step is stable (algorithm 1).
-    Closed form. Steps are as short as the smallest component.
+    With eigenvalues l and eigenvectors V of the Gramian, weights are the row means of sqrt(l_min) V l^(-1/2) V^T, over the
+    nonzero eigenvalues: all principal components of the gradients are rescaled to the norm of the smallest, which makes the
+    step stable (algorithm 1). Closed form. Steps are as short as the smallest component.
 
     Args:
         options: See `Options`.
@@ -279,10 +280,10 @@ def aligned_mtl(**options: Unpack[Options]) -> Weighting:
 
 
 def config(**options: Unpack[Options]) -> Weighting:
-    """Take the direction of equal cosines with all gradients (ConFIG; Liu et al., 2024, eq. 2).
+    """Use the direction with equal cosines to all gradients (ConFIG; Liu et al., 2024, eq. 2).
 
-    With U the gradients at unit length, the direction is U^+ 1, and its length the sum of the gradients' projections on it.
-    Where gradients are independent it opposes none. Closed form, made for the losses of physics-informed networks.
+    With U the gradients at unit norm, the direction is U^+ 1, and its norm the sum of the gradients' projections onto it. For
+    linearly independent gradients it opposes none. Closed form, designed for the losses of physics-informed networks.
 
     Args:
         options: See `Options`.
@@ -295,7 +296,7 @@ def config(**options: Unpack[Options]) -> Weighting:
         of_unit = jnp.sum(solvers.pseudo_inverse(unit, rounding=16.0), axis=1)
         raw = inverse * of_unit
         squared = solvers.quadratic(gramian, raw)
-        # Of length 1 / sqrt(K) or more, unless no direction has any cosine in common: then the step is 0.
+        # The norm of U^+ 1 is at least 1 / sqrt(K), unless no direction has equal cosines: then the step is 0.
         is_some = solvers.quadratic(unit, of_unit) > 10.0 * len(gramian) * jnp.finfo(gramian.dtype).eps
         projections = jnp.sum(jnp.dot(gramian, raw, precision=jax.lax.Precision.HIGHEST))
         return jnp.where(is_some, projections / jnp.where(is_some, squared, 1.0), 0.0) * raw

@@ -1,10 +1,10 @@
-"""Gradients of losses that read the shared parameters through latents alone (`gradients`, way latents).
+"""Gradients of losses that read the shared parameters only through latents (method latents of `gradients`).
 
-    encode          latents of every group, and the way back through each
-    differentiate   each loss down to what it reads of the parameters and of the latents
+    encode          latents of every group, with their pullbacks
+    differentiate   gradient of each loss with respect to the parameters and latents that it reads
 
 The inputs of a loss are found by tracing it, so that nothing is computed for others: a gradient passes only through those
-groups of latents that it is not zero in, and a head's gradient is not added to the zeros of all other losses.
+groups of latents where it can be nonzero, and a head's gradient is not added to zeros from all other losses.
 """
 
 import dataclasses
@@ -18,14 +18,14 @@ from jax.extend.core import Literal
 from jaxrl_vis.types import Params
 from jaxrl_vis.weighting.base import MAIN, dot, loss_order, split_result, to_float32, weighted_sum
 
-_ALL = "all"  # the group of latents that were not given names
+_ALL = "all"  # group of latents without names
 
 AtLatents = Mapping[str, Mapping[str, Any]]
-"""Loss -> group of latents that it reads -> its gradient there."""
+"""Gradients with respect to latents, by loss and by group of latents that it reads."""
 
 
 def like(tree: Params, other: Params) -> Params:
-    """Cast a tree to the dtypes of another."""
+    """Cast the leaves of a tree to the dtypes of another."""
     return jax.tree.map(lambda leaf, model: leaf.astype(model.dtype), tree, other)
 
 
@@ -34,11 +34,11 @@ class Through:
     """Latents, and their linearisations with respect to the shared parameters.
 
     Attributes:
-        latents: By group.
-        pullbacks: By group: of a gradient there, the gradient in the shared parameters.
-        functions: By group: the shared parameters -> its latents.
-        picked: The shared parameters.
-        has_names: True if losses take a dictionary of groups rather than a single one.
+        latents: Latents by group.
+        pullbacks: By group, function from a gradient in its latents to the gradient in the shared parameters.
+        functions: By group, function from the shared parameters to its latents.
+        picked: Shared parameters.
+        has_names: Whether losses take a dictionary of groups rather than a single one.
     """
 
     latents: dict[str, Any]
@@ -63,7 +63,7 @@ class Through:
         return total
 
     def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
-        """Compute the inner product of each loss's gradient and a direction in the shared parameters, [] float32."""
+        """Compute the inner products of the losses' gradients with a direction in the shared parameters, [] float32 by name."""
         along, read = like(direction, self.picked), {group for at in at_latents.values() for group in at}
         tangents = {
             group: jax.jvp(encode, (self.picked,), (along,))[1] for group, encode in self.functions.items() if group in read
@@ -76,12 +76,12 @@ class Through:
     def gramian(self, at_latents: AtLatents, reduce: Callable[[Any], Any]) -> jax.Array:
         """Compute the inner products of all pairs of losses' gradients in the shared parameters.
 
-        With a_i the gradient of loss i at the latents and J their Jacobian, G_ij = <a_i, J J^T a_j>: for each loss one pass
-        back, J^T a_j, and one forth. Only one such gradient is kept at a time.
+        With a_i the gradient of loss i at the latents and J their Jacobian, G_ij = <a_i, J J^T a_j>: for each loss one backward
+        pass, J^T a_j, and one forward-mode pass. Only one such gradient is kept in memory at a time.
 
         Args:
-            at_latents: Of all losses.
-            reduce: Applied to each J^T a_j, as in `gradients.weighted_grad`; the result is left to be reduced.
+            at_latents: Gradients of all losses with respect to the latents.
+            reduce: Function applied to each J^T a_j, as in `gradients.weighted_grad`; the result itself is not reduced.
 
         Returns:
             [K, K] float32 or wider, in the sorted order of the names.
@@ -90,7 +90,7 @@ class Through:
         for name in names:
             dots = self.dots(reduce(self.backward(at_latents, {name: jnp.ones(())})), at_latents)
             rows.append(jnp.stack([dots[other] for other in names]))
-            # Ties the next loss's passes to the end of this one's, or a compiler may begin all of them at once.
+            # Make the next loss's passes depend on this one's; the compiler may otherwise run all of them at once.
             at_latents, rows[-1] = jax.lax.optimization_barrier((at_latents, rows[-1]))
         matrix = jnp.stack(rows)
         return 0.5 * (matrix + matrix.T)
@@ -112,9 +112,9 @@ class Differentiated:
 
     Attributes:
         losses: [] float32 by name.
-        of_params: Loss -> place among the parameters' leaves -> gradient.
+        of_params: Gradients by loss and by index of the parameters' leaf.
         at_latents: See `AtLatents`.
-        extra: Further result of the losses' function.
+        extra: Auxiliary output of the loss function; None if it has none.
     """
 
     losses: dict[str, jax.Array]
@@ -142,10 +142,10 @@ def differentiate(
     Args:
         losses_fn: (params, latents, *args) -> [] floats by name; with ``has_aux``, followed by any auxiliary output.
         has_aux: See ``losses_fn``.
-        through: From `encode`.
-        traced: `jax.make_jaxpr` of ``losses_fn``, with the shapes of what it returns.
-        params: The parameters.
-        args: More arguments.
+        through: Result of `encode`.
+        traced: Result of `jax.make_jaxpr` for ``losses_fn``, with the shapes that it returns.
+        params: All parameters.
+        args: Further arguments of ``losses_fn``.
     """
     leaves, structure = jax.tree.flatten(params)
     program, results = traced
@@ -160,7 +160,7 @@ def differentiate(
             by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
             return to_float32(jnp.asarray(by_name[name])), extra
 
-        # Each by itself, so that a compiler finds what the others compute in it to be of no use.
+        # Differentiate each loss separately, so that the compiler can remove the computation of all others as dead code.
         chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
         losses[name], pullback, beside = jax.vjp(one, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
@@ -171,14 +171,15 @@ def differentiate(
 def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, through: Through) -> dict[str, Any]:
     """Find where each loss can have a nonzero gradient: indices of the parameters' leaves, and groups of latents.
 
-    Within a nested program every result counts as reading every argument: so rather too much is found than too little.
+    Within a nested program, every result is assumed to depend on every argument, so the result may include too many places,
+    but never too few.
     """
     variables = program.jaxpr.invars
     of_leaf, rest = variables[:num_leaves], iter(variables[num_leaves:])
     # Leaves of a dictionary come in the order of its sorted keys.
     of_group = {group: [next(rest) for _ in jax.tree.leaves(through.latents[group])] for group in sorted(through.latents)}
     reads = {}
-    for name, result in zip(sorted(losses), program.jaxpr.outvars):  # followed by what comes beside the losses
+    for name, result in zip(sorted(losses), program.jaxpr.outvars):  # followed by the auxiliary outputs
         needed = set() if isinstance(result, Literal) else {result}
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):

@@ -1,4 +1,4 @@
-"""Weightings that need the Gramian and learn, by Adam: GradNorm's weights, and AuxiNash's preferences."""
+"""Weightings that need the Gramian and learn parameters by Adam: the weights of GradNorm, the preferences of AuxiNash."""
 
 from collections.abc import Iterable
 from typing import Any, Unpack
@@ -25,20 +25,20 @@ from jaxrl_vis.weighting.base import (
 )
 from jaxrl_vis.weighting.gramian_based import Options, of_gramian
 
-_LEAST_SHARE = 1e-4  # of the mean weight, below which GradNorm lets none fall: its rule may overshoot 0
+_LEAST_SHARE = 1e-4  # minimum weight of GradNorm before rescaling to mean 1: its rule may overshoot 0
 
 
 def gradnorm(alpha: float = 1.5, learning_rate: float = 0.025, heads: Heads = "weighted") -> Weighting:
-    """Learn weights that bring weighted gradients to one length, longer for losses that lag (GradNorm; Chen et al., 2018).
+    """Learn weights that equalise the norms of weighted gradients, but favour losses that lag (GradNorm; Chen et al., 2018).
 
-    With r_i = L_i / L_i(0) over its mean, weights w follow the gradient of sum_i | w_i |g_i| - mean_j(w_j |g_j|) r_i^alpha |,
-    the mean and r held constant (eq. 2), and are then scaled to the sum K. A step uses the weights from before. Needs the
-    lengths of the gradients, in the paper those in the last shared layer: choose ``shared`` so to save time. All losses are
-    alike.
+    With r_i = L_i / L_i(0) divided by its mean, Adam minimises sum_i | w_i |g_i| - mean_j(w_j |g_j|) r_i^alpha | with respect
+    to w, the mean and r held constant (eq. 2); w is then scaled to the sum K. A step uses the weights from before its own
+    gradients. Needs the norms of the gradients; the paper uses those in the last shared layer, and selecting it by ``shared``
+    saves time. All losses are treated alike.
 
     Args:
-        alpha: Strength of the pull on losses that lag; 0 for equal lengths.
-        learning_rate: Of Adam for w.
+        alpha: Strength with which lagging losses are favoured; 0 for equal norms.
+        learning_rate: Learning rate of Adam for w.
         heads: See `Weighting`.
     """
     rule = optax.adam(learning_rate)
@@ -68,15 +68,15 @@ def gradnorm(alpha: float = 1.5, learning_rate: float = 0.025, heads: Heads = "w
 
 
 def auxinash(learning_rate: float = 0.01, **options: Unpack[Options]) -> Weighting:
-    """Learn how much say each loss has in the bargain, for the main one's sake (AuxiNash; Shamsian et al., 2023).
+    """Learn the losses' bargaining preferences so as to decrease the main loss (AuxiNash; Shamsian et al., 2023).
 
-    Weights solve G a = p / a : `nash_mtl` with preferences p, which sum to K. The derivative of a by p is
-    (G + diag(p / a^2))^-1 diag(1 / a). p = K softmax(l), and l follows by Adam the derivative of the main loss
-    after a step along G a. The paper differentiates a separate loss on held-out data at the optimum of the parameters; this is
+    Weights solve G a = p / a: `nash_mtl` with preferences p, which sum to K. The derivative of a with respect to p is
+    (G + diag(p / a^2))^-1 diag(1 / a). p = K softmax(l), and Adam optimises l by the derivative of the main loss after a step
+    with the weights a. The paper differentiates a separate loss on held-out data at the optimum of the parameters; this is
     its first step, on the main loss of the same minibatch, and needs no second pass. A loss must be called `MAIN`.
 
     Args:
-        learning_rate: Of Adam for l.
+        learning_rate: Learning rate of Adam for l.
         options: See `Options`.
     """
     rule = optax.adam(learning_rate)
@@ -105,13 +105,13 @@ def auxinash(learning_rate: float = 0.01, **options: Unpack[Options]) -> Weighti
 
 
 def preference_slope(gramian: jax.Array, shares: jax.Array, weights: jax.Array, main: int) -> jax.Array:
-    """Compute the main loss's derivative by the preferences of a bargain, per unit of step size and of 1 / a_main: [K].
+    """Compute the derivative of the main loss with respect to the preferences, per unit of step size and of 1 / a_main: [K].
 
     Args:
         gramian: [K, K] float.
         shares: [K] float, p.
         weights: [K] float, a, with G a = p / a.
-        main: Place of the main loss.
+        main: Index of the main loss.
     """
     scaled = weights[:, None] * gramian * weights[None, :]
     return -jnp.linalg.solve(scaled + jnp.diag(shares), scaled[main])

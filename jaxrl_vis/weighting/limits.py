@@ -1,4 +1,4 @@
-"""Weightings around another one: bounds and the sum of its weights, and cosines of the gradients among its metrics."""
+"""Wrappers of weightings that bound and rescale the weights, or add cosines between gradients to the metrics."""
 
 import math
 from typing import Any
@@ -15,19 +15,19 @@ Result = tuple[Weights | Direction, WeightingState, Metrics]
 def limited(
     weighting: Weighting, minimum: float | None = None, maximum: float | None = None, total: float | None = None
 ) -> Weighting:
-    """Bound the weights of a weighting, and give them a fixed sum.
+    """Bound the weights of a weighting, and scale them to a fixed sum.
 
-    The weights of a main loss stay at 1. What the weighting remembers is not bounded, only what it gives.
+    The weight of a main loss stays at 1. Only the returned weights are bounded, not those in the weighting's state.
 
     Args:
-        weighting: Gives weights, not a direction.
-        minimum: Least weight; None for none.
-        maximum: Greatest weight; None for none.
-        total: Sum of the weights after that, the main loss's left out if it is 1 by rule; None for theirs. Weights of sum 0
-            stay.
+        weighting: Weighting that returns weights, not a direction.
+        minimum: Minimum weight; None if unbounded.
+        maximum: Maximum weight; None if unbounded.
+        total: Sum to which the bounded weights are scaled, excluding that of a main loss that is always 1; None for no
+            scaling. Weights that sum to 0 are not scaled.
 
     Raises:
-        RequestError: The bounds make no sense; from ``update``: the weighting gives a direction.
+        RequestError: The bounds are invalid; from ``update``: the weighting returns a direction.
     """
     if minimum is not None and maximum is not None and not minimum <= maximum:
         raise RequestError(f"maximum of weighting {weighting.name} must be at least its minimum, not {maximum}")
@@ -53,11 +53,11 @@ def limited(
 def with_cosines(weighting: Weighting) -> Weighting:
     """Add cosines of the losses' gradients in the shared parameters to the metrics of a weighting.
 
-    ``cosine/least`` is the least of all pairs; ``cosine/NAME``, of each loss and the main one, if there is such a one. They
-    need the Gramian, of which the main loss's row serves a weighting that needs dots.
+    ``cosine/least`` is the minimum over all pairs; ``cosine/NAME`` that of each loss and the main one, if there is one. The
+    resulting weighting needs the Gramian; a wrapped one that needs dots gets its row of the main loss.
 
     Args:
-        weighting: One that needs no whole gradients.
+        weighting: Weighting that does not need whole gradients.
 
     Raises:
         RequestError: The weighting needs whole gradients.

@@ -1,7 +1,7 @@
-"""Weightings that read the losses' values alone, and cost no more than the plain sum. All losses are alike to them.
+"""Weightings that read only the losses' values, and cost no more than the plain sum. All losses are treated alike.
 
-`uniform` and `random` do not even read these. `geometric_mean` and `stch` follow from the values of one step; `uncertainty`,
-`imtl_l`, `dwa` and `famo` learn, and use the weights from before this step's losses.
+`uniform` and `random` do not read even these. Weights of `geometric_mean` and `stch` follow from the values of one step;
+`famo`, `uncertainty`, `imtl_l` and `dwa` are adaptive. The last three apply the weights from before the current losses.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -25,15 +25,15 @@ from jaxrl_vis.weighting.base import (
     to_vector,
 )
 
-_LARGEST = 1e6  # bound of ratios and slopes, so that no sum of squares is infinite
+_LARGEST = 1e6  # bound of ratios and slopes, so that sums of squares do not overflow
 Result = tuple[Weights | Direction, WeightingState, Metrics]
 
 
 def uniform() -> Weighting:
     """Average all losses: weights 1 / K.
 
-    Needs nothing and costs nothing. The baseline, beside `sum`: with tuned learning rates, few methods beat it (Kurin et al.,
-    2022; Xin et al., 2022).
+    Needs no statistics and costs nothing. The baseline, besides `sum`: with tuned learning rates, few methods outperform it
+    (Kurin et al., 2022; Xin et al., 2022).
     """
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
@@ -43,13 +43,13 @@ def uniform() -> Weighting:
 
 
 def random(seed: int = 0) -> Weighting:
-    """Draw weights anew at every step (RLW; Lin et al., 2022, "Reasonable Effectiveness of Random Weighting", algorithm 2).
+    """Sample new weights at every step (RLW; Lin et al., 2022, "Reasonable Effectiveness of Random Weighting", algorithm 2).
 
-    Weights are the softmax of K normal numbers, and so sum to 1. Needs nothing. A litmus test: a method that does no better
-    than this one has learned nothing about the losses.
+    Weights are the softmax of K standard normal samples, and thus sum to 1. Needs no statistics. A litmus test: a method that
+    does no better than this one has learned nothing about the losses.
 
     Args:
-        seed: Of the key that the state begins with; replace ``state.key`` where several states should draw apart.
+        seed: Seed of the initial key; replace ``state.key`` to make several states sample independently.
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
@@ -64,31 +64,31 @@ def random(seed: int = 0) -> Weighting:
 
 
 def random_weights(drawn: jax.Array) -> jax.Array:
-    """Compute the weights of `random` from K normal numbers: [K]."""
+    """Compute the weights of `random`, [K], from K standard normal samples."""
     return jax.nn.softmax(drawn)
 
 
 def uncertainty(learning_rate: float = 1e-2) -> Weighting:
-    """Weigh losses by learned variances (UW; Kendall et al., 2018, section 3.2, with s = log sigma^2).
+    """Weight losses by learned variances (UW; Kendall et al., 2018, section 3.2, with s = log sigma^2).
 
-    The objective is the sum of exp(-s_i) L_i / 2 + s_i / 2; weights are exp(-s_i) / 2, and s_i, at first 0, follows the
-    objective's gradient by Adam. At the optimum exp(s_i) = L_i, so that scaled losses are equal. For losses whose scales
-    differ, where no gradients can be spared.
+    The objective is the sum of exp(-s_i) L_i / 2 + s_i / 2; weights are exp(-s_i) / 2, and s_i, initially 0, is optimised by
+    Adam. At the optimum exp(s_i) = L_i, so that scaled losses are equal. Suited to losses of different scales, if computing a
+    gradient for each loss is too expensive.
 
     Args:
-        learning_rate: Of Adam for s. The paper leaves s to the model's own optimiser.
+        learning_rate: Learning rate of Adam for s. The paper uses the model's own optimiser for s.
     """
     return _learned("uncertainty", learning_rate, lambda s, losses: (1.0 - jnp.exp(-s) * losses) / 2, lambda s: jnp.exp(-s) / 2)
 
 
 def imtl_l(learning_rate: float = 1e-2) -> Weighting:
-    """Weigh losses by learned scales (IMTL-L; Liu et al., 2021, "Towards Impartial Multi-task Learning").
+    """Weight losses by learned scales (IMTL-L; Liu et al., 2021, "Towards Impartial Multi-task Learning").
 
-    The objective is the sum of exp(s_i) L_i - s_i; weights are exp(s_i), and s_i, at first 0, follows the objective's gradient
-    by Adam. At the optimum all scaled losses are 1: twice the weights of `uncertainty`.
+    The objective is the sum of exp(s_i) L_i - s_i; weights are exp(s_i), and s_i, initially 0, is optimised by Adam. At the
+    optimum all scaled losses are 1, and weights are twice those of `uncertainty`.
 
     Args:
-        learning_rate: Of Adam for s. The paper leaves s to the model's own optimiser.
+        learning_rate: Learning rate of Adam for s. The paper uses the model's own optimiser for s.
     """
     return _learned("imtl_l", learning_rate, lambda s, losses: jnp.exp(s) * losses - 1.0, jnp.exp)
 
@@ -96,12 +96,12 @@ def imtl_l(learning_rate: float = 1e-2) -> Weighting:
 def geometric_mean(eps: float = 1e-8) -> Weighting:
     """Minimise the geometric mean of the losses (GLS; Chennupati et al., 2019, "MultiNet++").
 
-    Weights are the derivatives of (prod_i L_i)^(1/K): that mean over K L_i. Scaling a loss scales all gradients alike, so that
-    units do not matter. For positive losses; those below 0 count as 0. A loss near 0 takes over: `balance`, the sum of the
-    logarithms, has the same minima and less of that.
+    Weights are the derivatives of (prod_i L_i)^(1/K), which are this mean divided by K L_i. Scaling a loss scales all gradients
+    alike, so that units do not matter. For positive losses; negative ones are clipped to 0. A loss near 0 dominates: `balance`,
+    the sum of the logarithms, has the same minima, but less of this effect.
 
     Args:
-        eps: Added to the losses.
+        eps: Constant added to the losses.
     """
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
@@ -116,12 +116,12 @@ def geometric_mean(eps: float = 1e-8) -> Weighting:
 def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weighting:
     """Minimise a smooth maximum of the losses (STCH; Lin et al., 2024, "Smooth Tchebycheff Scalarization").
 
-    The objective is mu log sum_i exp((L_i - z_i) / (K mu)); weights are its derivatives, which sum to 1 / K. For losses in one
-    unit of which the worst counts, such as errors of groups. The smaller mu, the closer to the maximum.
+    The objective is mu log sum_i exp((L_i - z_i) / (K mu)); weights are its derivatives, which sum to 1 / K. Suited to losses
+    of the same unit whose maximum matters, such as errors of groups. The smaller mu, the closer to the maximum.
 
     Args:
         mu: Width of the smoothing, in units of L / K.
-        reference: z by name, bounds that the losses do not fall below (the ideal point); None, or where one is missing: 0.
+        reference: z by name, lower bounds of the losses (the ideal point); 0 for missing names, or for all if None.
 
     Raises:
         RequestError: mu is not positive.
@@ -131,7 +131,7 @@ def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weigh
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         count = len(losses)
         values = to_vector({name: loss - (reference or {}).get(name, 0.0) for name, loss in losses.items()})
-        # Less the greatest first: with a fused multiply and add, 1e15 / mu less itself may be -3e7.
+        # Subtract the maximum before dividing: with a fused multiply-add, 1e15 / mu minus itself may be -3e7.
         weights = by_name(losses, jax.nn.softmax((values - jnp.max(values)) / (count * mu)) / count)
         return weights, *moved(state, weights)
 
@@ -139,15 +139,15 @@ def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weigh
 
 
 def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
-    """Weigh losses by how slowly they fall (dynamic weight average; Liu et al., 2019, "End-to-End Multi-Task Learning with
-    Attention", eq. 7).
+    """Weight losses by how slowly they decrease (dynamic weight average; Liu et al., 2019, "End-to-End Multi-Task Learning
+    with Attention", eq. 7).
 
-    Weights are K times the softmax of r_i / T, with r_i the mean loss of the last epoch over that of the one before; 1 in the
-    first two epochs. For epochs of many minibatches: ratios of single ones are noise.
+    Weights are K times the softmax of r_i / T, where r_i is the mean loss of the last epoch divided by that of the epoch before
+    it; 1 in the first two epochs. Epochs should contain many minibatches, as ratios of single ones are dominated by noise.
 
     Args:
-        temperature: T; the greater, the more equal the weights.
-        epoch: Updates in an epoch.
+        temperature: T; the larger, the more equal the weights.
+        epoch: Number of updates in an epoch.
 
     Raises:
         RequestError: An argument is not positive.
@@ -167,7 +167,7 @@ def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
         mean = total / epoch
         rate = jnp.where(last == 0.0, 1.0, mean / jnp.where(last == 0.0, 1.0, last))
         later = jax.nn.softmax(jnp.clip(rate, -_LARGEST, _LARGEST) / temperature) * len(losses)
-        later = jnp.where(state.updates < epoch, 1.0, later)  # one epoch has no ratio
+        later = jnp.where(state.updates < epoch, 1.0, later)  # there is no ratio after the first epoch
         before = to_vector(state.weights)
         memory = {"sum": jnp.where(is_last, 0.0, total), "last": jnp.where(is_last, mean, last)}
         after, _ = moved(state, by_name(losses, jnp.where(is_last, later, before)), memory=memory)
@@ -177,18 +177,18 @@ def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
 
 
 def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0.0, eps: float = 1e-8) -> Weighting:
-    """Let all losses fall at one rate (FAMO; Liu et al., 2023, "Fast Adaptive Multitask Optimization", algorithm 2).
+    """Decrease all losses at the same rate (FAMO; Liu et al., 2023, "Fast Adaptive Multitask Optimization", algorithm 2).
 
-    With z the softmax of learned numbers w, weights are c z_i / L_i, c = 1 / sum_i z_i / L_i. w follows by Adam the gradient of
-    sum_i z_i log(L_i before / L_i after), so that losses that fall less gain. Needs one more reading of the losses per step,
-    for which those of the next update serve: on the same data as the paper's if this one and the next see the same, otherwise
-    with the noise of a minibatch more. Costs no gradients, while it aims at what MGDA of logarithms does.
+    With z the softmax of learned logits w, weights are c z_i / L_i, c = 1 / sum_i z_i / L_i. Adam minimises
+    sum_i z_i log(L_i before / L_i after) with respect to w, so that losses that decrease less gain weight. The paper evaluates
+    the losses again after each step; here those of the next update are used, which is the same if both use the same data, and
+    otherwise adds the noise of a minibatch. Needs no gradients of single losses, while its aim is that of MGDA on logarithms.
 
     Args:
-        learning_rate: Of Adam for w.
+        learning_rate: Learning rate of Adam for w.
         decay: Weight decay of w, added to its gradient (gamma).
-        reference: A bound that no loss falls below, the same for all.
-        eps: Added to the losses above it.
+        reference: Lower bound common to all losses.
+        eps: Constant added to the losses after subtracting ``reference``.
 
     Raises:
         RequestError: An argument is negative, or eps not positive.
@@ -209,7 +209,7 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         changes, rule_state = rule.update(gradient, memory["rule"], memory["logits"])
         learned = {"logits": optax.apply_updates(memory["logits"], changes), "rule": rule_state}
         kept = {name: memory[name] for name in learned}
-        # The first losses have none before them.
+        # There are no losses before the first ones.
         now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, kept)
         shares = jax.nn.softmax(now["logits"]) / above
         weights = by_name(losses, shares / jnp.sum(shares))
@@ -231,12 +231,12 @@ def _learned(
     slope: Callable[[jax.Array, jax.Array], jax.Array],
     to_weights: Callable[[jax.Array], jax.Array],
 ) -> Weighting:
-    """Build a weighting by numbers s [K] that follow an objective of theirs.
+    """Build a weighting with parameters s [K] that are learned by Adam.
 
     Args:
         label: Name of the weighting.
-        learning_rate: Of Adam.
-        slope: (s, losses [K]) -> the objective's derivative by s.
+        learning_rate: Learning rate of Adam.
+        slope: (s, losses [K]) -> derivative of the objective with respect to s.
         to_weights: s -> weights.
     """
     _check_positive(label, "learning_rate", learning_rate)

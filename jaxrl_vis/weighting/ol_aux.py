@@ -4,9 +4,9 @@ Every N updates, with g_i the gradient of log(L_i + eps) with respect to the sha
 
     w_i <- max(0, w_i + beta alpha mean over the N updates of <g_main, g_i>)
 
-The sign is that of the text (equations 5.9 to 5.13): weights rise while gradients agree. Algorithm 1 prints a minus, which
-follows from the plus sign in equation 5.8 and would do the opposite. `ol_aux_variants` has the authors' release's rule, and the
-ablation of figure 5.7.
+The sign is that of the text (equations 5.9 to 5.13): weights increase while gradients agree. Algorithm 1 has a minus sign,
+which follows from the plus sign in equation 5.8 and would do the opposite. `ol_aux_variants` contains the rule of the authors'
+release, and the ablation of figure 5.7.
 """
 
 import math
@@ -48,17 +48,17 @@ def ol_aux(
     """Build OL-AUX-N. Weights start at 1; a step uses the weights from before its own gradients.
 
     Args:
-        interval: N, updates from one change of the weights to the next.
-        learning_rate: alpha, the nominal one of the optimiser of the shared parameters, whichever kind it is.
-        beta: Step size of the weights; 5 N if None (thesis: 25 for N = 5, 5 for N = 1).
-        log: True if logarithms of the losses are learned and compared.
+        interval: N, number of updates between changes of the weights.
+        learning_rate: alpha, nominal learning rate of the shared parameters' optimiser, regardless of its kind.
+        beta: Step size of the weights, in multiples of ``learning_rate``; 5 N if None (thesis: 25 for N = 5, 5 for N = 1).
+        log: Whether logarithms of the losses are minimised and compared.
         eps, main_eps: See `Weighting`. The release adds nothing to the main loss.
-        minimum: Least weight; None for none (thesis). Without one, weights turn negative and losses grow.
-        maximum: Greatest weight; None for none (thesis).
+        minimum: Minimum weight; None if unbounded (thesis). Without a bound, weights can turn negative and losses grow.
+        maximum: Maximum weight; None if unbounded (thesis).
         heads: See `Weighting`.
 
     Raises:
-        RequestError: An argument makes no sense; from ``update``: the state is another weighting's.
+        RequestError: An argument is invalid; from ``update``: the state belongs to another weighting.
     """
     move = make_rule("ol_aux", interval, learning_rate, beta, minimum, maximum)
 
@@ -89,18 +89,19 @@ def make_rule(
     maximum: float | None = None,
     multiplicative: bool = False,
 ) -> Callable[..., WeightingState]:
-    """Build the rule that updates weights by the inner products of their losses' gradients with the main one's.
+    """Build the rule that updates weights by the inner products of the auxiliary gradients with the main one.
 
     Args:
-        label: Name of the weighting, for messages.
-        interval, learning_rate, beta, minimum, maximum: As of `ol_aux`.
+        label: Name of the weighting, for error messages.
+        interval, learning_rate, beta, minimum, maximum: See `ol_aux`.
         multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Returns:
-        (state; [] float32 by name, the mean of the dots; sums of this interval; further fields) -> the state after this update.
+        Function of the state, mean dot products ([] float32 by name), sums of this interval and values of other fields, which
+        returns the updated state.
 
     Raises:
-        RequestError: An argument makes no sense.
+        RequestError: An argument is invalid.
     """
     check_count(label, "interval", interval)
     step_size = (5.0 * interval if beta is None else beta) * learning_rate
@@ -118,7 +119,7 @@ def make_rule(
             weights[name] = jnp.where(due, jnp.clip(moved, minimum, maximum), old)
         sums = jax.tree.map(lambda leaf: jnp.where(due, 0.0, leaf), sums)
         after = WeightingState(weights=weights, updates=state.updates + 1, sums=sums, **more)
-        return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # a scan's carry keeps its dtypes
+        return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # the carry of a scan must keep its dtypes
 
     return move
 
@@ -127,7 +128,7 @@ def check_count(label: str, name: str, count: float) -> None:
     """Check a number of updates.
 
     Raises:
-        RequestError: It is not a whole number, or less than 1.
+        RequestError: The number is not an integer, or less than 1.
     """
     if count % 1 != 0:
         raise RequestError(f"{name} of weighting {label} must be a whole number, not {count}")
@@ -136,10 +137,10 @@ def check_count(label: str, name: str, count: float) -> None:
 
 
 def check_state(label: str, state: WeightingState) -> None:
-    """Check that a state is one of OL-AUX.
+    """Check that a state belongs to OL-AUX.
 
     Raises:
-        RequestError: It is another weighting's.
+        RequestError: It belongs to another weighting.
     """
     if state.sums is None:
         raise RequestError(f"the state is not one of weighting {label}: begin with its own init")

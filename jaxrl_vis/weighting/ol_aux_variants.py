@@ -1,6 +1,6 @@
 """Variants of OL-AUX that need whole gradients: the rule of the authors' release, and the ablation of figure 5.7.
 
-They keep gradients, or parameters, in their state, and take as many passes through the shared parameters as there are losses.
+They keep gradients or parameters in their state, and take one backward pass through the shared parameters per loss.
 """
 
 from collections.abc import Iterable, Mapping
@@ -50,15 +50,15 @@ def ol_aux_window(
     """Build OL-AUX-N as in the authors' release: gradients are averaged over the latest updates before they are compared.
 
     Args:
-        interval, learning_rate, beta, log, eps, main_eps, minimum, maximum, heads: As of `ol_aux.ol_aux`.
-        main_grad: main, the gradient of the main loss (thesis), or total, that of everything that is learned, which adds
-            w_i |g_i|^2 to each dot (release).
-        window: Latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
+        interval, learning_rate, beta, log, eps, main_eps, minimum, maximum, heads: See `ol_aux.ol_aux`.
+        main_grad: main for the gradient of the main loss (thesis), or total for that of the whole weighted objective, which
+            adds w_i |g_i|^2 to each dot product (release).
+        window: Number of latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
         multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Raises:
-        RequestError: An argument makes no sense; from ``init``: ``shared`` is not given; from ``update``: the state is another
-            weighting's.
+        RequestError: An argument is invalid; from ``init``: ``shared`` is not given; from ``update``: the state belongs to
+            another weighting.
     """
     label = "ol_aux"
     check_count(label, "window", window)
@@ -101,18 +101,18 @@ def ol_aux_ablation(
 ) -> Weighting:
     """Build OL-AUX-N (Ablation) of figure 5.7: the one-step rule every N updates, on as much data as OL-AUX-N uses.
 
-    Gradients and losses of N minibatches, all of them taken at the parameters that the interval began with, are averaged as if
-    they were one minibatch of N times the size, and compared once. So the weights follow what helps within one step, from
-    gradients that are as smooth as those of OL-AUX-N.
+    Gradients and losses of N minibatches, all evaluated at the parameters from the start of the interval, are averaged as if
+    they were one minibatch of N times the size, and compared once. The weights thus follow the benefit within one step, with
+    gradients as smooth as those of OL-AUX-N.
 
     Args:
         interval: N.
-        learning_rate, beta, log, eps, main_eps, minimum: As of `ol_aux.ol_aux`.
-        main_grad: As of `ol_aux_window`.
-        window: 1; gradients are averaged over the interval already.
+        learning_rate, beta, log, eps, main_eps, minimum: See `ol_aux.ol_aux`.
+        main_grad: See `ol_aux_window`.
+        window: Must be 1; gradients are already averaged over the interval.
 
     Raises:
-        RequestError: An argument makes no sense; from ``init``: ``shared`` or ``params`` is not given.
+        RequestError: An argument is invalid; from ``init``: ``shared`` or ``params`` is not given.
     """
     label = "ol_aux_ablation"
     check_count(label, "window", window)
@@ -139,7 +139,7 @@ def ol_aux_ablation(
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         check_state(label, state)
         sums = jax.tree.map(jnp.add, state.sums, {"losses": dict(losses), "gradients": dict(statistics)})
-        # As of one large minibatch.
+        # Means, as those of one large minibatch.
         mean = scaled(sums, 1.0 / (state.updates % interval + 1))
         gradients = _learned(weighting, mean["losses"], mean["gradients"])
         direction = _direction(main_grad, gradients, state.weights)

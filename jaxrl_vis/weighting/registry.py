@@ -1,4 +1,4 @@
-"""Weightings by name. A new one is a constructor and a row here."""
+"""Registry of weightings by name. To add one, write its constructor and add an entry here."""
 
 import inspect
 from collections.abc import Callable
@@ -60,7 +60,7 @@ WEIGHTINGS: dict[str, Callable[..., Weighting]] = {
     "db_mtl": db_mtl,
     "moco": moco,
 }
-# Slower functions for options that the first ones lack.
+# Slower variants with options that the default constructors lack.
 _VARIANTS: dict[str, Callable[..., Weighting]] = {"ol_aux": ol_aux_window}
 
 
@@ -69,10 +69,10 @@ def make_weighting(name: str, **options: Any) -> Weighting:
 
     Args:
         name: One of `WEIGHTINGS`.
-        options: Arguments of the function that makes it.
+        options: Arguments of its constructor.
 
     Raises:
-        RequestError: There is no such weighting, it has no such option, or the option's value makes no sense.
+        RequestError: The weighting or an option is unknown, or an option's value is invalid.
     """
     if name not in WEIGHTINGS:
         raise RequestError(f"unknown weighting {name!r}{nearest(name, WEIGHTINGS)}")

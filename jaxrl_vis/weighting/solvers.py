@@ -1,14 +1,15 @@
-"""Small optimisation problems over the losses, K <= 32, from their Gramian: each a bounded loop of K x K linear systems.
+"""Small optimisation problems over K <= 32 losses, given the Gramian of their gradients.
 
-    nonnegative      quadratic programme with x >= 0, by block principal pivoting; the two below are cases of it
-    min_norm         weights of the shortest vector in the convex hull of the gradients
+    nonnegative      quadratic programme with x >= 0, by block principal pivoting; the next two are special cases
+    min_norm         weights of the minimum-norm vector in the convex hull of the gradients
     dual_cone        weights of a combination's projection onto the cone of directions that oppose no gradient
     conflict_averse  weights of the hull's vector that CAGrad adds to the mean
     bargain          positive solution of G a = p a^(-1/s)
     to_simplex       projection onto the simplex
 
-All of them first scale the gradients to unit length (`unit_gramian`), so that a loss of small gradients is as exact as one of
-large ones. Gradients may depend on each other linearly. Everything can be mapped.
+Iterative solvers run a bounded number of K x K linear solves. Gradients are first scaled to unit norm (`unit_gramian`), so that
+losses with small gradients are treated as accurately as those with large ones. Gradients may be linearly dependent. All
+functions support `jax.vmap`.
 """
 
 from typing import Any, NamedTuple
@@ -16,30 +17,30 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-_PIVOTS = 100  # more than any Gramian of 32 losses has been seen to need, by a factor of 4
-_PATIENCE = 3  # block exchanges without progress before single ones, which always end (Kim and Park, 2011)
+_PIVOTS = 100  # 4 times the maximum observed for Gramians of 32 losses
+_PATIENCE = 3  # block exchanges without progress before single ones, which always terminate (Kim and Park, 2011)
 _ROOT_STEPS = 60
 _NEWTON_STEPS = 60
 _HALVINGS = 16
 
 
 def unit_gramian(gramian: jax.Array, least: float | None = None) -> tuple[jax.Array, jax.Array]:
-    """Scale gradients to unit length.
+    """Scale gradients to unit norm.
 
     Args:
         gramian: [K, K] float.
-        least: Length, over that of the greatest, below which gradients are scaled no more; None: the precision of a number.
+        least: Minimum norm by which gradients are divided, relative to the largest norm; None for the machine epsilon.
 
     Returns:
-        [K, K] Gramian of the scaled gradients; [K] lengths of the gradients, in units of the greatest, and at
-        least the precision of a number. Both are those of any length where all gradients vanish.
+        [K, K] Gramian of the scaled gradients; [K] norms of the gradients relative to the largest norm, and not less than
+        ``least``. If all gradients vanish, the Gramian is 0 and every norm is ``least``.
     """
     eps = jnp.finfo(gramian.dtype).eps
     lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
     greatest = jnp.max(lengths)
     greatest = jnp.where(greatest > 0.0, greatest, 1.0)
     relative = jnp.maximum(lengths / greatest, eps if least is None else least)
-    # One factor at a time: the product of two small lengths may be too small for a number.
+    # Divide by one factor at a time: the product of two small norms might underflow.
     return gramian / greatest / greatest / relative[:, None] / relative[None, :], relative
 
 
@@ -47,8 +48,8 @@ class _Pivots(NamedTuple):
     free: jax.Array  # [K] bool, components that need not be 0
     solution: jax.Array  # [K], may be negative until the end
     wrong: jax.Array  # [K] bool, components on the wrong side
-    fewest: jax.Array  # [] int32, of them so far
-    patience: jax.Array  # [] int32
+    fewest: jax.Array  # [] int32, minimum number of wrong components so far
+    patience: jax.Array  # [] int32, remaining block exchanges without progress
     steps: jax.Array  # [] int32
 
 
@@ -57,17 +58,17 @@ def nonnegative(
 ) -> tuple[jax.Array, jax.Array]:
     """Minimise x^T M x / 2 - b^T x over x >= 0, by block principal pivoting (Kim and Park, 2011, algorithm 3).
 
-    M may be singular: each pass minimises that plus r |x - x'|^2 / 2, where x' is the pass before's and at first 0, and r is
-    eps^(2/3) of the greatest M_ii, 2e-5 in float32 and 4e-11 in float64 (the proximal point method).
+    M may be singular: each pass adds the term r |x - x'|^2 / 2 (the proximal point method), where x' is the previous pass's
+    solution, initially 0, and r is eps^(2/3) times the maximum M_ii; the factor is 2e-5 in float32 and 4e-11 in float64.
 
     Args:
         matrix: [K, K] float, M, positive semidefinite.
         target: [K] float, b, in its range.
-        free: [K] bool, components that begin as positive; None for none.
-        passes: Of the proximal point method.
+        free: [K] bool, components initially assumed to be positive; None for none.
+        passes: Number of iterations of the proximal point method.
 
     Returns:
-        [K] float, x; [K] bool, its components that are not held at 0.
+        [K] float, x; [K] bool, components of x that are not fixed at 0.
     """
     ridge = jnp.finfo(matrix.dtype).eps ** (2 / 3) * jnp.max(jnp.diagonal(matrix))
     raised = matrix + ridge * jnp.eye(len(matrix), dtype=matrix.dtype)
@@ -79,7 +80,7 @@ def nonnegative(
 
 
 def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Minimise as `nonnegative`, for a positive definite matrix."""
+    """Solve the problem of `nonnegative` for a positive definite matrix."""
     count, eps = len(target), jnp.finfo(matrix.dtype).eps
 
     def solve(free: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -109,16 +110,16 @@ def min_norm(
 ) -> tuple[jax.Array, jax.Array]:
     """Compute the weights w >= 0, of sum 1, that minimise w^T G w.
 
-    On the ray through w, min over t of t^2 w^T G w + (t - 1)^2 is q / (1 + q), with q = w^T G w: so that x = t w minimises
+    On the ray through w, min over t of t^2 w^T G w + (t - 1)^2 is q / (1 + q), with q = w^T G w; hence x = t w minimises
     x^T G x + (sum x - 1)^2 over x >= 0.
 
     Args:
         gramian: [K, K] float, positive semidefinite.
-        free, passes: As of `nonnegative`.
-        least: As of `unit_gramian`.
+        free, passes: See `nonnegative`.
+        least: See `unit_gramian`.
 
     Returns:
-        [K] float, w; [K] bool, as of `nonnegative`.
+        [K] float, w; [K] bool, as in `nonnegative`.
     """
     unit, lengths = unit_gramian(gramian, least)
     per_length = jnp.min(lengths) / lengths
@@ -146,13 +147,13 @@ def dual_cone(gramian: jax.Array, preferences: jax.Array) -> jax.Array:
 
 
 class _Bracket(NamedTuple):
-    low: jax.Array  # [] where the length of the hull's vector exceeds it
-    high: jax.Array  # [] where it does not
-    at_low: jax.Array  # [] by how much, halved where this end was kept twice
-    at_high: jax.Array
-    kept: jax.Array  # [] int32, -1 low end kept last, 1 high end
+    low: jax.Array  # [] t with |g_w(t)| > t
+    high: jax.Array  # [] t with |g_w(t)| <= t
+    at_low: jax.Array  # [] |g_w(t)| - t at low, halved if this end was kept twice
+    at_high: jax.Array  # [] likewise at high
+    kept: jax.Array  # [] int32, end kept by the last step: -1 low, 1 high
     free: jax.Array  # [K] bool
-    error: jax.Array  # [] of the latest
+    error: jax.Array  # [] |g_w(t)| - t at the latest t
     steps: jax.Array
 
 
@@ -160,15 +161,15 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     """Minimise <g_w, g_0> + c |g_0| |g_w| over w in the simplex (CAGrad; Liu et al., 2021), g_0 the mean gradient.
 
     |g_w| is the minimum over t > 0 of (|g_w|^2 / t + t) / 2, and for a given t the problem is that of the shortest vector in
-    the hull of g_i + (t / (c |g_0|)) g_0. What remains is the root of |g_w(t)| - t, which decreases: by regula falsi, with the
-    Illinois rule.
+    the hull of g_i + (t / (c |g_0|)) g_0. What remains is the root of the decreasing function |g_w(t)| - t, found by regula
+    falsi with the Illinois rule.
 
     Args:
         gramian: [K, K] float.
         radius: c > 0.
 
     Returns:
-        [K] float, w; [] float, |g_w|, both for gradients scaled so that the greatest has length 1.
+        [K] float, w; [] float, |g_w|; both for gradients scaled so that the largest norm is 1.
     """
     eps = jnp.finfo(gramian.dtype).eps
     greatest = jnp.max(jnp.diagonal(gramian))
@@ -180,8 +181,8 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     def evaluate(t: jax.Array, free: jax.Array, passes: int = 1) -> tuple[jax.Array, jax.Array, jax.Array]:
         share = t / ball
         shifted = scaled + share * (to_mean[:, None] + to_mean[None, :]) + share**2 * squared
-        # Sums of three terms, whose rounding would be all that is left of a gradient that is shifted close to 0: with this
-        # least length it stays below what `nonnegative` adds.
+        # Only the rounding errors of these sums would be left of a gradient that is shifted close to 0. This minimum norm
+        # keeps them below the ridge that `nonnegative` adds.
         weights, free = min_norm(shifted, free, passes, least=float(eps) ** (1 / 6))
         return weights, jnp.sqrt(jnp.maximum(quadratic(scaled, weights), 0.0)), free
 
@@ -202,7 +203,7 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
 
     zero, one = jnp.zeros((), scaled.dtype), jnp.ones((), scaled.dtype)
     _, at_one, free = evaluate(one, jnp.zeros(len(gramian), bool))
-    # 0 is a root, too, where the hull holds 0, but not of interest: as if the error were 1 there.
+    # If the hull contains 0, t = 0 is a root as well, but not the one wanted: treat the error there as 1.
     first = _Bracket(zero, one, one, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
     last = jax.lax.while_loop(is_open, step, first)
     # The last error is that of the end that moved last.
@@ -219,7 +220,7 @@ class _Newton(NamedTuple):
 def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -> jax.Array:
     """Solve G a = p a^(-1/s) for a > 0, by Newton's method on a convex function.
 
-    a minimises a^T G a / 2 - sum_i p_i phi(a_i), phi' = a^(-1/s): phi is the logarithm for s = 1.
+    a minimises a^T G a / 2 - sum_i p_i phi(a_i), where phi'(a) = a^(-1/s); phi is the logarithm for s = 1.
 
     Args:
         gramian: [K, K] float.
@@ -231,10 +232,10 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
     """
     eps, power = jnp.finfo(gramian.dtype).eps, 1.0 / exponent
     unit, relative = unit_gramian(gramian)
-    unit = unit + len(unit) * eps * jnp.eye(len(unit), dtype=unit.dtype)  # no solution is infinite
+    unit = unit + len(unit) * eps * jnp.eye(len(unit), dtype=unit.dtype)  # keeps the solution finite
     greatest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(gramian)), 0.0))
     lengths = relative * jnp.where(greatest > 0.0, greatest, 1.0)
-    # With a = x s / lengths, this is unit x = shares x^(-power), of which the greatest share is 1.
+    # With a = x scale / lengths, the equation is unit x = shares x^(-power), where the maximum of shares is 1.
     wanted = preferences * lengths ** (power - 1.0)
     scale = jnp.max(wanted) ** (1.0 / (1.0 + power))
     shares = wanted / jnp.max(wanted)
@@ -253,7 +254,7 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
         farthest = jnp.minimum(1.0, 0.99 / jnp.maximum(jnp.max(-change / now.x), eps))
         lengths = farthest * 0.5 ** jnp.arange(_HALVINGS, dtype=now.x.dtype)
         values = jax.vmap(lambda length: objective(now.x + length * change))(lengths)
-        # Close to the minimum, its value no longer tells steps apart, and whole ones converge quadratically.
+        # Close to the minimum, the objective no longer distinguishes steps, and full ones converge quadratically.
         length = jnp.where(decrement < 1e-2, farthest, lengths[jnp.argmin(values)])
         x = now.x + length * change
         pull = shares * x**-power
@@ -274,13 +275,13 @@ def to_simplex(vector: jax.Array) -> jax.Array:
 
 
 def quadratic(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """Compute x^T M x at full precision: []."""
+    """Compute the scalar x^T M x at full matrix-multiplication precision."""
     precision: Any = jax.lax.Precision.HIGHEST
     return jnp.dot(vector, jnp.dot(matrix, vector, precision=precision), precision=precision)
 
 
 def pseudo_inverse(gramian: jax.Array, rounding: float = 1.0) -> jax.Array:
-    """Compute the pseudo-inverse of a Gramian, [K, K]; eigenvalues up to ``rounding`` K eps of the greatest count as 0."""
+    """Compute the pseudo-inverse of a Gramian [K, K]; eigenvalues up to ``rounding`` K eps times the largest count as 0."""
     values, vectors = jnp.linalg.eigh(gramian)
     cut = rounding * len(gramian) * jnp.finfo(gramian.dtype).eps * jnp.max(jnp.abs(values))
     inverse = jnp.where(values > cut, 1.0 / jnp.where(values > cut, values, 1.0), 0.0)

@@ -1,6 +1,6 @@
-"""Weightings that change each gradient by the others, one after another in a random order. All losses are alike to them.
+"""Weightings that modify each gradient by the others, one after another in random order. All losses are treated alike.
 
-Each changed gradient is a combination of the original ones, so that the Gramian [K, K] is enough.
+Each modified gradient is a linear combination of the original ones, so that the Gramian [K, K] suffices.
 """
 
 from typing import Unpack
@@ -14,14 +14,13 @@ from jaxrl_vis.weighting.gramian_based import Options, of_gramian
 
 
 def pcgrad(seed: int = 0, **options: Unpack[Options]) -> Weighting:
-    """Remove from each gradient what opposes another (PCGrad; Yu et al., 2020, "Gradient Surgery", algorithm 1).
+    """Remove conflicting components from each gradient (PCGrad; Yu et al., 2020, "Gradient Surgery", algorithm 1).
 
-    Where <g_i, g_j> < 0, g_i is projected onto the normal plane of g_j; the changed gradients are summed. With two losses the
-    sum opposes neither; with more it may. Cheap and common.
+    If <g_i, g_j> < 0, g_i is projected onto the normal plane of g_j; the modified gradients are summed. With two losses the sum
+    opposes neither gradient; with more it may. Cheap and common.
 
     Args:
-        seed: Of the key that the state begins with, for the orders; replace ``state.key`` where several states should draw
-            apart.
+        seed: Seed of the initial key, for the orders; replace ``state.key`` to make several states sample independently.
         options: See `Options`.
     """
 
@@ -36,10 +35,10 @@ def pcgrad_weights(gramian: jax.Array, orders: jax.Array) -> jax.Array:
 
     Args:
         gramian: [K, K] float.
-        orders: [K, K] int, in row i the losses in the order in which g_i meets them; itself is passed over.
+        orders: [K, K] int; row i is the order in which g_i is compared with the others (i itself is skipped).
     """
     rows, squares = jnp.arange(len(gramian)), jnp.diagonal(gramian)
-    changed = jnp.eye(len(gramian), dtype=gramian.dtype)  # row i: the combination of gradients that g_i has become
+    changed = jnp.eye(len(gramian), dtype=gramian.dtype)  # row i: modified g_i as a combination of the gradients
     for place in range(len(gramian)):
         others = orders[:, place]
         dots = jnp.sum(gramian[others] * changed, axis=1)
@@ -50,15 +49,15 @@ def pcgrad_weights(gramian: jax.Array, orders: jax.Array) -> jax.Array:
 
 
 def gradvac(beta: float = 0.01, seed: int = 0, **options: Unpack[Options]) -> Weighting:
-    """Turn each gradient towards the others, up to their usual cosine (GradVac; Wang et al., 2021, "Gradient Vaccine").
+    """Rotate each gradient towards the others, up to their usual cosine (GradVac; Wang et al., 2021, "Gradient Vaccine").
 
-    Where the cosine of g_i and g_j is less than its running mean, at first 0, g_i gains as much of g_j as makes it equal; the
-    changed gradients are summed. `pcgrad` is the same with a mean that stays at 0. For losses whose gradients usually agree,
-    such as those of many languages.
+    If the cosine of g_i and g_j is below its running mean (initially 0), the multiple of g_j that makes them equal is added to
+    g_i; the modified gradients are summed. `pcgrad` is the same with a mean fixed at 0. Suited to losses whose gradients
+    usually agree, such as those of many languages.
 
     Args:
-        beta: Share of the latest cosine in the mean.
-        seed: As of `pcgrad`.
+        beta: Weight of the latest cosine in the running mean.
+        seed: See `pcgrad`.
         options: See `Options`.
 
     Raises:
@@ -74,13 +73,13 @@ def gradvac(beta: float = 0.01, seed: int = 0, **options: Unpack[Options]) -> We
 
 
 def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, beta: float) -> tuple[jax.Array, jax.Array]:
-    """Compute the weights of `gradvac`, [K], and the new means of cosines, [K, K].
+    """Compute the weights of `gradvac`, [K], and the updated running means of cosines, [K, K].
 
     Args:
         gramian: [K, K] float.
-        usual: [K, K] float, means of the cosines of changed gradients (rows) and original ones.
-        orders: As of `pcgrad_weights`.
-        beta: As of `gradvac`.
+        usual: [K, K] float, running means of the cosines between modified gradients (rows) and original ones (columns).
+        orders: See `pcgrad_weights`.
+        beta: See `gradvac`.
     """
     rows, lengths = jnp.arange(len(gramian)), jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
     changed = jnp.eye(len(gramian), dtype=gramian.dtype)
@@ -89,7 +88,7 @@ def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, bet
         dots = jnp.matmul(changed, gramian, precision=jax.lax.Precision.HIGHEST)
         length = jnp.sqrt(jnp.maximum(jnp.sum(dots * changed, axis=1), 0.0))
         other = lengths[others]
-        # A gradient that has been turned to nothing is rounding, and has no direction.
+        # A modified gradient that almost vanishes is rounding error, without a meaningful direction.
         is_some = length > 4.0 * jnp.finfo(gramian.dtype).eps ** 0.5 * lengths
         is_pair = (others != rows) & is_some & (other > 0.0)
         safe = jnp.where(is_pair, other, 1.0)
@@ -104,6 +103,6 @@ def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, bet
 
 
 def _orders(state: WeightingState, count: int) -> jax.Array:
-    """Draw an order of the losses for each loss: [K, K] int."""
+    """Sample a random order of the losses for each loss: [K, K] int."""
     keys = jax.random.split(jax.random.fold_in(state.key, state.updates), count)
     return jax.vmap(lambda key: jax.random.permutation(key, count))(keys)

@@ -1,7 +1,7 @@
 """Our renderer on the scenes of `models`: images per second of every output, size and batch.
 
-Poses are world coordinates; the images have 8-bit colours and float32 depth in metres, without shadows. A renderer's own
-preparation for a new pose (culling, refitting of bounding volumes) is part of its figure.
+Poses are in world coordinates; images have 8-bit colours and float32 depth in metres, without shadows. A renderer's own
+preparation for a new pose (culling, refitting of bounding volumes) is included in its time.
 """
 
 import dataclasses
@@ -28,12 +28,12 @@ CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (4096,)
 SCENE_ACCELERATOR_COUNTS = {"primitives": (8192,)}
 OUTPUTS = ("rgbd", "rgbd8", "depth")
-_SAMPLE = 32  # poses in which the needed tests are counted
-_DEPTH_RANGE = 10.0  # metres that an 8-bit depth spans
+_SAMPLE = 32  # number of poses over which the needed tests are averaged
+_DEPTH_RANGE = 10.0  # range of an 8-bit depth in metres
 
 # Without textures first: MuJoCo Warp is fastest on that variant.
 VARIANTS = tuple({"poses": "scattered", "textures": textures, "highlights": True} for textures in (False, True))
-# Its own scene also as it measures it: at the start, where its bounding volumes fit best, and without highlights.
+# MuJoCo Warp's scene also in its own setting: at the start, where its bounding volumes fit best, and without highlights.
 SCENE_VARIANTS = {
     "primitives": (
         *VARIANTS,
@@ -50,7 +50,7 @@ class Case:
     Attributes:
         config: Entries of a record: scene, poses, textures, highlights, image_size, images.
         mj_model: Model, seen by its first camera.
-        batches: Two sets of poses, see `models.random_poses`; the first ``config["images"]`` of each are drawn.
+        batches: Two sets of poses, see `models.random_poses`; the first ``config["images"]`` of each are rendered.
     """
 
     config: dict[str, Any]
@@ -63,7 +63,7 @@ def cases(scene: str, settings: Settings, sizes: tuple[int, ...], min_poses: int
 
     Args:
         scene: Name or path, see `models.load`.
-        settings: Settings, of which ``envs`` and ``on_accelerator`` count.
+        settings: Settings, of which ``envs`` and ``on_accelerator`` are used.
         sizes: Heights and widths of the images.
         min_poses: Minimum number of poses in a batch.
     """
@@ -77,7 +77,7 @@ def cases(scene: str, settings: Settings, sizes: tuple[int, ...], min_poses: int
 
 
 def measure(settings: Settings, sizes: tuple[int, ...]) -> Iterator[Measurement]:
-    """Yield images per second of each case of ``settings.scene`` and each output.
+    """Yield images per second for each case of ``settings.scene`` and each output.
 
     Args:
         settings: Settings with a scene.
@@ -123,12 +123,12 @@ def measure_output(case: Case, output: str, repeats: int) -> Measurement:
 
 
 def _effort(compiled: Any, pixels: int, seconds: float, tests: float, pixel_operations: float | None) -> dict[str, Any]:
-    """Cost of a figure: ray-geom tests, operations, and memory.
+    """Return the details of a measurement's cost: ray-geom tests, operations, and memory.
 
     Args:
         compiled: Compiled program.
-        pixels: Pixels of all images together.
-        seconds: Seconds of one call.
+        pixels: Total number of pixels of all images.
+        seconds: Duration of one call in seconds.
         tests: Tests per pixel under perfect culling.
         pixel_operations: Operations per pixel of these tests and the shading (`operations`); None if unknown.
     """

@@ -1,4 +1,4 @@
-"""Scenes for comparisons of renderers, and batches of poses in world coordinates, so that no kinematics is timed."""
+"""Scenes for comparing renderers, and batches of poses in world coordinates, so that kinematics is not timed."""
 
 import importlib.util
 import itertools
@@ -15,7 +15,7 @@ POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xm
 POSES += ("xpos", "xmat", "xipos")
 FREE_METRES, FREE_RADIANS, BALL_RADIANS, SLIDE_METRES = 0.2, 0.5, 1.0, 0.3
 SPREADS = {"scattered": 1.0, "start": 0.01}
-"""Spread of the joints, as a share of `scatter_joints`: at the start just enough that no two images are equal."""
+"""Spread of the joints, see `scatter_joints`: at the start just enough that no two images are equal."""
 
 
 def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.MjModel:
@@ -24,8 +24,8 @@ def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.M
     Args:
         scene: ``finger`` (from the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
             over a table), or the path of an MJCF file with a camera.
-        textures: Keep the textures of materials and sky.
-        highlights: Keep the specular part of lights.
+        textures: Whether to keep the textures of materials and sky.
+        highlights: Whether to keep the specular component of lights.
 
     Raises:
         RequestError: The scene is unknown, its package is missing, or it has no camera.
@@ -46,7 +46,7 @@ def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.M
     mj_model.light_castshadow[:] = 0
     if not textures:
         mj_model.mat_texid[:] = -1
-        # A sky is found by its type.
+        # The sky is identified by its texture type.
         mj_model.tex_type[mj_model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX] = mujoco.mjtTexture.mjTEXTURE_CUBE
     if not highlights:
         mj_model.light_specular[:] = mj_model.vis.headlight.specular[:] = 0
@@ -72,9 +72,9 @@ def _scene_path(scene: str) -> Path:
 
 
 def primitives_xml() -> str:
-    """MJCF of 127 geoms: a floor, a table top, and 25 each of sphere, capsule, ellipsoid, cylinder and box, all free bodies.
+    """Return MJCF of 127 geoms: floor, table top, and 25 free bodies each of sphere, capsule, ellipsoid, cylinder and box.
 
-    Types, sizes, positions, camera and lights are the same as in MuJoCo Warp's own benchmark of that name, so that its figures
+    Types, sizes, positions, camera and lights are the same as in MuJoCo Warp's own benchmark of that name, so that its results
     are comparable.
     """
     kinds = (
@@ -112,16 +112,16 @@ def primitives_xml() -> str:
 
 
 def scatter_joints(mj_model: mujoco.MjModel, mj_data: mujoco.MjData, rng: np.random.Generator, spread: float = 1.0) -> None:
-    """Set every joint to a random position, in place; the kinematics is not run.
+    """Set every joint to a random position, in place, without running the kinematics.
 
     Hinges and slides are uniform within their limits (hinges without: any angle; slides without: 0.3 m each way), balls turn by
     up to a radian, free bodies move by a tenth of the model's extent (0.2 m at most) and turn by up to half a radian.
 
     Args:
         mj_model: Model.
-        mj_data: State, whose ``qpos`` is written.
+        mj_data: State, which is reset and whose ``qpos`` is written.
         rng: Random generator.
-        spread: Share of the distance from the start to that position, in [0, 1].
+        spread: Fraction in [0, 1] of the distance from the start to that position.
     """
     mujoco.mj_resetData(mj_model, mj_data)
     joints = mujoco.mjtJoint
@@ -152,7 +152,7 @@ def _rotate_randomly(quaternions: np.ndarray, max_angle: float, rng: np.random.G
 
 
 def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-    """Compute what an image needs: poses of bodies, geoms, sites, cameras, lights and tendons, and the tendons' limits."""
+    """Compute the inputs of rendering: poses of bodies, geoms, sites, cameras, lights and tendons, and tendon limits."""
     mujoco.mj_kinematics(mj_model, mj_data)
     mujoco.mj_comPos(mj_model, mj_data)
     mujoco.mj_camlight(mj_model, mj_data)
@@ -162,7 +162,7 @@ def forward(mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
 
 
 def random_poses(mj_model: mujoco.MjModel, count: int, seed: int, spread: float = 1.0) -> dict[str, np.ndarray]:
-    """Draw poses in world coordinates for ``count`` random joint positions, see `scatter_joints`.
+    """Compute poses in world coordinates for ``count`` random joint positions, see `scatter_joints`.
 
     Returns:
         Arrays [count, ...] float32 by name (`POSES`), shaped as in MjData.
@@ -178,10 +178,10 @@ def random_poses(mj_model: mujoco.MjModel, count: int, seed: int, spread: float 
 
 
 def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: int) -> np.ndarray:
-    """Ray-geom tests per pixel under perfect culling by bounding spheres, averaged over ``poses``; [ngeom] float.
+    """Compute ray-geom tests per pixel under perfect culling by bounding spheres, averaged over ``poses``: [ngeom] float.
 
     A geom needs a test in every pixel that the projection of its bounding sphere covers, a plane in every pixel. Geoms that
-    are not drawn (because of their group, or with alpha 0) need none.
+    are not rendered (because of their group, or with alpha 0) need none.
 
     Args:
         mj_model: Model, seen by its first camera.
@@ -199,7 +199,7 @@ def needed_tests(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], size: i
     middles = (2.0 * np.arange(size) + 1.0 - size) / size * reach
     tests = endless.astype(float)
     for u, v in itertools.product(middles, middles):
-        # The sphere's centre against the line of the ray (u, v, -1): nearer than the radius, and not wholly behind.
+        # The sphere's centre is within one radius of the ray (u, v, -1), and the sphere is not entirely behind the camera.
         length = u * u + v * v + 1.0
         along = (x * u + y * v + away) / length
         apart = x * x + y * y + away * away - along * along * length

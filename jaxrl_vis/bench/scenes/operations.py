@@ -1,8 +1,8 @@
-"""Minimum arithmetic of an image: the renderer's own functions under perfect culling.
+"""Minimum number of arithmetic operations of an image: the renderer's own functions under perfect culling.
 
-The compiler's own count is no substitute: it includes tests that a kernel skips, and nothing inside a kernel. Here every
-operation on a pixel counts as one (a fused multiply-add as two, a square root as one): once per pixel and object that has to be
-tested, and once per pixel for depth, normal, texture and colour. Work that is done once per environment does not count.
+The compiler's count is no substitute: it includes tests that a kernel skips, and nothing inside a kernel. Here every operation
+on a pixel counts as one (a fused multiply-add as two, a square root as one): once per pixel and object that must be tested, and
+once per pixel for depth, normal, texture and colour. Work done once per environment is not counted.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,19 +16,19 @@ from jaxrl_vis_envs.render import Scene, camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
 
-# Number of traced pixels: a length that no other axis has.
+# Number of traced pixels: a size that no other axis has.
 _PIXELS = 7919
 # Copies, views and indexing, which are not arithmetic.
 _MOVES = {"broadcast_in_dim", "squeeze", "reshape", "slice", "dynamic_slice", "concatenate", "gather", "iota", "transpose"}
 
 
 def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True) -> float | None:
-    """Operations per pixel of an image.
+    """Return the number of operations per pixel of an image.
 
     Args:
-        scene: Scene; the cost of haze, shadows and transparent objects is left out.
+        scene: Scene; the cost of haze, shadows and transparent objects is not included.
         tests: [ngeom] float, tests per pixel of each geom, see `models.needed_tests`.
-        coloured: Count shading as well as depth, which the tests themselves give.
+        coloured: Whether to count shading in addition to depth, which the tests themselves yield.
 
     Returns:
         Number of operations; None for a scene with triangles, whose tests are not counted.
@@ -62,7 +62,7 @@ def operations_per_pixel(scene: Scene, tests: np.ndarray, coloured: bool = True)
 
 
 def _count(function: Callable, *arguments: Any) -> int:
-    """Count the operations on single pixels in a function."""
+    """Count the operations of a function on arrays over pixels."""
     equations = _equations(jax.make_jaxpr(function)(*arguments).jaxpr)
     return sum(equation.primitive.name not in _MOVES and _PIXELS in equation.outvars[0].aval.shape for equation in equations)
 

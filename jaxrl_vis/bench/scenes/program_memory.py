@@ -1,6 +1,6 @@
 """Size of the largest array that a compiled program stores between its operations, parsed from the program text.
 
-The compiler's own figure (`Compiled.memory_analysis`) is the size of all of these arrays together.
+`Compiled.memory_analysis` reports only the total size of these arrays.
 """
 
 import math
@@ -11,13 +11,13 @@ import numpy as np
 
 _HEAD = re.compile(r"(ENTRY )?%?([\w.\-]+) \(.*\{$")
 _ARRAY = re.compile(r"\s+(ROOT )?%?[\w.\-]+ = (\w+)\[([\d,]*)\]\S* ([\w\-]+)\(")
-# These only name memory that another operation has written or that belongs to the program.
+# Operations that only refer to memory written by another operation or belonging to the program.
 _NO_MEMORY = {"parameter", "get-tuple-element", "bitcast", "constant"}
 _BITS = re.compile(r"[a-z]+(\d+)")
 
 
 def largest_temporary(compiled: Any) -> int:
-    """Bytes of the largest array that an operation writes and that is not a result of the program.
+    """Return the bytes of the largest array that an operation writes and that is not a result of the program.
 
     Operations within a fusion write nothing. A result counts if it is copied from another array.
 
@@ -36,6 +36,6 @@ def largest_temporary(compiled: Any) -> int:
 
 
 def _bytes(dtype: str) -> int:
-    """Bytes of one number of a type by XLA's name for it."""
+    """Return the number of bytes of a scalar, given XLA's name of its type."""
     bits = _BITS.match(dtype)
     return int(np.ceil(int(bits[1]) / 8)) if bits else 1

@@ -11,7 +11,7 @@ from jaxrl_vis.learner.acting.rollout import Acting, play
 from jaxrl_vis.learner.parallel.shards import ONE, Shards
 from jaxrl_vis.types import Metrics, TrainState
 
-# Episodes whose images are returned, for videos.
+# Number of episodes whose images are returned, for videos.
 _NUM_RECORDED = 8
 
 
@@ -39,31 +39,31 @@ def summarize(
     """Summarize the episodes of an evaluation.
 
     Args:
-        outcome: The task's metrics (`GoalEnv.metric_names`) of all N episodes at their last steps, [S, N].
-        observations: [S, K, T+2, ...] of the recorded episodes, the goals' at the end.
-        success: [S, at least K] of the recorded episodes and possibly more.
-        frame_stack: Images that an observation stacks.
-        xp: ``jax.numpy`` or ``numpy``, whose arrays these are.
+        outcome: [S, N] by name, metrics (`GoalEnv.metric_names`) of all N episodes at their last steps.
+        observations: [S, K, T+2, ...] of the recorded episodes, followed by the goal's.
+        success: [S, at least K] success of the recorded episodes and possibly more.
+        frame_stack: Number of images that an observation stacks.
+        xp: ``jax.numpy`` or ``numpy``, according to the type of the arrays.
     """
     metrics = {f"eval/{name}": xp.mean(values, axis=1) for name, values in outcome.items()}
     metrics["eval/goal_distance_median"] = xp.median(outcome["goal_distance"], axis=1)
-    if frame_stack > 1:  # for people, the newest of stacked images, which come first
+    if frame_stack > 1:  # for display, keep the newest of the stacked images, which come first
         observations = observations[:, :, :, : observations.shape[3] // frame_stack]
     frames, goals = observations[:, :, :-1], observations[:, :, -1]
     return Evaluation(metrics, {"frames": frames, "goals": goals, "success": success[:, : observations.shape[1]]})
 
 
 def make_evaluate(acting: Acting, num_episodes: int, shards: Shards = ONE) -> Callable[[TrainState, jax.Array], Evaluation]:
-    """Make the evaluation without exploration, as a function to be compiled.
+    """Build the evaluation without exploration, as a function to be compiled.
 
     Args:
-        acting: The environment and the algorithm.
-        num_episodes: N, of each learner.
-        shards: Shards of each learner. Each plays its part of the episodes; metrics are of all, and images are of the first few
-            of each shard.
+        acting: Environment and algorithm.
+        num_episodes: N, number of episodes per learner.
+        shards: Shards of each learner. Each rolls out its part of the episodes; metrics cover all of them, images the first
+            few of each shard.
 
     Returns:
-        (TrainState [S, ...], key []) -> `Evaluation`. All seeds play the same episodes.
+        (TrainState [S, ...], key []) -> `Evaluation`. All seeds are evaluated on the same episodes.
     """
 
     def evaluate(train: TrainState, key: jax.Array) -> Evaluation:

@@ -1,6 +1,6 @@
 """Rollouts: whole episodes of the current policy, with all environments in lockstep.
 
-reset S x E environments (each draws its goal image once)
+reset S x E environments (each renders its goal image once)
 scan over T:  act -> advance -> observe        observations [T, S, E, ...], each kept once
 """
 
@@ -17,17 +17,17 @@ from jaxrl_vis.types import Episodes, Metrics, TrainState
 from jaxrl_vis_envs.base import GoalEnv, State
 
 Draws = Shards | RolloutPart
-"""Source of the random numbers of the environments that are played: all of a learner's, those of one device, or a few."""
+"""Source of random numbers for the environments of a call: all of a learner's, those of one device, or those of one part."""
 
-# Folded into keys for noise on observations, so that it changes nothing else.
+# Folded into keys for observation noise, so that it changes no other random numbers.
 _FIRST_NOISE, _GOAL_NOISE, _STEP_NOISE = 0x6E6F30, 0x6E6F31, 0x6E6F32
 
 
 class Exploration(NamedTuple):
-    """Noise of actions; none by default.
+    """Exploration noise of actions; none by default.
 
     Attributes:
-        random_action_probability: Share of actions replaced by uniformly random ones, whole vectors at a time.
+        random_action_probability: Fraction of action vectors replaced by uniformly sampled ones.
         action_noise: Standard deviation of the Gaussian noise on the others.
     """
 
@@ -61,24 +61,24 @@ def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: 
     """Add exploration noise to actions, if there is any: [E, A] float32 in [-1, 1].
 
     Args:
-        action: [E, A] float32 in [-1, 1], the policy's own.
-        exploration: The noise.
-        key: [] typed; draws the noise.
-        draws: Random numbers of these environments.
+        action: [E, A] float32 in [-1, 1], the policy's actions.
+        exploration: Exploration noise.
+        key: [] typed key for the noise.
+        draws: Source of random numbers for these environments.
     """
     if exploration.is_none:
         return action
     noise_key, random_key = jax.random.split(key)
     noise = draws.draw(lambda shape: jax.random.normal(noise_key, shape), action.shape)
     action = jnp.clip(action + exploration.action_noise * noise, -1.0, 1.0)
-    # One draw says whether an action is random, and which.
+    # One sample determines both whether an action is random, and its value.
     drawn = draws.draw(lambda shape: jax.random.uniform(random_key, shape), (*action.shape[:-1], 1 + action.shape[-1]))
     is_random = drawn[..., :1] < exploration.random_action_probability
     return jnp.where(is_random, 2.0 * drawn[..., 1:] - 1.0, action)
 
 
 def split_keys(keys: jax.Array, num_envs: int, draws: Draws = ONE) -> tuple[jax.Array, jax.Array]:
-    """Split the keys of a rollout, [S], into those of all S x E resets, seed by seed, and those of the policies, [S]."""
+    """Split the keys of a rollout [S] into keys of all resets [S * E], seed by seed, and keys of the policies [S]."""
     reset_keys, policy_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     return jax.vmap(lambda key: draws.split(key, num_envs))(reset_keys).reshape(-1), policy_keys
 
@@ -87,10 +87,10 @@ def add_noise(key: jax.Array, observations: jax.Array, deviation: float, draws: 
     """Add camera noise to observations [E, ...]: same shape and dtype; bytes are rounded and clipped.
 
     Args:
-        key: [] a typed key.
+        key: [] typed key.
         observations: uint8 images or float32 state vectors.
         deviation: Standard deviation of the noise, in the observation's unit.
-        draws: Random numbers of these environments.
+        draws: Source of random numbers for these environments.
     """
     noisy = observations + deviation * draws.noise(key, observations.shape)
     if observations.dtype == jnp.uint8:
@@ -102,9 +102,9 @@ class Rollout(NamedTuple):
     """Result of `play`.
 
     Attributes:
-        episodes: The kept episodes, [S, K, ...].
-        outcome: the task's metrics (`GoalEnv.metric_names`) of all episodes at their last step, [S, E].
-        record: Result of ``record`` for the kept episodes' states after 0, 1, ... T steps, [S, K, T+1, ...]; or None.
+        episodes: [S, K, ...] kept episodes.
+        outcome: [S, E] by name, metrics (`GoalEnv.metric_names`) of all episodes at their last step.
+        record: [S, K, T+1, ...] results of ``record`` for the kept episodes' states after 0, 1, ..., T steps; or None.
     """
 
     episodes: Episodes
@@ -127,19 +127,19 @@ def play(
     record: Callable[[State], Any] | None = None,
     draws: Draws = ONE,
 ) -> Rollout:
-    """Play one episode in each of E environments, for each of S learners side by side.
+    """Roll out one episode in each of E environments, for each of S learners in parallel.
 
-    To the environments learners are nothing but more environments: one `jax.vmap` less means half as much to trace.
+    Seeds and environments share one axis of S x E environments: one `jax.vmap` less halves the time to trace.
 
     Args:
-        acting: The environment and the algorithm.
-        train: The learners, [S, ...].
+        acting: Environment and algorithm.
+        train: [S, ...] learners.
         keys: [S] typed keys of this rollout.
-        num_envs: E, environments of each learner that are played here.
-        exploration: The noise.
-        num_kept: K, how many of the episodes to keep (the first ones); None: all.
-        record: Makes a pytree, to be kept, of the state of one environment after reset and after each step.
-        draws: Random numbers of these environments.
+        num_envs: E, number of environments per learner in this call.
+        exploration: Exploration noise.
+        num_kept: K, number of episodes to keep (the first ones); None for all.
+        record: Function of the state of one environment that returns a pytree to record, after reset and after each step.
+        draws: Source of random numbers for these environments.
     """
     env, algorithm, deviation = acting
     num_seeds = keys.shape[0]
@@ -151,7 +151,7 @@ def play(
         return by_seed(leaf)[:, :num_kept]
 
     def seen(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
-        # Noise belongs to a frame: it is drawn here, once, and stored with the frame, which therefore equals itself as a goal.
+        # Noise is sampled once per frame and stored with it, so that a frame equals itself when it becomes a goal.
         if not deviation:
             return observations
         noise_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)

@@ -1,10 +1,10 @@
 """Rollouts divided into parts of a few environments, which the threads of a CPU run in parallel.
 
-A GPU plays all environments at once, and so do several devices. One CPU plays `PART_SIZE` at a time, in as many threads as it
-has cores (`jaxrl_vis.run.compiled.threaded_rollout`): XLA would divide single operations among its threads, and those of a
-physics step are too small for that. On two cores 16 environments of VisualFetchReach are played in 0.13 s in place of 0.25. An
-evaluation of 256 episodes calls the same program, and takes 2.0 s in place of 2.7; so most of what takes long to compile,
-physics and images, is compiled once.
+A GPU steps all environments at once, and so do several devices. One CPU steps at most `PART_SIZE` at a time, in as many threads
+as it has cores (`jaxrl_vis.run.compiled.threaded_rollout`): XLA would divide single operations among its threads, and those of
+a physics step are too small for that. On two cores a rollout of 16 environments of VisualFetchReach takes 0.13 s instead of
+0.25. An evaluation of 256 episodes calls the same program, and takes 2.0 s instead of 2.7; so physics and rendering, which take
+longest to compile, are compiled only once.
 """
 
 import dataclasses
@@ -20,14 +20,14 @@ from jaxrl_vis.types import Episodes, Metrics
 from jaxrl_vis_envs.base import GoalEnv
 
 PART_SIZE = 8
-"""Largest number of environments in a part: as many float32 numbers as the vector registers of most CPUs hold."""
+"""Maximum number of environments in a part: as many float32 numbers as fit into a vector register of most CPUs."""
 
 Played = tuple[Episodes, Metrics]
 """Episodes [S, P, ...], and ``success`` and ``goal_distance`` at their last steps, [S, P] float32."""
 
 
 def part_size(num_envs: int) -> int:
-    """Return P, the smallest part size with as few parts as parts of `PART_SIZE` environments would take."""
+    """Return P, the minimum part size that needs no more parts than `PART_SIZE` would."""
     return math.ceil(num_envs / math.ceil(num_envs / PART_SIZE))
 
 
@@ -37,7 +37,7 @@ def join_parts(parts: Sequence[Any], count: int, xp: ModuleType = jnp, axis: int
     Args:
         parts: Arrays with P environments along ``axis``.
         count: Number of environments to return.
-        xp: ``jax.numpy`` or ``numpy``, whose arrays these are.
+        xp: ``jax.numpy`` or ``numpy``, according to the type of the arrays.
         axis: Axis of environments, 0 or 1.
     """
     joined = xp.concatenate(parts, axis=axis)
@@ -48,12 +48,12 @@ def join_parts(parts: Sequence[Any], count: int, xp: ModuleType = jnp, axis: int
 class RolloutPart:
     """Random numbers of one part of a rollout, in a program that can run any part.
 
-    It has the methods that `rollout.play` calls on `shards.Shards`. Environment ``first + i`` starts as it does where all are
-    played at once, and its actions have the same noise. Image noise is drawn separately for each part: drawing that of all
-    environments would take longer than drawing the images.
+    It has the methods that `rollout.play` calls on `shards.Shards`. Environment ``first + i`` starts as it does in a rollout of
+    all environments, and its actions have the same noise. Image noise is sampled separately for each part: sampling it for all
+    environments would take longer than rendering the images.
 
     Attributes:
-        first: [] int32, number of the first environment. Beyond ``total`` there is no noise to draw, as in evaluations.
+        first: [] int32, index of the first environment. From ``total`` on, as in evaluations, no action noise is available.
         total: Number of environments in a whole rollout.
     """
 
@@ -61,17 +61,17 @@ class RolloutPart:
     total: int
 
     def draw(self, draw: Callable[[tuple[int, ...]], jax.Array], shape: tuple[int, ...]) -> jax.Array:
-        """Draw the numbers of all environments, and return this part's, of ``shape``; padded with zeros."""
+        """Sample numbers for all environments, and return those of this part, of ``shape``; padded with zeros."""
         drawn = draw((self.total, *shape[1:]))
         filled = jnp.concatenate([drawn, jnp.zeros(shape, drawn.dtype)])  # the last part may be longer than what is left
         return jax.lax.dynamic_slice_in_dim(filled, self.first, shape[0])
 
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-        """Draw standard normal numbers of ``shape``, different in every part."""
+        """Sample standard normal numbers of ``shape``, different in every part."""
         return jax.random.normal(jax.random.fold_in(key, self.first), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
-        """Return this part's slice of the keys that `jax.random.split` makes for all environments."""
+        """Return this part's slice of the keys that `jax.random.split` returns for all environments."""
         return jax.vmap(jax.random.fold_in, (None, 0))(key, self.first + jnp.arange(count))
 
 
@@ -80,7 +80,7 @@ def played_spec(env: GoalEnv, size: int, seeds: int) -> Played:
 
     Args:
         env: The environment.
-        size: P, environments in the part.
+        size: P, number of environments in the part.
         seeds: S.
     """
 

@@ -6,8 +6,8 @@
     autoencoder        latent               -> image
     optical_flow       latent, next latent  -> strength of the optical flow
 
-Each is a file of its own with a function ``make`` of a `Spec`. An `AuxTask` declares what it reads; the learner encodes, stores
-and samples what the tasks of a run declare, and knows none of them by name.
+Each is a separate file with a function ``make`` of a `Spec`. An `AuxTask` declares its inputs; the learner encodes, stores and
+samples what the tasks of a run declare, without referring to any task by name.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,19 +28,19 @@ _MAKERS: dict[str, Callable[[Spec], AuxTask]] = {
 }
 
 NAMES: tuple[str, ...] = tuple(_MAKERS)
-"""The tasks; first those of the thesis, in its order."""
+"""Names of the built-in tasks, in the order of the thesis."""
 
 
 def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[str, AuxTask]:
     """Build the named tasks; return them by `AuxTask.name`.
 
     Args:
-        names: Some of `NAMES`, and ``module:Name`` of functions of a `Spec` that return an `AuxTask`; or none.
+        names: Names out of `NAMES`, or ``module:Name`` of functions of a `Spec` that return an `AuxTask`; may be empty.
         spec: Sizes of the observation, the action and the latent.
         folder: Folder from which modules are imported first.
 
     Raises:
-        RequestError: A name is unknown or given twice, or there are no images.
+        RequestError: A name is unknown or occurs twice, or observations are not images.
     """
     makers = [find("auxiliary task", name, _MAKERS, folder) for name in names]
     for name in names:

@@ -1,8 +1,8 @@
-"""Auxiliary tasks and their weighting as parts of a learner, built from a `Config`.
+"""Auxiliary tasks and their weighting as components of a learner, built from a `Config`. They are used in
 
-collecting   what tasks compute of whole episodes (`AuxTask.episode`)
-sampling     views and targets of a batch (`AuxTask.view`, `AuxTask.target`)
-ddpg         latents of all observations that some task reads, losses, and a weighted gradient for each encoder
+collecting   to compute arrays of whole episodes (`AuxTask.episode`)
+sampling     to compute views and targets of a batch (`AuxTask.view`, `AuxTask.target`)
+ddpg         to compute latents of the observations that tasks read, losses, and a weighted gradient for each encoder
 """
 
 import dataclasses
@@ -21,9 +21,9 @@ from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
 from jaxrl_vis.types import Batch, Episodes, Params
 from jaxrl_vis.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, limited, make_weighting, with_cosines
 
-# Folded into a learner's key, for numbers that a weighting draws.
+# Folded into a learner's key for the samples of a weighting.
 _DRAWS = 0x647261
-_EPISODES_AT_ONCE = 10  # whose arrays are computed together: some 500 images fill a GPU, and more would fill its memory
+_EPISODES_AT_ONCE = 10  # processed together: about 500 images saturate a GPU, and more would exhaust its memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Auxiliary:
     """Auxiliary tasks of a learner, possibly none, and the weighting of their losses.
 
     Attributes:
-        tasks: By name.
+        tasks: Tasks by name.
         weighting: Weighting of their losses and the main one.
         way: Method of the gradients of losses (`weighting.gradients`).
     """
@@ -47,7 +47,7 @@ class Auxiliary:
 
     @property
     def encoded(self) -> tuple[str, ...]:
-        """Observations besides those before and the goals that are encoded with gradient: ``after``, and names of views."""
+        """Observations encoded with gradient, in addition to those before the action and goals: ``after``, names of views."""
         after = ("after",) if any("latent_tp1" in task.needs for task in self.tasks.values()) else ()
         return (*after, *(name for name, task in self.tasks.items() if task.view is not None))
 
@@ -94,9 +94,9 @@ class Auxiliary:
         """Add the views and targets of all tasks to a batch.
 
         Args:
-            key: [] a typed key, from which views are drawn.
-            batch: With raw images.
-            stored: [B, ...] by task, as the replay has it.
+            key: [] typed key for random views.
+            batch: Batch with raw images.
+            stored: [B, ...] by task, arrays stored in the replay.
         """
         views, targets = {}, {}
         for name, task in self.tasks.items():
@@ -122,7 +122,7 @@ class Auxiliary:
             view: Inputs that all tasks share.
             latents: [B, L] of the tasks' own views, by name.
             batch: The transitions, with targets.
-            latent_scales: [] float32 by name, factors of each loss's gradient in its latents; None: 1.
+            latent_scales: [] float32 by name, factors of each loss's gradient with respect to its latents; None for 1.
         """
         views = self._views(view, latents, batch)
         if latent_scales is not None:
@@ -137,11 +137,13 @@ class Auxiliary:
         return {name: task.predict(heads[name], views[name]) for name, task in self.tasks.items()}
 
     def main_latents(self, latents: jax.Array, weights: Mapping[str, jax.Array]) -> jax.Array:
-        """Scale the gradient of an actor's main loss in the latents by a weight that is not 1 by rule, and not for heads, too.
+        """Scale the gradient of an actor's main loss with respect to the latents by the main loss's weight.
+
+        Returns ``latents`` unchanged if that weight is always 1, or also applies to heads.
 
         Args:
             latents: [..., L].
-            weights: [] float32 by name, of the critic's losses.
+            weights: [] float32 by name, weights of the critic's losses.
         """
         if self.weighting.main or self.weighting.heads == "weighted":
             return latents
@@ -159,7 +161,7 @@ class Auxiliary:
 
 
 def _scale_latents(view: View, weight: jax.Array) -> View:
-    """Multiply the gradient in a view's latents by ``weight``; the latents stay as they are."""
+    """Multiply the gradient with respect to a view's latents by ``weight``, leaving the latents unchanged."""
     names = ("latent_t", "latent_tp1", "latent_view")
     latents = {name: getattr(view, name) for name in names if getattr(view, name) is not None}
     return view.replace(**{name: _scale_gradient(latent, weight) for name, latent in latents.items()})
@@ -187,14 +189,14 @@ def make_auxiliary(
     """Build the auxiliary tasks and the weighting of a configuration.
 
     Args:
-        config: The run.
+        config: Configuration of the run.
         observation: Shape and dtype of one observation.
         action_size: A.
-        frame_stack: Images that an observation stacks.
-        dtype: Dtype that the networks compute in.
+        frame_stack: Number of images that an observation stacks.
+        dtype: Compute dtype of the networks.
 
     Raises:
-        RequestError: They do not go together, or not with the rest of the configuration.
+        RequestError: Tasks and weighting are incompatible with each other or with the rest of the configuration.
     """
     if config.auxiliary.weighting in WEIGHTINGS:
         weighting = _bounded(config, make_weighting(config.auxiliary.weighting, **_options(config)))
@@ -230,7 +232,7 @@ def make_auxiliary(
 
 
 def _bounded(config: Config, weighting: Weighting) -> Weighting:
-    """Bound and scale the weights as the configuration says. OL-AUX has a greatest weight in its own rule."""
+    """Bound and scale the weights as configured. OL-AUX applies the maximum weight in its own rule."""
     maximum, total = config.study.weighting_maximum, config.study.weighting_total
     if config.auxiliary.weighting == "ol_aux":
         maximum = None
@@ -241,7 +243,7 @@ def _options(config: Config) -> dict[str, Any]:
     """Return the arguments for the constructor of the configuration's weighting.
 
     Raises:
-        RequestError: There are not as many values of eps as tasks.
+        RequestError: The number of values of eps differs from the number of tasks.
     """
     options: dict[str, Any] = {}
     tasks, each = config.auxiliary.aux_tasks, config.study.weighting_task_eps

@@ -37,14 +37,14 @@ def egomotion_pair(
     """Rotate images by random angles, uniform up to 30 degrees either way, and optionally shift them.
 
     Args:
-        key: [] a typed key.
+        key: [] typed key.
         images: [B, C, H, W] uint8.
         border: Treatment of empty corners.
-        max_shift: Farthest shift each way, as a share of the image's size; in the release 0.1, in the thesis none.
+        max_shift: Maximum shift in each direction, as a fraction of the image's size; 0.1 in the release, 0 in the thesis.
 
     Returns:
-        The images moved, [B, C, H, W] uint8, and the motion in [-1, 1]: angles [B, 1], or angles and shifts to the right and
-        down [B, 3], float32.
+        Transformed images [B, C, H, W] uint8, and motion in [-1, 1] in units of its maximum: angles [B, 1], or angles and
+        shifts to the right and down [B, 3], float32.
     """
     motion = jax.random.uniform(key, (images.shape[0], 3 if max_shift else 1), minval=-1.0, maxval=1.0)
     size = jnp.array([images.shape[-1], images.shape[-2]])
@@ -57,7 +57,7 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
 
     Args:
         images: [B, C, H, W] uint8.
-        angle: [B] float32 in radians, counter-clockwise as one sees it.
+        angle: [B] float32 in radians, counter-clockwise in the displayed image.
         shift: [B, 2] float32 in pixels, to the right and down.
         border: Treatment of empty corners.
     """
@@ -70,7 +70,7 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
         if border == "clip":
             along, across = jnp.abs(cos), jnp.abs(sin)
             zoom = jnp.minimum(last_x / (last_x * along + last_y * across), last_y / (last_x * across + last_y * along))
-        # Where each pixel comes from, as seen from the centre.
+        # Source position of each pixel, relative to the centre.
         right = zoom * (jnp.arange(width) - last_x / 2 - shift[0])
         down = zoom * (jnp.arange(height)[:, None] - last_y / 2 - shift[1])
         x, y = cos * right - sin * down + last_x / 2, sin * right + cos * down + last_y / 2
@@ -78,6 +78,6 @@ def rotate(images: jax.Array, angle: jax.Array, shift: jax.Array, border: Border
         is_inside = (jnp.abs(x - last_x / 2) <= width / 2) & (jnp.abs(y - last_y / 2) <= height / 2)
         return jnp.where(is_inside, read_words_between(words, x, y), jnp.uint32(0))
 
-    # A barrier, lest a compiler puts a word together for each of its bytes anew.
+    # The barrier keeps the compiler from recomputing a word for each of its bytes.
     words = jax.lax.optimization_barrier(jax.vmap(one)(to_words(images), angle, shift))
     return from_words(words, images.shape[1])

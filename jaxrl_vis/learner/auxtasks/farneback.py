@@ -1,21 +1,21 @@
 """Dense optical flow by polynomial expansion (Farnebäck, "Two-frame motion estimation based on polynomial expansion", 2003).
 
-Around every pixel, an image is fitted by a quadratic f(x) = x'Ax + b'x + c under a Gaussian weight. Where the next image is the
+Around every pixel, an image is fitted by a quadratic f(x) = x'Ax + b'x + c under a Gaussian weight. If the next image is the
 same surface displaced by d, its coefficients are A and b - 2Ad, so that
 
     A d = (b_t - b_t+1) / 2
 
-which is solved in the least-squares sense over a window around the pixel, with the coefficients of the next image read at the
-displacement that was found before; from coarse images to fine ones, several times at each.
+which is solved in the least-squares sense over a window around the pixel, with the coefficients of the next image sampled at
+the previous estimate of the displacement; from coarse levels to fine ones, with several iterations at each.
 
 Smoothing, resizing and the fit, borders included, are the same for all rows and for all columns. They are therefore two
 products with small constant matrices, L @ image @ R, into which successive steps are multiplied beforehand: an image is
-smoothed, resized and expanded at once. Images are small, so the zeros of these matrices cost less than kernels would.
+smoothed, resized and expanded at once. Images are small, so multiplying the zeros of these matrices is cheaper than convolving.
 
-Where the paper leaves a choice, it is that of OpenCV's ``calcOpticalFlowFarneback``, whose flow this agrees with: an image is
-reflected at its borders when it is smoothed and repeated when it is fitted, pixels near a border count less, no level of the
-pyramid is smaller than 32 pixels, and the determinant of the equations is regularised by 0.001. What that does depends on the
-unit of the grey levels: with 0 to 255 next to nothing; with 0 to 1 it leaves less than 0.001 pixels of the flow in our images.
+Details that the paper leaves open follow OpenCV's ``calcOpticalFlowFarneback``, with whose flow this agrees: borders are
+reflected for smoothing and replicated for the fit, pixels near a border get lower weights, no level of the pyramid is smaller
+than 32 pixels, and the determinant of the equations is regularised by 0.001. The effect of this depends on the unit of the grey
+levels: negligible for 0 to 255; for 0 to 1, less than 0.001 pixels of the flow remain in our images.
 """
 
 import dataclasses
@@ -38,12 +38,12 @@ class Settings:
     """Settings, called pyr_scale, levels, winsize, iterations, poly_n and poly_sigma in OpenCV; defaults as in the release.
 
     Attributes:
-        scale: Size of a level of the pyramid over that of the next finer one.
-        levels: The most levels above the image itself; those that would be too small are left out.
-        window: Width of the window that shares one displacement, pixels; odd.
-        iterations: At each level.
-        radius: Of the neighbourhood that is fitted, pixels.
-        sigma: Deviation of its Gaussian weight, pixels.
+        scale: Size of a pyramid level relative to the next finer one.
+        levels: Maximum number of levels above the image itself; levels that would be too small are omitted.
+        window: Width in pixels of the window that shares one displacement; odd.
+        iterations: Number of iterations at each level.
+        radius: Radius in pixels of the neighbourhood that is fitted.
+        sigma: Standard deviation of its Gaussian weight in pixels.
     """
 
     scale: float = 0.5
@@ -55,7 +55,7 @@ class Settings:
 
 
 Planes = tuple[Any, ...]
-"""Numbers of each pixel, as images [rows, columns] of their own: as one array, they would be copied on the way into it."""
+"""Quantities of each pixel, as separate images [rows, columns]: stacking them in one array would cost a copy."""
 
 
 def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settings()) -> jax.Array:
@@ -63,7 +63,7 @@ def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settin
 
     Args:
         images_t: [B, H, W] grey levels, 0 to 255, of any dtype.
-        images_tp1: The same, one step later.
+        images_tp1: Images one step later, in the same format.
         settings: Window, pyramid, iterations.
     """
     expand = jax.vmap(functools.partial(_expansions, settings=settings))
@@ -159,7 +159,7 @@ def _resizing(new: int, old: int) -> np.ndarray:
 
 @functools.cache
 def _fits(new: int, old: int, scale: float, radius: int, sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return matrices [new, old] that smooth and resize a line of pixels, and fit value, slope and curvature at each pixel.
+    """Return matrices [new, old] that smooth and resize a row of pixels, and fit value, slope and curvature at each pixel.
 
     The fit's normal equations separate: with g the Gaussian and m2, m4 its moments, the weights at distance x from the pixel
     are g, x g / m2 and (x^2 - m2) g / (m4 - m2^2). Those of a quadratic in two dimensions are products of these.
@@ -190,19 +190,19 @@ def _equations(expansion_t: Planes, expansion_tp1: Planes, found_right: jax.Arra
     """Compute A'A (xx, xy, yy) and A'(b_t - b_t+1)/2 (x, y) at each pixel, [rows, columns] each.
 
     Args:
-        expansion_t, expansion_tp1: From `_expansions`.
-        found_right, found_down: [rows, columns], the displacements so far.
+        expansion_t, expansion_tp1: Expansions from `_expansions`.
+        found_right, found_down: [rows, columns], current estimate of the displacements in pixels.
     """
     rows, columns = found_right.shape
     x, y = jnp.arange(columns) + found_right, jnp.arange(rows)[:, None] + found_down
     is_inside = (x >= 0) & (x < columns - 1) & (y >= 0) & (y < rows - 1)
     weight = np.outer(_border_weights(rows), _border_weights(columns)).astype(np.float32)
-    # What has left the image says nothing about curvature, and its slope counts as 0.
+    # For points that have left the image, use a slope of 0 and the curvature of the first image.
     outside = (0.0, 0.0, *expansion_t[2:])
     warped = [jnp.where(is_inside, there, other) for there, other in zip(read_planes_between(expansion_tp1, x, y), outside)]
     right, down = (0.5 * weight * (here - there) for here, there in zip(expansion_t[:2], warped[:2]))
     xx, yy, xy = (0.5 * weight * (here + there) for here, there in zip(expansion_t[2:], warped[2:]))
-    # The coefficients were read at the displacement so far, so what is missing is measured from there.
+    # The coefficients were sampled at the current displacement, so add its contribution.
     right, down = right + xx * found_right + xy * found_down, down + xy * found_right + yy * found_down
     return xx * xx + xy * xy, (xx + yy) * xy, yy * yy + xy * xy, xx * right + xy * down, xy * right + yy * down
 
@@ -218,7 +218,7 @@ def _border_weights(size: int) -> np.ndarray:
 def _solve(equations: Planes) -> Planes:
     """Solve the equations of each pixel, from `_equations`, for displacements (right, down)."""
     xx, xy, yy, right, down = equations
-    # Nothing moves farther than the image is wide. Along a straight edge, the determinant is rounding and nothing else.
+    # Bound displacements by the size of the image. Along a straight edge, the determinant is nothing but rounding error.
     limit = max(xx.shape)
     determinant = jnp.maximum(xx * yy - xy * xy, 0.0) + _REGULARIZATION
     numerators = yy * right - xy * down, xx * down - xy * right

@@ -10,8 +10,8 @@ from jaxrl_vis.types import Params
 def make(spec: Spec) -> AuxTask:
     """Build the task.
 
-    With ``spec.options.detach`` the next latent is a target only. The authors' release lets gradients into it, so that the
-    encoder can lower the loss by making all latents alike.
+    With ``spec.options.detach`` no gradient flows through the next latent. In the authors' release it does, so that the encoder
+    can reduce the loss by making all latents alike.
     """
     detach = spec.options.detach
 

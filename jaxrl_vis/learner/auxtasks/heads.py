@@ -1,8 +1,8 @@
 """Heads of auxiliary tasks: a linear layer, and a decoder from latents to an image.
 
-A transposed 2x2 convolution with stride 2 makes a 2x2 block of every pixel, so it IS a matrix product of [pixels, channels in]
+A transposed 2x2 convolution with stride 2 maps every pixel to a 2x2 block, so it IS a matrix product of [pixels, channels in]
 with [channels in, 4 * channels out]. As in the encoder (`networks`), images stay in nested 2x2 blocks (`blocks`), where the
-output of one layer is the input of the next: no copy in between, and none at the end if the target has that order, too.
+output of one layer is the input of the next: no copies in between, and none at the end if the target has the same order.
 """
 
 from typing import Any
@@ -18,12 +18,12 @@ from jaxrl_vis.types import Params
 
 _glorot = jax.nn.initializers.glorot_uniform()
 
-# Channels of a decoder: at every level but the finest one, and there; as in the authors' release.
+# Channels of a decoder: at every level but the finest one, and at the finest; as in the authors' release.
 _CHANNELS, _FINEST_CHANNELS = 64, 16
 
 
 def init_linear(key: jax.Array, inputs: int, outputs: int) -> Params:
-    """Initialise `linear`; like all last layers, it is named so that it stays in float32 (`Networks.compute_copy`)."""
+    """Initialise `linear`; the name ``output``, as for all last layers, keeps it in float32 (`Networks.compute_copy`)."""
     return {"output": {"kernel": _glorot(key, (inputs, outputs)), "bias": jnp.zeros((outputs,))}}
 
 
@@ -37,10 +37,10 @@ def init_decoder(key: jax.Array, inputs: int, shape: tuple[int, int, int], level
     """Initialise `decode`.
 
     Args:
-        key: [] a typed key.
-        inputs: Size of what is decoded.
-        shape: C, H, W of the image; what does not fill a block of 2^levels pixels is left out.
-        levels: Transposed convolutions.
+        key: [] typed key.
+        inputs: Size of the vectors to decode.
+        shape: C, H, W of the image; borders that do not fill a block of 2^levels pixels are cropped.
+        levels: Number of transposed convolutions.
     """
     channels, height, width = shape
     sizes = [_CHANNELS] * (levels - 1) + [_FINEST_CHANNELS, channels]
@@ -48,7 +48,7 @@ def init_decoder(key: jax.Array, inputs: int, shape: tuple[int, int, int], level
     dense = (inputs, (height >> levels) * (width >> levels) * sizes[0])
     params = {"dense": {"kernel": _glorot(dense_key, dense), "bias": jnp.zeros(dense[1:])}}
     for level, (layer_key, before, after) in enumerate(zip(keys, sizes[:-1], sizes[1:])):
-        # Initialised as the convolution that it is: fan-in and fan-out count the window too.
+        # Initialise like a convolution: fan-in and fan-out include the window.
         kernel = _glorot(layer_key, (2, 2, before, after)).transpose(2, 0, 1, 3).reshape(before, 4 * after)
         params[f"up_{level}"] = {"kernel": kernel, "bias": jnp.zeros((after,))}
     return params

@@ -5,15 +5,15 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 
-_LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601, which OpenCV uses, too
+_LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601, as in OpenCV
 
 
 def grey(images: jax.Array, frame_stack: int = 1) -> jax.Array:
     """Return the luminance of each observation's newest image, or its depth if it has no colours: [B, H, W] float32.
 
     Args:
-        images: [B, C, H, W] of any dtype: R, G, B and D, R, G and B, or D, for each image of the stack, the newest first.
-        frame_stack: Images that an observation stacks.
+        images: [B, C, H, W] of any dtype; channels RGBD, RGB or D of each image of the stack, the newest first.
+        frame_stack: Number of images that an observation stacks.
     """
     channels = images.shape[-3] // frame_stack
     if channels < len(_LUMINANCE):
@@ -27,8 +27,8 @@ def read_planes_between(planes: Sequence[jax.Array], x: jax.Array, y: jax.Array)
 
     Args:
         planes: [H, W] each, of any dtype.
-        x, y: [...] float32, columns and rows, counted from the centre of the first; outside of the image, the nearest border
-            pixel is read.
+        x, y: [...] float32, columns and rows, relative to the centre of the first pixel; outside of the image, the nearest
+            border pixel is used.
     """
     height, width = planes[0].shape
     first, right, down = _neighbours(height, width, x, y)
@@ -60,7 +60,7 @@ _BYTES = 4  # in a word
 def to_words(images: jax.Array) -> jax.Array:
     """Pack four channels into each word: [B, C, H, W] uint8 -> [B, ceil(C / 4), H, W] uint32, padded with zeros.
 
-    A pixel is then read once for four channels.
+    Four channels of a pixel are then read at once.
     """
     batch, channels, *size = images.shape
     padded = jnp.pad(images, [(0, 0), (0, -channels % _BYTES), (0, 0), (0, 0)]).astype(jnp.uint32)
@@ -70,7 +70,7 @@ def to_words(images: jax.Array) -> jax.Array:
 
 
 def from_words(words: jax.Array, channels: int) -> jax.Array:
-    """Undo `to_words`: [B, words, H, W] uint32 -> [B, channels, H, W] uint8."""
+    """Invert `to_words`: [B, words, H, W] uint32 -> [B, channels, H, W] uint8."""
     batch, _, *size = words.shape
     apart = jnp.stack([_byte(words, byte) for byte in range(_BYTES)], axis=2)
     return apart.reshape(batch, -1, *size)[:, :channels].astype(jnp.uint8)
@@ -85,7 +85,7 @@ def read_words_between(words: jax.Array, x: jax.Array, y: jax.Array) -> jax.Arra
 
     Args:
         words: [words, H, W] uint32 from `to_words`.
-        x, y: As of `read_planes_between`.
+        x, y: See `read_planes_between`.
     """
     count, height, width = words.shape
     first, right, down = _neighbours(height, width, x, y)

@@ -12,7 +12,7 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task. The flow is computed once per episode, since it takes longer than the rest of a gradient step."""
+    """Build the task. The flow is computed once per episode, as it takes longer than the rest of a gradient step."""
     stretch = spec.options.stretch
     _, height, width = spec.observation.shape
     whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
@@ -64,11 +64,11 @@ def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int =
 
     Args:
         images_t: [B, C, H, W] uint8, observations before the action.
-        images_tp1: The same after it.
-        frame_stack: Images that an observation stacks; the newest ones count.
-        stretch: True to stretch each mask to [0, 1], as in the authors' release, whose grey levels lie in [0, 1], too. This
-            discards speeds, and amplifies rounding errors where nothing moves. At such grey levels, Farneback's regularisation
-            outweighs the images (`farneback`), so that sharp edges count more than their speed.
+        images_tp1: [B, C, H, W] uint8, observations after the action.
+        frame_stack: Number of images that an observation stacks; the newest ones are used.
+        stretch: Whether to stretch each mask to [0, 1], as in the authors' release, whose grey levels also lie in [0, 1]. This
+            discards speeds, and amplifies rounding errors if nothing moves. At such grey levels, Farneback's regularisation
+            dominates (`farneback`), so that the sharpness of edges matters more than their speed.
     """
     unit = _unit(stretch)
     return _strength(farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit), stretch)

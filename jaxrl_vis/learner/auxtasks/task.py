@@ -1,11 +1,11 @@
 """Interface of an auxiliary task, and the records that it reads.
 
-A task is a head on the latents of an encoder and a loss. It declares what it wants beyond the latents of an observation:
+A task is a head on the latents of an encoder, and a loss. It declares its inputs beyond the latents of an observation:
 
-    needs      latents and images that other tasks may need, too                                  `View`
-    episode    arrays that are computed once an episode, and lie beside it in the replay          [T, ...] for its T steps
-    view       images of its own that are encoded, made anew for each batch, and what belongs to them: its target
-    target     a target that follows from a batch and from what ``episode`` has computed
+    needs      latents and images that are shared with other tasks                                `View`
+    episode    arrays that are computed once per episode and stored with it in the replay         [T, ...] for its T steps
+    view       images of its own to be encoded, recomputed for each batch, together with its target
+    target     target computed from a batch and from the arrays of ``episode``
 """
 
 import dataclasses
@@ -19,8 +19,9 @@ import jax.numpy as jnp
 from jaxrl_vis.types import Params, Replaceable
 
 Border = Literal["clip", "zero"]
-"""Treatment of the corners that a rotation leaves empty. ``clip``: the image is clipped to the largest rectangle of its own
-proportions that has none, and scaled to its old size, as in the thesis. ``zero``: they are 0, as in the authors' release."""
+"""Treatment of the empty corners of a rotated image. ``clip``: the image is cropped to the largest rectangle of its aspect
+ratio without empty corners, and scaled to its original size, as in the thesis. ``zero``: filled with 0, as in the authors'
+release."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,10 +29,10 @@ class Options:
     """Options in which the thesis and the authors' release differ: the defaults follow the thesis, `RELEASE` the release.
 
     Attributes:
-        detach: Whether the loss of forward dynamics leaves the next latent alone. The thesis does not say; in the release, it
-            does not.
-        border: Treatment of the corners that a rotation leaves empty.
-        max_shift: Farthest shift that comes with a rotation, as a share of the image's size.
+        detach: Whether forward dynamics stops the gradient through the next latent. Unspecified in the thesis; not in the
+            release.
+        border: Treatment of the empty corners of a rotated image.
+        max_shift: Maximum shift applied after a rotation, as a fraction of the image's size.
         in_grey: Whether the autoencoder reconstructs one grey channel rather than the observation.
         stretch: Whether each mask of optical flow is stretched to [0, 1], rather than being in pixels.
     """
@@ -44,7 +45,7 @@ class Options:
 
 
 RELEASE = Options(detach=False, border="zero", max_shift=0.1, in_grey=True, stretch=True)
-"""The authors' release. A shift of 0.1 is 10 of its 100 pixels."""
+"""Options of the authors' release, where a shift of 0.1 is 10 of 100 pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +55,10 @@ class Spec:
     Attributes:
         observation: Shape [C, H, W] and dtype uint8 of one observation.
         action_size: A.
-        latent_size: L, of an encoded observation.
-        frame_stack: Images that an observation stacks along C, the newest first.
-        levels: Strided layers of the encoder; decoders have as many.
-        dtype: Dtype that decoders compute in. Their last step, linear heads and losses are float32.
+        latent_size: L, size of an encoded observation.
+        frame_stack: Number of images that an observation stacks along C, the newest first.
+        levels: Number of strided layers of the encoder; decoders have as many.
+        dtype: Compute dtype of decoders. Their last step, linear heads and losses are float32.
         options: Differences between the thesis and the release.
     """
 
@@ -74,10 +75,10 @@ class Transitions(NamedTuple):
     """Batch of B sampled transitions, before images are shifted or normalised.
 
     Attributes:
-        images_t: [B, C, H, W] uint8, before the action.
-        images_tp1: The same after it.
+        images_t: [B, C, H, W] uint8, observations before the action.
+        images_tp1: [B, C, H, W] uint8, observations after the action.
         action: [B, A] float32 in [-1, 1], as executed.
-        stored: [B, ...] what `AuxTask.episode` has computed for these steps; None where the task has none.
+        stored: [B, ...] result of `AuxTask.episode` for these steps; None if the task has none.
     """
 
     images_t: jax.Array
@@ -96,10 +97,10 @@ class View(Replaceable):
         action: [B, A] float32 in [-1, 1], as executed.
         latent_tp1: [B, L] of the observations after the action.
         image: [B, C, H, W] any float dtype, the observations before, normalised as for the encoder.
-        latent_view: [B, L] of the images that the task's own ``view`` has made.
-        target: Result of the task's own ``view`` or ``target``.
-        patches: [at least B, patches, 64 C'], ``image`` and others as `kernels.encoder.prepare` orders them, where the encoder
-            reads them so: decoders, too, are kernels then (`kernels.decoder`).
+        latent_view: [B, L] of the images from the task's own ``view``.
+        target: Target from the task's own ``view`` or ``target``.
+        patches: [at least B, patches, 64 C'], ``image`` and others in the order of `kernels.encoder.prepare`, if the encoder
+            reads them in this form: decoders can then be kernels, too (`kernels.decoder`). None otherwise.
     """
 
     latent_t: jax.Array
@@ -120,16 +121,16 @@ class AuxTask(NamedTuple):
         predict: (parameters, View) -> prediction of the head, float32: a latent [B, L], an action [B, A], a motion [B, 1 or 3],
             an image [B, C, H, W] or a flow strength [B, H, W]. Images end where the encoder's last whole block does.
         loss: (parameters, View) -> [] float32, such as the mean squared error of that prediction.
-        needs: Of ``latent_tp1`` and ``image``, the fields of `View` that it reads.
+        needs: Optional fields of `View` that it reads, out of ``latent_tp1`` and ``image``.
         episode: [T + 1, C, H, W] uint8, images of an episode -> [T, ...] uint8 or float32. Computed once, when an episode is
             collected: a transition is sampled 5 to 20 times.
-        view: (key, Transitions) -> (images [B, C, H, W] uint8 to be encoded, target). They are shifted as the batch is.
+        view: (key, Transitions) -> (images [B, C, H, W] uint8 to be encoded, target). The images are shifted like the batch.
         target: Transitions -> target, for tasks without ``view``.
-        shift: (target, [B, 2] int32 pixels) -> target where a batch's images are shifted so far down and to the right; None:
-            the same target.
-        number: uint32, folded into keys for what the task draws, so that it draws alike whichever other tasks there are; None:
-            a digest of the name.
-        draws_unfolded: Whether ``view`` draws with the batch's own key, which only one task may do.
+        shift: (target, [B, 2] int32 pixels) -> target for images shifted by this down and to the right; None if the target does
+            not change.
+        number: uint32, folded into the task's random keys, so that its samples do not depend on the other tasks; None for a
+            digest of the name.
+        draws_unfolded: Whether ``view`` uses the batch's own key, which only one task may do.
     """
 
     name: str
@@ -153,7 +154,7 @@ def read(view: View, field: str) -> jax.Array:
     """Return an optional field of a view.
 
     Raises:
-        ValueError: It was left out.
+        ValueError: The field is None.
     """
     value = getattr(view, field)
     if value is None:

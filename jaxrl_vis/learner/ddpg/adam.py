@@ -1,8 +1,8 @@
 """Adam (Kingma and Ba, 2015) for several networks at once: `optax.adam` with its states, in fewer GPU kernels.
 
-XLA makes one kernel of the steps of all arrays of one shape, whichever network they belong to, if there is an array that these
-steps all read. A single number does not count. So what changes from one step to the next, for all networks and both moments,
-is one array here (`corrections`), where optax has a number for each.
+XLA fuses the steps of all arrays of one shape, of any network, into one kernel if these steps read a common array; a scalar is
+not enough. The bias corrections, which change at each step, are therefore one array for all networks and both moments
+(`corrections`), while optax has a scalar for each.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ import optax
 
 from jaxrl_vis.types import Params
 
-# Of both moments; these and the other one are optax's own.
+# Decay rates of both moments, and the constant in the denominator; defaults of optax.
 _DECAYS = (0.9, 0.999)
 _SMALL = 1e-8
 
@@ -24,7 +24,7 @@ def init(params: Params) -> Any:
 
 
 def count(state: Any) -> jax.Array:
-    """Return the number of steps that a state has seen, [] int32."""
+    """Return the number of steps that a state has taken, [] int32."""
     return state[0].count
 
 
@@ -46,10 +46,10 @@ def step(params: Params, gradient: Params, state: Any, learning_rate: float, cor
     """Take one step of one network; return new parameters, and a state with new moments and the old `count`.
 
     Args:
-        params: float32.
-        gradient: Likewise.
-        state: As of optax; its `count` is not read.
-        learning_rate: The size of a step.
+        params: Parameters, float32.
+        gradient: Gradient, float32.
+        state: State of optax; its `count` is not read.
+        learning_rate: Learning rate.
         correction: [2] float32, a row of `corrections`.
     """
     moments = state[0]

@@ -1,14 +1,14 @@
 """Deep deterministic policy gradient with goals (Lillicrap et al., 2016), as pure functions.
 
-    prepare      inputs of the networks, which nothing that is learned changes
+    prepare      inputs of the networks, which do not depend on learned parameters
     gradients    losses of a batch, main and auxiliary, and one weighted gradient for each network
     apply        optimisers, then target networks
     update       all of them, in a scan over the batches of an iteration
 
 The losses are in `objectives`.
 
-Encoding images is most of the work, and `Config` can save some of it: ``encoders="shared"`` lets the actor act on the critic's
-latents, too, ``target_encoder=False`` computes targets with the online encoders, and ``actor_interval`` spares the actor steps.
+Encoding images dominates the cost, and options of `Config` reduce it: with ``encoders="shared"`` the actor uses the critic's
+latents, with ``target_encoder=False`` targets use the online encoders, and ``actor_interval`` makes actor steps less frequent.
 """
 
 import dataclasses
@@ -33,9 +33,9 @@ from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, Metrics, Params, Replaceable, Statistics
 from jaxrl_vis.weighting import MAIN, Weighted, WeightingState
 
-# Folded into the networks' keys for the heads of auxiliary tasks, so that these change nothing else.
+# Folded into the networks' keys for the heads of auxiliary tasks, so that these change no other random numbers.
 _HEADS = 0x686473
-# The same for a model that makes rewards.
+# Folded into the agent's key for a reward model.
 _REWARD_MODEL = 0x617574
 
 
@@ -45,12 +45,12 @@ class Agent(Replaceable):
     """Networks, their targets and optimisers.
 
     Attributes:
-        actor, critic: Online parameters. The actor is a head alone where it shares the critic's encoder.
-        target_actor, target_critic: Slowly following copies; heads alone without target encoders.
+        actor, critic: Online parameters. The actor is only a head if it shares the critic's encoder.
+        target_actor, target_critic: Slowly updated copies; only heads without target encoders.
         actor_optimizer, critic_optimizer: optax states.
-        updates: [] int32, gradient steps taken (fewer than 2^31 in any run that ends).
-        weighting: `weighting.WeightingState` of the auxiliary losses; None where there is nothing to remember.
-        reward_model: `learned_reward.ModelState`; None where rewards come from elsewhere.
+        updates: [] int32, number of gradient steps taken (below 2^31 in any realistic run).
+        weighting: `weighting.WeightingState` of the auxiliary losses; None without a weighting.
+        reward_model: `learned_reward.ModelState`; None if rewards come from elsewhere.
     """
 
     actor: Params
@@ -68,11 +68,10 @@ class Working(NamedTuple):
     """Agent between two gradient steps of one iteration.
 
     Attributes:
-        agent: The agent; its counters are those of the beginning.
-        copies: Its parameters as the networks compute with them.
-        scaling: Scaling of observations. It stays the same, and is here because it would otherwise be worked out in every step,
-            before all else.
-        counts: [3] int32, gradient steps: those of the critic, of the actor, and `Agent.updates`.
+        agent: The agent; its counters are unchanged since the start of the iteration (and thus stale).
+        copies: Copies of its parameters in the compute dtype.
+        scaling: Scaling of observations. Constant, but carried so that it is not recomputed at the start of every step.
+        counts: [3] int32, number of gradient steps of the critic and of the actor, and `Agent.updates`.
     """
 
     agent: Agent
@@ -85,10 +84,10 @@ class Prepared(NamedTuple):
     """Batch in the form that `GradientSteps.gradients` takes.
 
     Attributes:
-        batch: With rewards.
-        inputs: Its observations as the encoders read them.
-        image: [B, C, H, W] its observations before the action, normalised, where an auxiliary task asks for them; else None.
-        noise: [B, A] float32, added to the next actions in the critic's targets; None: nothing.
+        batch: Batch of transitions, with rewards unless a learned model computes them.
+        inputs: Its observations in the form that encoders read.
+        image: [B, C, H, W] its observations before the action, normalised, if an auxiliary task needs them; else None.
+        noise: [B, A] float32, added to the next actions in the critic's targets; None for no noise.
     """
 
     batch: Batch
@@ -101,9 +100,9 @@ class Gradients(NamedTuple):
     """Gradients of a batch.
 
     Attributes:
-        critic, actor: For the optimisers, float32; None if the actor is not updated.
-        weighting: State of the weighting after this batch; None where there is nothing to remember.
-        reward_model: For the optimiser of the model that makes rewards; None where there is none.
+        critic, actor: Gradients for the optimisers, float32; ``actor`` is None if the actor is not updated.
+        weighting: State of the weighting after this batch; None without a weighting.
+        reward_model: Gradient for the optimiser of the reward model; None if there is none.
     """
 
     critic: Params
@@ -118,8 +117,8 @@ class GradientSteps(NamedTuple):
     Attributes:
         init: key -> Agent.
         begin: (Agent, Statistics) -> Working, before the first of several gradient steps.
-        prepare: (Working, Batch with rewards) -> Prepared, the same for every gradient step after one `begin`.
-        gradients: (Working, Prepared, whether for the actor, too) -> (Gradients, metrics of [] float32).
+        prepare: (Working, Batch) -> Prepared, which is the same at every gradient step after one `begin`.
+        gradients: (Working, Prepared, whether to include the actor) -> (Gradients, metrics, [] float32 by name).
         apply: (Working, Gradients) -> Working, after one gradient step.
         end: Working -> Agent.
     """
@@ -161,12 +160,12 @@ def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedRewa
 
 
 def _stack_counts(agent: Agent) -> jax.Array:
-    """Stack `Working.counts` in one array: XLA would launch a kernel per scalar counter."""
+    """Stack `Working.counts` in one array: XLA would launch a kernel for each scalar counter."""
     return jnp.stack([adam.count(agent.critic_optimizer), adam.count(agent.actor_optimizer), agent.updates])
 
 
 def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
-    """Put the counters back into the agent."""
+    """Restore the counters in the agent."""
     return agent.replace(
         critic_optimizer=adam.with_count(agent.critic_optimizer, counts[0]),
         actor_optimizer=adam.with_count(agent.actor_optimizer, counts[1]),
@@ -175,7 +174,7 @@ def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
 
 
 def _compute_copies(networks: Networks, agent: Agent) -> ComputeCopies:
-    """Make the compute copies of all four networks."""
+    """Return the compute copies of all four networks."""
     return ComputeCopies(*map(networks.compute_copy, _network_parameters(agent)))
 
 
@@ -210,7 +209,7 @@ def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config
 
 
 def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, goals: jax.Array) -> Metrics:
-    """Implement `Algorithm.diagnose`: the mean value of the policy's actions where the goal itself is observed."""
+    """Implement `Algorithm.diagnose`: the mean value of the policy's actions if the observation is the goal itself."""
     own = (statistics.observations,) if statistics.own_goals is None else (statistics.observations, statistics.goals)
     inputs = [networks.prepare(networks.scaling(part), goals) for part in own]
 
@@ -223,7 +222,7 @@ def _value_at_goals(networks: Networks, agent: Agent, statistics: Statistics, go
 
 
 def _loss_metrics(weighted: Weighted, value: jax.Array) -> Metrics:
-    """Return metrics: the critic's losses, their weighting, and the mean of its values [B]."""
+    """Return the metrics of the critic: its losses, their weighting, and the mean of its values [B]."""
     return {
         "train/critic_loss": weighted.losses[MAIN],
         "train/value": jnp.mean(value),
@@ -241,7 +240,7 @@ def make_ddpg(
         networks: Architecture of the parameters.
         config: Learning rates, target decay, action penalty.
         resolved: Discount, bounds of the targets, filter threshold.
-        auxiliary: Auxiliary tasks; None: those of ``config``, without stacked images.
+        auxiliary: Auxiliary tasks; None for those of ``config``, without stacked images.
         shards: Shards of the learner: batches are those of one shard, gradients and metrics those of the whole.
     """
     if auxiliary is None:
@@ -283,7 +282,7 @@ def make_ddpg(
         if learned_reward is not None and rewarded is not None:
             metrics[f"train/{learned_reward.name}_loss"] = rewarded.loss
         of_model = rewarded.gradient if rewarded is not None else None
-        # Of a learner in several parts, this is the one thing that an update waits for the others for.
+        # Average everything that was not reduced earlier over the shards of a learner, in one all-reduce.
         own_gradient = None if learning.reduces_early else weighted.gradient
         own_gradient, actor_gradient, of_model, metrics, mean_square, counts = shards.mean(
             (own_gradient, actor_gradient, of_model, metrics, mean_square, counts)
@@ -318,7 +317,7 @@ DrawNoise = Callable[[jax.Array, int], jax.Array]
 def make_update(
     config: Config, steps: GradientSteps, draw_noise: DrawNoise | None = None
 ) -> Callable[..., tuple[Agent, Metrics]]:
-    """Build `Algorithm.update` from gradient steps; ``draw_noise`` None: no noise in targets."""
+    """Build `Algorithm.update` from gradient steps; without noise in targets if ``draw_noise`` is None."""
     interval = config.ddpg.actor_interval
 
     def update(agent: Agent, statistics: Statistics, batches: Batches, key: jax.Array) -> tuple[Agent, Metrics]:
@@ -327,8 +326,8 @@ def make_update(
         def take(state: tuple[Working, Prepared], following: Any) -> tuple[tuple[Working, Prepared], jax.Array]:
             """Take gradient steps, of which only the last updates the actor; unrolled, so that the body has no conditional.
 
-            Each has its batch already, and reads and prepares the next one. A GPU does that while it computes; with its own
-            batch it would have to begin with it.
+            Each step receives its prepared batch, and prepares the next one, which a GPU can do while it computes; otherwise,
+            it would have to wait for its own batch first.
             """
             (working, prepared), rows = state, []
             for number in range(interval):
@@ -337,7 +336,7 @@ def make_update(
                 working, prepared = steps.apply(working, gradients), coming
                 rows.append(metrics)
             names[:] = rows[-1]
-            # As one vector, because writing each number by itself would be a kernel each.
+            # Stack metrics in one vector, because writing each scalar would take a kernel.
             metrics = jnp.stack([_mean([row[name] for row in rows if name in row]) for name in names])
             return (working, prepared), metrics
 
@@ -345,7 +344,7 @@ def make_update(
             choice, noise = row
             return steps.prepare(working, batches.read(choice))._replace(noise=noise)
 
-        # Drawn for all gradient steps at once, as the choices are: one by one it would be kernels in each.
+        # Sample noise for all gradient steps at once, like the choices, which saves kernels in each step.
         count = jax.tree.leaves(batches.choices)[0].shape[0]
         rows = (batches.choices, None if draw_noise is None else draw_noise(key, count))
         working = steps.begin(agent, statistics)
@@ -372,8 +371,8 @@ def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = No
 
     Args:
         setup: Configuration and sizes.
-        critic_heads: Heads of the critic, which learn the same target, the least of theirs (`Networks.critic_heads`).
-        draw_noise: Noise on the actions in targets; None: none.
+        critic_heads: Number of critic heads, which share one target, the minimum of theirs (`Networks.critic_heads`).
+        draw_noise: Sampler of the noise on actions in targets; None for no noise.
     """
     config, resolved = setup.config, setup.resolved
     networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias, critic_heads)

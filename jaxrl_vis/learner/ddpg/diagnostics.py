@@ -1,7 +1,7 @@
-"""Diagnostics of a batch's rewards against the ground truth, which only a simulation knows.
+"""Diagnostics of a batch's rewards against the ground truth, which is known only in simulation.
 
-Shares of one batch are means of products, so that a quotient of two of them, averaged over many batches, is the share over all
-of these batches: precision of the filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
+The ratio of two fractions, each averaged over many batches, estimates the fraction over all of these batches: precision of the
+filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
 """
 
 from typing import Any
@@ -20,16 +20,16 @@ def count_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` turns them into shares.
+    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` converts them to fractions.
 
-    Where a batch is spread over devices, the mean of these over the devices comes in between.
+    If a batch is divided among devices, average the counts over the devices before calling `shares`.
 
     Args:
         reward: [B] float32.
-        keep: [B] float32, 0 for what the filter drops (`losses.keep_mask`).
+        keep: [B] float32, 0 for transitions dropped by the filter (`losses.keep_mask`).
         reward_positive, reward_negative: R+ and R-.
-        success: [B] float32, 1 where the goal was truly reached; None: no comparison with the truth.
-        graded: True if rewards lie anywhere between R- and R+: one in the middle counts as half a positive.
+        success: [B] float32, 1 if the goal was truly reached; None for no comparison with the truth.
+        graded: Whether rewards may lie anywhere between R- and R+: one in the middle counts as half a positive.
     """
     if graded:
         positive = (reward - reward_negative) / (reward_positive - reward_negative)
@@ -53,10 +53,10 @@ def of_rewards(*args: Any, **kwargs: Any) -> Metrics:
 
 
 def shares(counts: Metrics, parts: int = 1) -> Metrics:
-    """Compute shares of a batch, [] float32 by name; docs/learner.md defines them.
+    """Compute fractions of a batch, [] float32 by name; docs/learner.md defines them.
 
     Args:
-        counts: From `count_rewards`; of a batch in several parts, the mean over these.
+        counts: Counts from `count_rewards`; for a batch in several parts, their mean over the parts.
         parts: Number of parts.
     """
 

@@ -1,9 +1,9 @@
-"""Rewards of models that are trained along with the learner: an encoder of images of their own, and a loss.
+"""Reward models that are trained alongside the learner: each has its own image encoder, and a loss.
 
-    autoencoder   cosine of the latents of achieved observation and goal (thesis, section 5.1.5, Auto Encoder); reconstructs
-                  achieved observations
-    classifier    probability that the achieved observation is the goal (after VICE: Fu et al., 2018, arXiv 1805.11686); tells
-                  goals, each with itself, from achieved observations with their goals
+    autoencoder   cosine of the latents of achieved observation and goal (thesis, section 5.1.5, Auto Encoder); trained to
+                  reconstruct achieved observations
+    classifier    probability that the achieved observation is the goal (after VICE: Fu et al., 2018, arXiv 1805.11686);
+                  trained to discriminate goals paired with themselves from achieved observations paired with their goals
 
 Rewards lie between R- and R+, and are recomputed for every batch with the current model, without gradient.
 """
@@ -29,10 +29,10 @@ from jaxrl_vis.types import Batch, Params, Replaceable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ModelState(Replaceable):
-    """State of a model between two gradient steps.
+    """State of a reward model between two gradient steps.
 
     Attributes:
-        params: Nested dictionaries of float32.
+        params: Parameters, nested dictionaries of float32 arrays.
         optimizer: optax state.
     """
 
@@ -45,8 +45,8 @@ class Rewarded(NamedTuple):
 
     Attributes:
         reward: [B] float32, without gradient.
-        loss: [] float32, the model's.
-        gradient: Gradient of that loss, for the parameters, float32.
+        loss: [] float32, loss of the model.
+        gradient: Gradient of the loss with respect to the model's parameters, float32.
     """
 
     reward: jax.Array
@@ -55,12 +55,12 @@ class Rewarded(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Observations that a model compares, as encoders read them.
+    """Observations that a model compares, in the form that encoders read.
 
     Attributes:
-        reached, goal: Pieces of prepared observations, of B transitions each.
-        image: [B, C, H, W] what was reached, normalised.
-        batch: The transitions.
+        reached, goal: Prepared achieved observations and goals of B transitions, as pieces.
+        image: [B, C, H, W] achieved observations, normalised.
+        batch: Batch of transitions.
     """
 
     reached: list[Piece]
@@ -74,11 +74,11 @@ class LearnedReward:
     """Model of one configuration; all methods are pure. Create it with `make_learned_reward`.
 
     Attributes:
-        name: Method, for the name of its loss.
+        name: Name of the method, used for the metric of its loss.
         networks: Architecture of the encoder.
         init_params: key -> parameters.
         loss_and_reward: (parameters, `Seen`) -> loss [] and rewards [B] float32.
-        optimizer: Of the parameters.
+        optimizer: Optimiser of the parameters.
     """
 
     name: str
@@ -96,10 +96,10 @@ class LearnedReward:
         """Compute the rewards of a batch, and the model's gradient.
 
         Args:
-            state: The model.
+            state: State of the model.
             scaling: Scaling of observations.
-            inputs: From `Networks.prepare_batch`.
-            batch: The transitions.
+            inputs: Observations from `Networks.prepare_batch`.
+            batch: Batch of transitions.
         """
         if batch.reached is None:
             reached, pieces = batch.observation_tp1, inputs.pieces("after")
@@ -117,7 +117,7 @@ class LearnedReward:
 
 
 def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
-    """Build the autoencoder, in whose latent space observations are compared."""
+    """Build the autoencoder in whose latent space observations are compared."""
     shape = networks.observation_spec, networks.action_size, config.network.latent_size
     spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
@@ -139,7 +139,7 @@ def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> 
 def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
     """Build the classifier of pairs of achieved observation and goal.
 
-    All that was achieved counts as a negative, as in VICE, even where it is the goal: there, both classes are equally likely.
+    All achieved observations are negatives, as in VICE, even if they equal the goal: both classes are then equally likely.
     """
     head = networks.head(1)
 
@@ -153,7 +153,7 @@ def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> L
         pairs = jnp.stack([jnp.concatenate([goal, reached]), jnp.concatenate([goal, goal])])
         of_goals, of_reached = head.apply({"params": params["head"]}, pairs)[:, 0].reshape(2, -1)
         loss = jnp.mean(jax.nn.softplus(-of_goals)) + jnp.mean(jax.nn.softplus(of_reached))
-        share = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair that is in both classes has half of R+ to R-
+        share = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair in both classes, of probability 1/2, gets R+
         return loss, resolved.reward_negative + (resolved.reward_positive - resolved.reward_negative) * share
 
     return LearnedReward("classifier", networks, init, loss_and_reward, optax.adam(config.ddpg.critic_learning_rate))
@@ -167,11 +167,11 @@ def make_learned_reward(networks: Networks, config: Config, resolved: Resolved) 
 
     Args:
         networks: Architecture of the model's own encoder.
-        config: The method and the step size, that of the critic.
+        config: Configuration with the method and the learning rate, which is that of the critic.
         resolved: R+ and R-.
 
     Raises:
-        RequestError: Observations are no images.
+        RequestError: The method needs images, and observations are states.
     """
     method = resolved.method
     if method.needs_images and not networks.sees_images:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 LOG_FLOOR = 1e-6
-"""Least number whose logarithm is a loss; nearer to the greatest value, an actor has nothing to gain."""
+"""Minimum argument of a logarithm in a loss; values this close to the maximum give the actor no gradient."""
 
 
 def td_target(
@@ -28,20 +28,23 @@ def td_target(
         reward_t: [B] float32, rewards of the transitions.
         value_tp1: [B] float32, the target critic's values of the target actor's actions in the next states.
         discount: gamma.
-        minimum: Least target, R-/(1-gamma).
-        maximum: Greatest target, R+/(1-gamma).
+        minimum: Minimum target, R-/(1-gamma).
+        maximum: Maximum target, R+/(1-gamma).
     """
     return jax.lax.stop_gradient(jnp.clip(reward_t + discount * value_tp1, minimum, maximum))
 
 
 def keep_mask(reward_t: jax.Array, value_t: jax.Array, reward_negative: float, threshold: float) -> jax.Array:
-    """Return 0 for negatives that their value marks as false, else 1 (thesis, 5.1.4): [B] float32.
+    """Return 0 for negatives whose value exceeds the threshold and which are thus likely false, else 1 (thesis, 5.1.4).
 
     Args:
         reward_t: [B] float32, rewards.
         value_t: [B] float32, the online critic's values of the same transitions.
         reward_negative: R-.
         threshold: q0; infinity keeps everything.
+
+    Returns:
+        [B] float32, without gradient.
     """
     false_negative = (reward_t == reward_negative) & (value_t > threshold)
     return jax.lax.stop_gradient(1.0 - false_negative.astype(jnp.float32))
@@ -54,7 +57,7 @@ def critic_loss(value_t: jax.Array, target: jax.Array, keep: jax.Array, count: j
         value_t: [B] float32, the online critic's values.
         target: [B] float32, from `td_target`.
         keep: [B] float32, 0 or 1, from `keep_mask`.
-        count: [] float32, transitions to divide the sum by; None: the sum of ``keep``, at least 1.
+        count: [] float32, divisor of the sum; None for the sum of ``keep``, at least 1.
     """
     count = jnp.maximum(jnp.sum(keep), 1.0) if count is None else count
     return jnp.sum(keep * jnp.square(value_t - target)) / count
@@ -72,15 +75,15 @@ def actor_loss(
 
     Args:
         value_t: [B] float32, the online critic's values of ``action``.
-        action: [B, A] float32 in [-1, 1], the policy's own.
+        action: [B, A] float32 in [-1, 1], actions of the policy.
         action_penalty: Weight of the mean square.
-        log_below: The greatest value that there can be, R+/(1-gamma): the logarithm of the distance to it replaces minus the
-            value, to match auxiliary losses learned as logarithms. With the rewards 0/-1 of the OL-AUX release, it is 0, and
-            this is the release's log(-Q). None: no logarithm.
-        whole: Makes the mean of the whole batch of that of these transitions, before a logarithm is taken.
-        log_of: value, the distance alone, with the mean square added to its logarithm (the release); or loss, both together.
-            The slope of a logarithm is the inverse of its argument: with ``value`` it divides the value's gradient, but not
-            that of the mean square.
+        log_below: Maximum possible value, R+/(1-gamma): the logarithm of the distance to it replaces minus the value, to match
+            auxiliary losses minimised as logarithms. With the rewards 0/-1 of the OL-AUX release, it is 0, and this is the
+            release's log(-Q). None for no logarithm.
+        whole: Function from the mean over these transitions to that over the whole batch, applied before a logarithm.
+        log_of: Argument of the logarithm: value, the distance alone, with the mean square added afterwards (the release); or
+            loss, their sum. The derivative of a logarithm is the inverse of its argument: with ``value`` it divides the
+            gradient of the value, but not that of the mean square.
     """
     value, penalty = jnp.mean(value_t), action_penalty * jnp.mean(jnp.square(action))
     if log_below is None:

@@ -1,12 +1,12 @@
 """Losses of critic and actor for a batch, including auxiliary losses, and their weighted gradients.
 
-Four networks read three observations (before, goal, after). Each is normalised and ordered once, and each network encodes what
-it needs in one pass:
+Four networks read three observations (before, goal, after). Each observation is normalised and reordered once, and each network
+encodes those that it needs in one pass:
 
     critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, views
     their targets                           goal, after
 
-The actor's loss values its actions with the critic's latents from the critic's own forward pass: the actor cannot change them.
+The actor's loss evaluates its actions on the latents from the critic's forward pass, without a gradient through these.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from jaxrl_vis.weighting import MAIN, Weighted, WeightingState, weighted_grad
 
 
 class ComputeCopies(NamedTuple):
-    """Networks of an agent in the compute dtype (`Networks.compute_copy`)."""
+    """Parameters of an agent's four networks in the compute dtype (`Networks.compute_copy`)."""
 
     actor: Params
     critic: Params
@@ -48,10 +48,10 @@ class Latents(NamedTuple):
     """Latents of a transition's observations by one online network, [B, latent] each.
 
     Attributes:
-        pair: [2, B, latent] before and goal, as heads take them.
-        before: The first of them.
-        after: None where no loss reads it.
-        views: Latents of images that auxiliary tasks have made, by name.
+        pair: [2, B, latent] latents before the action and of the goal, the input of heads.
+        before: Latents before the action.
+        after: Latents after the action; None if no loss reads them.
+        views: Latents of the auxiliary tasks' own images, by name.
     """
 
     pair: jax.Array
@@ -63,7 +63,8 @@ class Latents(NamedTuple):
 def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, apart: bool) -> Latents:
     """Encode all observations that losses read, with gradient.
 
-    Most auxiliary losses read two of them or one. Encoded ``apart``, the gradient of each loss passes through these alone.
+    Most auxiliary losses read only one or two of them. If encoded ``apart``, the gradient of each loss passes through these
+    alone.
     """
     names = ("before", "goal", *auxiliary.encoded)
     if apart:
@@ -85,9 +86,9 @@ _MAIN_READS, _OTHERS_READ = "main", "others"
 
 
 def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[str, Callable[[Params], jax.Array]]:
-    """Return functions of the encoder: to the latents of the critic's main loss, and to those of the auxiliary losses.
+    """Return functions from encoder parameters to the latents of the critic's main loss, and to those of auxiliary losses.
 
-    The main loss looks at goals and auxiliary losses never do, so gradients have less to pass through.
+    Only the main loss reads goals, so separate encodings shorten the backward passes of auxiliary losses.
     """
 
     def of(*names: str) -> Callable[[Params], jax.Array]:
@@ -97,7 +98,7 @@ def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[
 
 
 def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
-    """Collect the latents for the losses, encoded at once or by `_encoders`."""
+    """Collect the latents for the losses, whether encoded together or by `_encoders`."""
     if isinstance(found, Latents):
         return found
     before, *others = found[_OTHERS_READ]
@@ -107,7 +108,7 @@ def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> La
 def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
     """Encode the next observation and the goal for the target actor and the target critic: [2, B, latent] each.
 
-    Heads take them in this order; observations come as (goal, after). ``latents`` are the online critic's.
+    Heads take them in this order; inputs are stored as (goal, after). ``latents`` are the online critic's.
     """
     if networks.config.network.target_encoder:
         of_critic = _encode(networks, now.target_critic, inputs, "goal", "after")[::-1]
@@ -122,7 +123,7 @@ def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latent
 
 
 def _least(values: jax.Array) -> jax.Array:
-    """Return the least of the heads' values: [K, B] -> [B]."""
+    """Return the minimum of the heads' values: [K, B] -> [B]."""
     return values[0] if values.shape[0] == 1 else jnp.min(values, axis=0)
 
 
@@ -140,8 +141,8 @@ class Objectives:
     def reduces_early(self) -> bool:
         """True if the critic's gradients are averaged over the shards of a learner before they are weighted.
 
-        A weighting that reads losses, or compares gradients, must see those of the whole learner. What others
-        make of them is a sum, which may be averaged afterwards, together with all else.
+        A weighting that reads losses or compares gradients needs those of the whole learner. Other weightings are linear, so
+        their result can be averaged afterwards, together with everything else.
         """
         weighting = self.auxiliary.weighting
         return self.shards.count > 1 and (weighting.needs != "losses" or weighting.reads_losses)
@@ -151,7 +152,7 @@ class Objectives:
     ) -> Callable[[Params, WeightingState], Weighted]:
         """Build the function that computes the critic's losses and gradient; ``extra`` is (latents, values [B], keep [B]).
 
-        Several heads learn the same target; of their values, the least one counts. ``noise`` as for `_target`.
+        All heads are trained on the same target; ``values`` are the minimum over heads. ``noise`` as for `_target`.
         """
         networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
 
@@ -169,7 +170,7 @@ class Objectives:
             errors = [losses.critic_loss(of_head, target, keep, self._kept(keep)) for of_head in values]
             return {MAIN: functools.reduce(jnp.add, errors), **others}, (latents, value, keep)
 
-        # Where gradients are passed on one by one, those of auxiliary losses need not pass through all that the main one does.
+        # If losses are differentiated one by one, auxiliary losses need not pass through everything that the main one reads.
         passes_apart = way == "latents" and weighting.needs in ("dots", "gramian")
         encoders = _encoders(networks, self.auxiliary, inputs) if passes_apart else encode
         options: dict[str, Any] = {"forwards": forward_mode.with_tangents, "encode": encoders, "has_aux": True}
@@ -178,13 +179,13 @@ class Objectives:
         return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
 
     def _kept(self, keep: jax.Array) -> jax.Array | None:
-        """Return the mean number of unfiltered transitions per shard, the common divisor of all shards; None: each its own."""
+        """Return the mean number of unfiltered transitions per shard, the divisor for all shards; None for each its own."""
         if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
 
     def _target(self, now: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch, noise: jax.Array | None) -> jax.Array:
-        """Compute the critic's targets [B]; ``noise`` [B, A] is added to the next actions, None: nothing."""
+        """Compute the critic's targets [B]; ``noise`` [B, A], unless None, is added to the next actions."""
         assert batch.reward is not None
         networks, resolved = self.networks, self.resolved
         of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
@@ -236,7 +237,7 @@ class Objectives:
     ) -> dict[str, jax.Array]:
         """Compute the auxiliary losses of a network's latents, by name.
 
-        ``weights`` take effect here where they are for the encoder alone: the losses' sum has those of the heads.
+        ``weights`` are applied here only if they are for the encoder alone; the sum of the losses applies those of the heads.
         """
         if not self.auxiliary.tasks:
             return {}

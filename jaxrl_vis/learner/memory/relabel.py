@@ -1,14 +1,14 @@
-"""Goal relabelling: replaces goals by observations of the same episode (thesis, section 5.1.4).
+"""Goal relabelling: replacement of goals by observations of the same episode (thesis, section 5.1.4).
 
-An episode's frames lie in slots 0 ... T, its original goal in slot T+1 (`types.Episodes`), so to relabel is to choose a slot.
-For the transition from slot t to t+1:
+Slots 0 ... T of an episode hold its frames, slot T+1 its original goal (`types.Episodes`), so to relabel is to choose a slot.
+For the transition from slot t to t+1, with probability
 
-    with p1 p2          slot t+1                     reached for certain: a positive even under the indicator reward
-    with p1 (1 - p2)    a slot of t+1 ... T, evenly  hindsight experience replay's "future" (Andrychowicz et al., 2017)
-                        or slot t+k in proportion to gamma^k: states that contrastive RL contrasts (Eysenbach et al., 2022)
-    with 1 - p1         slot T+1                     the goal that the policy was given
+    p1 p2          slot t+1                       certainly reached: a positive even under the indicator reward
+    p1 (1 - p2)    a slot of t+1 ... T, uniform   hindsight experience replay's "future" (Andrychowicz et al., 2017)
+                   or slot t+k with probability proportional to gamma^k, for contrastive RL (Eysenbach et al., 2022)
+    1 - p1         slot T+1                       the goal that the policy was given
 
-What is observed in that slot becomes the goal in `sampling`.
+`sampling` converts the observation in that slot to the goal.
 """
 
 import jax
@@ -18,10 +18,10 @@ from jaxrl_vis.learner.memory.random_integers import scaled
 
 
 def geometric_offsets(fraction: jax.Array, remaining: jax.Array, discount: float) -> jax.Array:
-    """Map uniform numbers in [0, 1) to 0 ... remaining - 1, each k in proportion to discount^k: [B] int32.
+    """Map uniform samples to integers k in [0, remaining), with probability proportional to discount^k: [B] int32.
 
     Args:
-        fraction: [B] float32.
+        fraction: [B] float32 in [0, 1).
         remaining: [B] int32, at least 1.
         discount: gamma in (0, 1).
     """
@@ -42,12 +42,12 @@ def choose_goal_slots(
     """Choose a goal slot for every transition: [B] int32 in {t+1, ..., T+1}.
 
     Args:
-        key: [] a typed key.
+        key: [] typed key.
         time: [B] int32, t in [0, T).
         horizon: T.
         relabel_probability: p1.
         balance_probability: p2.
-        discount: gamma of geometrically distributed goals; None: they are even.
+        discount: gamma of geometrically distributed goals; None for a uniform distribution.
     """
     strategy, fraction = jax.random.uniform(key, (2, *time.shape))
     remaining = horizon - time

@@ -2,15 +2,15 @@
 
     observations  [N, T+2, C, H, W/4] uint32     slots 0 ... T: the episode;  slot T+1: its goal
                    |                |
-                   |                +-- four pixels (uint8) a word: XLA copies element by element, whatever their size
+                   |                +-- four pixels (uint8) per word: XLA copies element by element, whatever their size
                    +-- rollouts of E episodes, one after the other; N is a multiple of E
 
-Images whose width four does not divide, and state vectors, are kept as they are. Where observations stack the images of the
-latest control steps, the newest one of each is kept: the others are in the slots before it, or in slot 0 where the episode
-began. A goal stands still, so that all its images are one.
+Images whose width is not a multiple of four, and state vectors, are stored unpacked. If observations stack the images of the
+latest control steps, only the newest image of each is stored: the others are in the slots before it, or repeat slot 0 at the
+start of an episode. A goal is at rest, so that all its images are the same.
 
-A rollout is written as one contiguous slice. The place follows from the iteration, which all seeds share, so that under `vmap`
-over seeds it stays a slice and does not become a scatter. Samples are drawn from the newest ``size`` episodes.
+A rollout is written as one contiguous slice. Its position follows from the iteration, which all seeds share, so that under
+`vmap` over seeds it stays a slice and does not become a scatter. Batches are sampled from the newest ``size`` episodes.
 """
 
 import math
@@ -67,11 +67,11 @@ class Replay(NamedTuple):
     """Fixed sizes of a replay. All methods are pure.
 
     Attributes:
-        num_rollouts: Rollouts that the ring holds.
-        num_envs: E, episodes in a rollout.
-        horizon: T.
-        frame_stack: F, images that an observation stacks along C, the newest first; 1 for state vectors.
-        mean_age: Mean age of samples, in rollouts, if probabilities are to fall exponentially with age; None: they are even.
+        num_rollouts: Number of rollouts that the ring holds.
+        num_envs: E, number of episodes in a rollout.
+        horizon: T, number of control steps in an episode.
+        frame_stack: F, number of images that an observation stacks along C, the newest first; 1 for state vectors.
+        mean_age: Mean age of samples, in rollouts, for probabilities that decay exponentially with age; None for uniform ones.
     """
 
     num_rollouts: int
@@ -134,9 +134,9 @@ class Replay(NamedTuple):
         """Write the E episodes of a rollout; once the ring is full, they overwrite the oldest ones.
 
         Args:
-            state: The replay before.
+            state: State of the replay before the insertion.
             rollout: E episodes, unpacked.
-            iteration: [] int32, iterations before this one: it settles the place.
+            iteration: [] int32, index of the iteration, which determines the position.
         """
         start = (iteration % self.num_rollouts) * self.num_envs
         episodes = jax.tree.map(
@@ -192,11 +192,11 @@ class Replay(NamedTuple):
             state: The replay.
             indices: Places of the transitions, [B] each.
             goal_slot: [B] int32 in [1, T+1].
-            steps: Steps of a transition; it has fewer where the episode ends.
-            goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
+            steps: Number of steps from the first to the last observation of a transition; fewer at the end of an episode.
+            goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
 
         Returns:
-            The transitions, without rewards; of stacked images the goal's stand still.
+            Transitions without rewards. Stacked images of goals are at rest: copies of the newest one.
         """
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices
@@ -230,14 +230,14 @@ class Replay(NamedTuple):
 
 
 def make_replay(transitions: int, num_envs: int, horizon: int, frame_stack: int = 1, mean_age: int | None = None) -> Replay:
-    """Plan a replay of at least ``transitions`` transitions, rounded up to whole rollouts; nothing is allocated yet.
+    """Plan a replay of at least ``transitions`` transitions, rounded up to whole rollouts, without allocating it.
 
     Args:
-        transitions: Least number of transitions to hold.
-        num_envs: E, episodes in a rollout.
-        horizon: T, control steps in an episode.
-        frame_stack: F, images that an observation stacks.
-        mean_age: Mean age of samples, transitions; None: samples are even.
+        transitions: Minimum number of transitions to hold.
+        num_envs: E, number of episodes in a rollout.
+        horizon: T, number of control steps in an episode.
+        frame_stack: F, number of images that an observation stacks.
+        mean_age: Mean age of samples in transitions; None for uniform sampling.
     """
     of_rollout = num_envs * horizon
     in_rollouts = None if mean_age is None else mean_age / of_rollout

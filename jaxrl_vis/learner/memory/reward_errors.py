@@ -1,10 +1,10 @@
-"""State estimator with errors, instead of the oracle's true states (thesis, equation 5.2).
+"""Simulated state estimator with errors, instead of the oracle's true states (thesis, equation 5.2).
 
     estimate      Gaussian noise on the estimated state
-    flip          rewards that are false, everywhere or only where the workspace is cluttered
+    flip          false rewards, everywhere or only in a cluttered part of the workspace
 
-An estimator is a deterministic function of its input. Its errors are drawn with keys that are made from the true states
-themselves, so a transition is misjudged in the same way every time it is sampled, and errors do not average out.
+An estimator is a deterministic function of its input. Its errors are sampled with keys derived from the true states themselves,
+so that a transition gets the same error every time it is sampled, and errors do not average out.
 """
 
 import jax
@@ -43,16 +43,16 @@ def flip(
     clutter: float = 1.0,
     clutter_end: jax.Array | None = None,
 ) -> jax.Array:
-    """Misjudge some rewards; return which ones are positive afterwards: [B] bool.
+    """Flip some rewards; return the mask of positives afterwards: [B] bool.
 
     Args:
-        is_positive: [B] bool, before.
-        states: [B, G] float32, the true states that were reached.
-        goal_states: [B, G] float32, those of the goals.
-        false_positives: Share of the negatives that become positives.
-        false_negatives: Share of the positives that become negatives.
-        clutter: Share of the workspace where errors occur, more often there so that the shares above hold overall.
-        clutter_end: [] float32, from `find_clutter_end`; None: it happens everywhere.
+        is_positive: [B] bool, mask of positives before.
+        states: [B, G] float32, true achieved states.
+        goal_states: [B, G] float32, true states of the goals.
+        false_positives: Fraction of the negatives that become positives.
+        false_negatives: Fraction of the positives that become negatives.
+        clutter: Fraction of the workspace where errors occur; their rate is increased so that the overall fractions hold.
+        clutter_end: [] float32, from `find_clutter_end`; None if errors occur everywhere.
     """
     number = jax.vmap(jax.random.uniform)(_keys(jnp.concatenate([states, goal_states], axis=1), _FALSE))
     is_false = number < jnp.where(is_positive, false_negatives, false_positives) / clutter
@@ -62,12 +62,12 @@ def flip(
 
 
 def find_clutter_end(goal_states: jax.Array, is_stored: jax.Array, clutter: float) -> jax.Array:
-    """Find the first coordinate below which the share ``clutter`` of all goals lies: [] float32.
+    """Find the value of the first coordinate below which the fraction ``clutter`` of all goals lies: [] float32.
 
     Args:
-        goal_states: [N, G] float32, true states of goals: they are spread over the workspace whatever the policy does.
-        is_stored: [N] bool, which of the N there are.
-        clutter: The share, in (0, 1).
+        goal_states: [N, G] float32, true states of goals, whose distribution over the workspace is independent of the policy.
+        is_stored: [N] bool, mask of occupied positions.
+        clutter: Fraction in (0, 1).
     """
     ordered = jnp.sort(jnp.where(is_stored, goal_states[:, 0], jnp.inf))
     return ordered[jnp.clip((clutter * jnp.sum(is_stored)).astype(jnp.int32), 0, len(ordered) - 1)]

@@ -1,10 +1,10 @@
-"""Rewards that are functions of what was reached and of the goal alone, and are computed where batches are read.
+"""Rewards that depend only on the achieved observation and the goal, and are computed when batches are read.
 
     indicator             equality in every element
     indicator_tolerance   nearly all elements within some grey levels of the goal's, for cameras with noise
-    features              cosine of the vectors that a frozen encoder makes of both
+    features              cosine similarity of both in a frozen encoder's feature space
 
-A function from images to vectors makes a method of one's own: ``Mine = features_method(encode)``, ``--method module:Mine``.
+A custom method can be built from any image encoder: ``Mine = features_method(encode)``, ``--method module:Mine``.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,15 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import frozen_encoder
 from jaxrl_vis_envs import goals
 
-_SMALL = 1e-6  # of a vector's length: the direction of a shorter one means nothing
+_SMALL = 1e-6  # minimum norm of a vector with a meaningful direction
 
 
 def cosine_reward(vector: jax.Array, goal_vector: jax.Array, positive: float = 1.0, negative: float = 0.0) -> jax.Array:
     """Map the angle between vectors [B, L] to rewards [B] float32: ``positive`` at 0, ``negative`` at a right angle or more.
 
     Args:
-        vector: [B, L] any float dtype, of the achieved observations.
-        goal_vector: [B, L], of the goals.
+        vector: [B, L] any float dtype, vectors of the achieved observations.
+        goal_vector: [B, L], vectors of the goals.
         positive: R+.
         negative: R-.
     """
@@ -38,7 +38,7 @@ def cosine_reward(vector: jax.Array, goal_vector: jax.Array, positive: float = 1
 
 
 def features_reward(encode: Callable[[jax.Array], jax.Array]) -> RewardFunction:
-    """Build the reward of a frozen encoder: the cosine of what it makes of what was reached and of the goal.
+    """Build the reward of a frozen encoder: the cosine similarity of its vectors for achieved observation and goal.
 
     Args:
         encode: Images [B, C, H, W] uint8 -> vectors [B, L] of any float dtype.

@@ -1,7 +1,7 @@
 """Batches from the replay: sample, relabel, reward.
 
-    choose     which transitions (`replay`), and which slot of its own episode is each one's goal (`relabel`)
-    batch      reads them, turns observations in those slots into goals, and computes rewards
+    choose     sample transitions (`replay`), and for each the slot of its episode that becomes the goal (`relabel`)
+    batch      read them, convert observations in those slots to goals, and compute rewards
 
 Rewards are recomputed from the contents of the replay, by the same functions that score the environments. No MuJoCo here.
 """
@@ -27,17 +27,17 @@ from jaxrl_vis.learner.resolved import Resolved
 from jaxrl_vis.types import Batch, ReplayState
 from jaxrl_vis_envs import goals
 
-# Folded into a key for draws that only some configurations make, so that they change nothing for the others.
+# Folded into a key for samples that only some configurations need, so that they do not affect the others.
 _TRIVIAL, _SHIFT, _TARGETS = 0x747276, 0x736866, 0x617578
 
 
 class Choice(NamedTuple):
-    """Chosen transitions and goals, drawn ahead for many batches at once.
+    """Chosen transitions and goals, sampled in advance for many batches at once.
 
     Attributes:
-        indices: Places of the transitions, [B] each.
-        goal_slot: [B] int32 in [t + 1, T + 1]; of another episode, in [1, T].
-        goal_episode: [B] int32, whose slots those are; None: of the transitions' own episodes.
+        indices: Positions of the transitions, [B] each.
+        goal_slot: [B] int32 in [t + 1, T + 1]; for goals from another episode, in [1, T].
+        goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
         shift: [B, 2] int32, see `Batch`; or None.
         target_key: [] a typed key, for targets of auxiliary tasks; or None.
         clutter_end: [] float32, see `reward_errors`; or None.
@@ -56,14 +56,14 @@ class Sampler:
     """Sampler of batches; all methods are pure.
 
     Attributes:
-        config: Batch size, method, and p1.
+        config: Configuration with the batch size, method, and p1.
         resolved: p2, R+ and R-.
         replay: Sizes of the replay to read from.
         threshold: Threshold of the oracle's reward, in the unit of the true states.
-        as_goal: [...] -> [...], converts an achieved observation to a goal (`GoalEnv.as_goal`); None where an observation is
-            one already.
-        auxiliary: Auxiliary tasks, whose targets batches carry.
-        shards: Shards of the learner. ``replay`` is one, and so are batches; the configuration's batch size is that of all.
+        as_goal: [...] -> [...], converts an achieved observation to a goal (`GoalEnv.as_goal`); None if observations already
+            have the form of goals.
+        auxiliary: Auxiliary tasks whose targets are added to batches.
+        shards: Shards of the learner. ``replay`` and batches are those of one shard; the configured batch size is the total.
     """
 
     config: Config
@@ -75,11 +75,11 @@ class Sampler:
     shards: Shards = ONE
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
-        """Draw B transitions and their goals; every shard draws those of the whole learner and keeps its own.
+        """Sample B transitions and their goals; every shard samples those of the whole learner and keeps its own part.
 
         Args:
-            state: The replay, with the rollout of ``iteration`` inserted.
-            key: [] a typed key.
+            state: State of the replay, with the rollout of ``iteration`` inserted.
+            key: [] typed key.
             iteration: [] int32.
         """
         sample_key, goal_key = jax.random.split(key)
@@ -88,7 +88,7 @@ class Sampler:
         choice = Choice(indices, goal_slot)
         if self.config.goals.trivial_goals < 1.0:
             is_replaced = self._replaced(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
-            # Transitions are drawn at random, so those of the next one's episode are, too.
+            # Transitions are sampled at random, so the next transition's episode is a random one.
             choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
         if self.config.network.random_shift:
             most, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
@@ -120,8 +120,9 @@ class Sampler:
     def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
         """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
 
-        Not to the original goals. Where these look different from what episodes show (VisualFingerTurn's finger always hangs
-        down in them), all that is seldom reached would look like that, and a critic would tell rewards by it.
+        They are not replaced by original goals. If these look different from observations in episodes (VisualFingerTurn's
+        finger always hangs down in them), rarely reached goals would all share that look, and the critic could infer rewards
+        from it.
         """
         episode, time = indices
         states = state.episodes.states
@@ -130,14 +131,14 @@ class Sampler:
         return is_trivial & ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
-        """Read the chosen transitions, with goals at rest and the matching rewards.
+        """Read the chosen transitions, with goals at rest, and compute their rewards.
 
         Args:
-            state: The replay.
-            choice: From `choose`.
+            state: State of the replay.
+            choice: Choice from `choose`.
 
         Returns:
-            B transitions with rewards.
+            B transitions, with rewards unless a learned model computes them.
         """
         batch = self.replay.gather(state, choice.indices, choice.goal_slot, self.config.study.n_step, choice.goal_episode)
         batch = batch.replace(shift=choice.shift)
@@ -146,7 +147,7 @@ class Sampler:
             batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.stored(state, choice.indices))
         reached = batch.observation_tp1
         if self.as_goal is not None:
-            # Stacked images also show how things move, and a goal stands still; what is reached is compared in the same terms.
+            # Stacked images also show motion, while goals are at rest; convert achieved observations to the same form.
             reached = jax.vmap(self.as_goal)(batch.observation_tp1)
             batch = batch.replace(reached=reached)
             if batch.goal.ndim == 2:  # of states; the replay repeats a goal's newest image itself
@@ -155,7 +156,7 @@ class Sampler:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
         if self.resolved.method.is_learned:
-            return batch  # the learner rewards it, with the model as it is by then (`learned_reward`)
+            return batch  # the learner computes rewards with its current model (`learned_reward`)
         return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
     def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
@@ -176,9 +177,9 @@ class Sampler:
         """Compute the rewards [B] float32.
 
         Args:
-            batch: The transitions, relabelled.
-            reached: [B, ...] the achieved observations, converted to goals.
-            clutter_end: As of `Choice`.
+            batch: Relabelled transitions.
+            reached: [B, ...] achieved observations, converted to goals.
+            clutter_end: See `Choice`.
         """
         values = {"positive": self.resolved.reward_positive, "negative": self.resolved.reward_negative}
         method = self.resolved.method

@@ -25,8 +25,8 @@ def from_blocks(blocks: jax.Array, height: int, width: int) -> jax.Array:
     """Invert `to_blocks`: [..., blocks, 4^levels * C] -> [..., C, height, width], same dtype.
 
     Args:
-        blocks: In nested blocks; the number of blocks and the size determine the number of levels.
-        height, width: Of the images without the border that `to_blocks` crops, pixels.
+        blocks: Nested blocks; their number, ``height`` and ``width`` determine the number of levels.
+        height, width: Size of the images in pixels, without the border that `to_blocks` crops.
     """
     *batch, count, size = blocks.shape
     levels = ((height * width // count).bit_length() - 1) // 2

@@ -1,7 +1,7 @@
 """Forward-mode differentiation through operations with custom reverse-mode rules.
 
-`jax.custom_vjp` gives a function a gradient and no tangent. While traced, such functions call `are_wanted`; inside
-`with_tangents` they use plain JAX, which has both modes.
+`jax.custom_vjp` defines reverse-mode differentiation only. While traced, such functions call `are_wanted`; inside
+`with_tangents` they use plain JAX, which supports both modes.
 """
 
 import contextlib
@@ -9,13 +9,13 @@ from collections.abc import Iterator
 
 import jax
 
-# Part of what JAX knows a traced function by, so that one which was traced outside is traced again inside.
+# Part of JAX's tracing cache key, so that a function traced outside the context is traced again inside.
 _wanted = jax.make_user_context(default_value=False)
 
 
 @contextlib.contextmanager
 def with_tangents() -> Iterator[None]:
-    """Trace the context so that `jax.jvp` can differentiate it."""
+    """Trace the code in this context so that `jax.jvp` can differentiate it."""
     with _wanted(True):
         yield
 

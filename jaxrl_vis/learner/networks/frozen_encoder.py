@@ -1,7 +1,7 @@
-"""Encoders of images that are trained no further, in a file: kernels of `modules.Encoder`, and how images are normalised.
+"""Files of frozen image encoders: parameters of `modules.Encoder`, and the normalisation of the images.
 
 shape     [3] int64: C, H, W of the images
-mean      [C, H, W] float32, and ``scale``, 1 / standard deviation
+mean      [C, H, W] float32; likewise ``scale``, 1 / standard deviation
 kernel_0, bias_0, ..., latent/kernel, latent/bias     float32
 """
 
@@ -19,21 +19,21 @@ from jaxrl_vis.learner.networks.modules import Encoder
 from jaxrl_vis.learner.networks.normalizer import Scaling
 from jaxrl_vis.types import Params
 
-_LIMIT = 5.0  # of normalised values, as of ``normalizer_clip``
+_LIMIT = 5.0  # clipping bound of normalised values, the default of ``normalizer_clip``
 
 
 def save(path: Path | str, encoder: Params, scaling: Scaling) -> None:
-    """Write an encoder: parameters of `modules.Encoder`, and the scaling of its images [C, H, W]."""
+    """Write an encoder to a file: parameters of `modules.Encoder`, and the scaling of its images [C, H, W]."""
     arrays = {name: leaf for name, leaf in encoder.items() if name != "latent"}
     arrays |= {f"latent/{name}": leaf for name, leaf in encoder["latent"].items()}
     np.savez(path, shape=np.array(scaling.mean.shape), mean=scaling.mean, scale=scaling.scale, **jax.device_get(arrays))
 
 
 def load(path: Path | str) -> Callable[[jax.Array], jax.Array]:
-    """Read an encoder: images [B, C, H, W] uint8 -> vectors [B, L] float32.
+    """Read an encoder from a file: images [B, C, H, W] uint8 -> vectors [B, L] float32.
 
     Raises:
-        RequestError: The file is missing, or no encoder; or, when the encoder is called, images are of another shape.
+        RequestError: The file is missing or not an encoder; or, when the encoder is called, images have another shape.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -50,7 +50,7 @@ def load(path: Path | str) -> Callable[[jax.Array], jax.Array]:
         raise RequestError(
             f"{path} is no encoder that jaxrl-vis encoder wrote: {' '.join(str(error).split())[:120]}"
         ) from error
-    except Exception as error:  # flax has exceptions of its own for parameters of the wrong shape
+    except Exception as error:  # flax raises its own exceptions for parameters of the wrong shape
         raise RequestError(f"{path} is no encoder: its arrays do not fit together") from error
 
     def encode(images: jax.Array) -> jax.Array:

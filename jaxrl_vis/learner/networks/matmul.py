@@ -1,4 +1,4 @@
-"""Matrix products whose gradients have the memory layout that the optimiser reads."""
+"""Matrix products whose kernel gradients have the memory layout of the kernel, for the optimiser."""
 
 import jax
 
@@ -17,7 +17,7 @@ def _with_rule(values: jax.Array, kernel: jax.Array) -> jax.Array:
 
 def _backward(residuals: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
     values, kernel = residuals
-    # JAX's own rule makes the kernel's gradient transposed, and the optimiser then reads it against the grain.
+    # JAX's own rule computes the transpose of the kernel's gradient, which the optimiser then reads with strides.
     batch = tuple(range(values.ndim - 2))
     rows, columns = len(batch), len(batch) + 1
     kernel_gradient = jax.lax.dot_general(values, gradient, (((rows,), (rows,)), (batch, batch)))

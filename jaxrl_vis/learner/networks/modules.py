@@ -1,12 +1,12 @@
-"""Modules of the networks: encoder of images, dense layer, head. The only file that knows flax.
+"""Modules of the networks: encoder of images, dense layer, head. The only file that uses flax.
 
 The encoder is a stack of 2x2 convolutions with stride 2. Such windows never overlap, so each layer IS a matrix product of
 [pixels, 4 * channels in] with [4 * channels in, channels out]. If the pixels are put into nested 2x2 blocks once,
 
     [B, C, H, W]  ->  [B, H/16, W/16, 2*2, 2*2, 2*2, 2*2 * C]      (four layers; the finest block last)
 
-every layer is one reshape and one matrix product over the last axis, with no copy between layers. The order is made on the
-uint8 image, where it is cheapest. Borders that do not fill a block are cropped, as a convolution without padding does.
+every layer is one reshape and one matrix product over the last axis, with no copy between layers. Pixels are reordered in the
+uint8 image, where it is cheapest. Borders that do not fill a block are cropped, as by a convolution without padding.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _glorot = nn.initializers.glorot_uniform()
 
 
 def _cold(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
-    """Initialise kernels that make hardly any output: uniform in [-1e-12, 1e-12]."""
+    """Initialise kernels with outputs close to 0: uniform in [-1e-12, 1e-12]."""
     return jax.random.uniform(key, shape, dtype, -1e-12, 1e-12)
 
 
@@ -39,12 +39,12 @@ class Encoder(nn.Module):
 
     @nn.compact
     def __call__(self, *pieces: jax.Array, first_layer: int = 0) -> jax.Array:
-        """Encode, from layer ``first_layer`` on."""
+        """Apply the layers from ``first_layer`` on."""
         pieces = tuple(blocks.astype(self.dtype) for blocks in pieces)
         count, size = pieces[0].shape[1:]
         channels = size // 4 ** (len(self.filters) - first_layer)
         for level, filters in list(enumerate(self.filters))[first_layer:]:
-            # Initialised as the convolution that it is: fan-out counts the window too.
+            # Initialise like a convolution: the fan-out includes the window.
             kernel = self.param(
                 f"kernel_{level}",
                 lambda key, shape: _glorot(key, (2, 2, shape[0] // 4, shape[1])).reshape(shape),
@@ -54,7 +54,7 @@ class Encoder(nn.Module):
             kernel = kernel.astype(self.dtype)
             pieces = tuple(nn.relu(product(values.reshape(-1, 4 * channels), kernel) + bias) for values in pieces)
             channels = filters
-        # Only here, where they are smallest, are the pieces put together.
+        # Concatenate the pieces here, where they are smallest.
         features = [values.reshape(-1, count * channels) for values in pieces]
         features = jnp.concatenate(features) if len(features) > 1 else features[0]
         return Dense(self.latent_size, self.dtype, name="latent")(features)
@@ -63,7 +63,7 @@ class Encoder(nn.Module):
 class Dense(nn.Module):
     """Dense layer [B, inputs] -> [B, size], as `flax.linen.Dense`.
 
-    Inputs may be split into parts to be concatenated, arrays [B, part] or [parts, B, part]: nothing is put together first.
+    Inputs may be passed as parts, arrays [B, part] or [parts, B, part], which are not concatenated in memory.
     """
 
     size: int
@@ -73,7 +73,7 @@ class Dense(nn.Module):
 
     @nn.compact
     def __call__(self, *inputs: jax.Array) -> jax.Array:
-        """Multiply and add."""
+        """Apply the layer."""
         inputs = tuple(values if values.ndim == 3 else values[None] for values in inputs)
         width = sum(values.shape[0] * values.shape[-1] for values in inputs)
         kernel = self.param("kernel", self.kernel_init, (width, self.size)).astype(self.dtype)
@@ -93,7 +93,7 @@ class Dense(nn.Module):
 class Head(nn.Module):
     """Head: inputs as for `Dense` -> [B, outputs] float32.
 
-    ``stabilised``: with layer normalisation, and outputs near 0 at first (Zheng et al., 2024, arXiv 2306.03346).
+    ``stabilised``: with layer normalisation, and outputs initially near 0 (Zheng et al., 2024, arXiv 2306.03346).
     """
 
     hidden_sizes: Sequence[int]
@@ -110,7 +110,7 @@ class Head(nn.Module):
             if self.stabilised:
                 values = nn.LayerNorm(dtype=self.dtype, name=f"normalization_{layer}")(values)
             inputs = (nn.relu(values),)
-        # The last layer stays in float32: near Q = -50 neighbouring bfloat16 numbers lie 0.25 apart.
+        # The last layer stays in float32: near Q = -50 the spacing of bfloat16 numbers is 0.25.
         bias = nn.initializers.constant(self.output_bias)
         kernel = _cold if self.stabilised else _glorot
         return Dense(self.outputs, jnp.float32, bias, kernel, name="output")(*inputs)

@@ -1,6 +1,6 @@
 """Encoder, actor and critic (OL-AUX, appendix; hyper-parameters in `Config`) as pure functions of parameters.
 
-Observation and goal go through the same encoder; actor and critic have one each.
+Observation and goal pass through the same encoder; actor and critic have one each, unless the actor shares the critic's.
 """
 
 import dataclasses
@@ -36,26 +36,26 @@ class BatchScaling(NamedTuple):
     """Scaling of observations and goals.
 
     Attributes:
-        observations: Before and after the action; goals, too, unless they have their own.
-        goals: None where they have not.
+        observations: Scaling of observations before and after the action; also of goals, unless they have their own.
+        goals: Separate scaling of goals; None if they share ``observations``.
     """
 
     observations: Scaling
     goals: Scaling | None
 
 
-_OBSERVED = ("before", "goal", "after")  # as `Inputs` has them
+_OBSERVED = ("before", "goal", "after")  # in the order of `Inputs.observed`
 
 Piece = tuple[jax.Array, slice]
-"""Some of an array of prepared observations: the array [B, ...], and which."""
+"""Slice of an array of prepared observations: the array [B, ...], and the slice along its first axis."""
 
 
 class Inputs(NamedTuple):
     """Observations of B transitions in the form that encoders read (`Networks.prepare_batch`).
 
     Attributes:
-        observed: [3 B, ...], those before, the goals, those after.
-        views: [B, ...] images that auxiliary tasks have made, by name.
+        observed: [3 B, ...], observations before the action, goals, observations after the action.
+        views: [B, ...] images computed by auxiliary tasks, by name.
     """
 
     observed: jax.Array
@@ -63,11 +63,11 @@ class Inputs(NamedTuple):
 
     @property
     def size(self) -> int:
-        """B."""
+        """Number B of transitions."""
         return self.observed.shape[0] // len(_OBSERVED)
 
     def pieces(self, *names: str) -> list[Piece]:
-        """Locate observations: ``before``, ``goal``, ``after``, or a view, in the order of ``names``."""
+        """Return slices of the observations ``names``, in this order: ``before``, ``goal``, ``after``, or names of views."""
         size, pieces = self.size, []
         for name in names:
             if name in self.views:
@@ -86,13 +86,13 @@ class Networks:
 
     Attributes:
         init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
-        prepare: (scaling, observations [B, ...], possibly how to shift them) -> inputs: what encoders read; made once for all
-            four networks.
+        prepare: (scaling, observations [B, ...], optional shift) -> inputs of the encoders, computed once for all four
+            networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
         act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
-        values: (critic, latents [2, B, latent], action [B, A]) -> [K, B] float32, of each head.
-        value: The same of the first head: [B] float32.
-        critic_heads: K, heads of the critic on one encoder. With several, their parameters have a leading axis [K].
+        values: (critic, latents [2, B, latent], action [B, A]) -> values of all heads [K, B] float32.
+        value: The same for the first head only: [B] float32.
+        critic_heads: K, number of heads of the critic on one encoder. With several, their parameters have a leading axis [K].
     """
 
     config: Config
@@ -105,8 +105,8 @@ class Networks:
         """Check the image size, and the maximum shift against it.
 
         Raises:
-            RequestError: The image is smaller than one block of the encoder, or could be moved out of sight; or there is no
-                image to be moved.
+            RequestError: The image is smaller than one block of the encoder or than the maximum shift; or a shift is set, but
+                observations are not images.
         """
         shift = self.config.network.random_shift
         if shift and not self.sees_images:
@@ -134,7 +134,7 @@ class Networks:
 
     @property
     def uses_kernel(self) -> bool:
-        """True if the first layers are those of `kernels.encoder`, one kernel on a GPU, instead of one product each."""
+        """True if the first layers are computed by `kernels.encoder`, one kernel on a GPU, instead of a product each."""
         return (
             self.sees_images
             and self.dtype == jnp.bfloat16
@@ -161,7 +161,7 @@ class Networks:
 
     @property
     def latent_size(self) -> int:
-        """Size of an encoded observation; a state vector is its own."""
+        """Size of an encoded observation; a state vector is its own latent."""
         return self.config.network.latent_size if self.sees_images else math.prod(self.observation_spec.shape)
 
     def _init(self, key: jax.Array, head: Head, head_inputs: int, has_encoder: bool = True) -> Params:
@@ -192,7 +192,7 @@ class Networks:
         return {**critic, "head": jax.tree.map(lambda *leaves: jnp.stack(leaves), critic["head"], *others)}
 
     def init_target(self, online: Params) -> Params:
-        """Copy online parameters for a target network: the head alone if targets have no encoders."""
+        """Copy online parameters for a target network: only the head if targets have no encoders."""
         kept = online if self.config.network.target_encoder else {"head": online["head"]}
         return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
 
@@ -203,10 +203,9 @@ class Networks:
         return {**params, "encoder": other["encoder"]}
 
     def compute_copy(self, params: Params) -> Params:
-        """Copy the large kernels in the compute dtype; None for all parameters that stay as they are.
+        """Copy the large kernels in the compute dtype; None for all parameters that are used unconverted.
 
-        With `with_compute_copy`, a learner that makes this copy where it changes the parameters saves the networks a conversion
-        at every use.
+        Together with `with_compute_copy`, copying when parameters change saves the networks a conversion at every use.
         """
 
         def copy(path: Any, leaf: jax.Array) -> jax.Array | None:
@@ -216,7 +215,7 @@ class Networks:
         return jax.tree_util.tree_map_with_path(copy, params)
 
     def with_compute_copy(self, params: Params, copy: Params) -> Params:
-        """Substitute compute copies for parameters; every function here takes the result like the originals."""
+        """Substitute compute copies for parameters; all methods accept the result like the original parameters."""
         return jax.tree.map(
             lambda converted, leaf: leaf if converted is None else converted, copy, params, is_leaf=lambda leaf: leaf is None
         )
@@ -244,9 +243,9 @@ class Networks:
         return Inputs(jnp.concatenate(pieces), views)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
-        """Normalise and order [B, ...] observations for the encoders: [B, blocks, block size], or [B, S] for states.
+        """Normalise and reorder observations [B, ...] for the encoders: [B, blocks, block size], or [B, S] for states.
 
-        Images may be moved by ``shift`` [B, 2] int32, as of `Batch`. They are normalised first: what moves in is the mean.
+        Images are shifted by ``shift`` [B, 2] int32 (see `Batch`) after normalisation, so they are padded with the mean.
         """
         mean, scale = scaling
         if not self.sees_images:
@@ -289,13 +288,13 @@ class Networks:
         return jnp.tanh(self.head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
     def values(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        """Compute the values [K, B] float32 that each head has of actions [B, A]; latents [2, B, latent] as for `act`."""
+        """Compute each head's values [K, B] float32 of actions [B, A]; latents [2, B, latent] as for `act`."""
         if self.critic_heads == 1:
             return self._value(critic["head"], latents, action)[None]
         return jax.vmap(self._value, (0, None, None))(critic["head"], latents, action)
 
     def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        """Compute the values [B] float32 that the first head has of actions [B, A]."""
+        """Compute the first head's values [B] float32 of actions [B, A]; latents [2, B, latent] as for `act`."""
         head = critic["head"]
         return self._value(head if self.critic_heads == 1 else jax.tree.map(lambda leaf: leaf[0], head), latents, action)
 

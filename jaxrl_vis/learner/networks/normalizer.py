@@ -1,6 +1,6 @@
-"""Running mean and deviation of observations, per pixel and channel, merged batch by batch (Chan et al., 1979).
+"""Running mean and standard deviation of observations, per pixel and channel, merged batch by batch (Chan et al., 1979).
 
-A camera that stands still sees mostly things that never change: subtracting the mean image leaves what moves.
+Most of what a static camera sees never changes: subtracting the mean image leaves the moving parts.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class Scaling(NamedTuple):
 
 
 def init(observation_spec: jax.ShapeDtypeStruct) -> NormalizerState:
-    """Initialise the statistics of observations of this shape."""
+    """Return empty statistics of observations of this shape."""
     zeros = jnp.zeros(observation_spec.shape, jnp.float32)
     return NormalizerState(count=jnp.zeros((), jnp.float32), mean=zeros, sum_of_squares=zeros)
 
@@ -37,14 +37,14 @@ def update(
 
     Args:
         state: Statistics so far.
-        observations: In their own dtype, with leading axes to reduce.
-        axes: The leading axes.
+        observations: Observations in their own dtype, with leading axes to reduce.
+        axes: Leading axes to reduce.
         shards: Shards of the learner; ``observations`` are those of one shard.
     """
     count = jnp.float32(shards.count)
     for axis in axes:
         count = count * observations.shape[axis]
-    # Deviations are taken from the running mean, not from zero: close to it they are small, and squares keep their digits.
+    # Compute deviations from the running mean, not from zero: these are small, so that their squares keep precision.
     centred = observations.astype(jnp.float32) - state.mean
     shift = shards.mean(jnp.mean(centred, axis=axes))
     batch_squares = shards.total(jnp.sum(jnp.square(centred), axis=axes)) - count * jnp.square(shift)

@@ -1,6 +1,6 @@
-"""Deterministic policy of the shared networks: an actor, and the statistics that its observations are normalised with.
+"""Deterministic policy of the shared networks: an actor, and the statistics that normalise its observations.
 
-All that `Algorithm.act`, ``aim`` and ``policy_params`` need, for any algorithm whose actor is that of `Networks`.
+Implements `Algorithm.act`, ``aim`` and ``policy_params`` for any algorithm whose actor is that of `Networks`.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ class PolicyParams(NamedTuple):
     """Parameters of the policy.
 
     Attributes:
-        actor: With an encoder, of its own or the critic's.
-        observations, goals: Statistics that these are normalised with.
+        actor: Parameters of the actor, including an encoder (its own or the critic's).
+        observations, goals: Statistics for normalising observations and goals.
     """
 
     actor: Params

@@ -1,13 +1,13 @@
 """Several devices: a mesh with an axis for seeds and one for the data of each learner.
 
-    seed    learners lie on different devices, side by side, and never communicate
-    data    the devices share one learner: each plays its part of the environments, keeps these episodes in its part of the
-            replay, and takes its part of every batch from there; gradients, statistics and metrics are averaged
+    seed    learners are placed on different devices and never communicate
+    data    devices share one learner: each steps its part of the environments, keeps these episodes in its part of the replay,
+            and samples its part of every batch from there; gradients, statistics and metrics are averaged
 
-Every device runs the whole training iteration on its own part (`jax.shard_map`), so only the averages of this module are
-communicated. Random numbers are drawn for the whole learner, and each device takes its part of them: environment number 7
-starts and explores alike on however many devices. Batches differ in one respect from those of a single device: part d of a
-batch is drawn from the episodes of the environments of device d, so each environment group contributes equally to it.
+Every device runs the whole training iteration on its own part (`jax.shard_map`), so only averages over shards are
+communicated. Random numbers are generated for the whole learner, and each device uses its part of them: environment number 7
+starts and explores alike on any number of devices. Batches differ in one respect from those of a single device: part d of a
+batch is sampled from the episodes of the environments of device d, so each group of environments contributes equally.
 """
 
 import dataclasses
@@ -34,12 +34,12 @@ SEED = "seed"
 class Layout:
     """Placement of a run's seeds, and of each learner's shards, on devices; create it with `make_layout`.
 
-    Between two iterations, the replay of a learner that is divided is an array [S, rollouts, E, ...] in place of
-    [S, rollouts * E, ...]: the same bytes, so that a run may continue on another number of devices.
+    Between iterations, the replay of a sharded learner is an array [S, rollouts, E, ...] instead of [S, rollouts * E, ...]: the
+    same bytes, so that a run may continue on another number of devices.
 
     Attributes:
-        mesh: The devices, with the axes `SEED` and `DATA`; None: JAX's first device, and plain arrays.
-        shards: The parts of each learner.
+        mesh: Mesh of devices with the axes `SEED` and `DATA`; None for JAX's first device and plain arrays.
+        shards: Shards of each learner.
     """
 
     mesh: Mesh | None = None
@@ -110,14 +110,14 @@ class Layout:
         Args:
             function: Function of one device's parts of its arguments.
             in_specs: A partition spec, or a tree of them, for each argument.
-            out_specs: The same for its results.
-            jit: Such as `jax.jit`.
-            kept_as: Partition specs of the final result; None: ``out_specs``.
-            **options: Of ``jit``.
+            out_specs: A partition spec, or a tree of them, for the results.
+            jit: Compiling transformation, such as `jax.jit`.
+            kept_as: Partition specs of the final result; None for ``out_specs``.
+            **options: Further arguments of ``jit``.
         """
         if self.mesh is None:
             return jit(function, **options)
-        # Kernels and custom rules do not say along which axes their results vary, so JAX cannot check it.
+        # Kernels and custom rules do not declare along which axes their results vary, so JAX cannot check it.
         mapped = jax.shard_map(function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
         shardings = {"in_shardings": self.shardings(in_specs), "out_shardings": self.shardings(kept_as or out_specs)}
         return jit(mapped, **shardings, **options)
@@ -127,7 +127,7 @@ class Layout:
 
         Args:
             shapes: A pytree.
-            specs: Partition specs: a tree of which each leaf stands for a part of ``shapes``.
+            specs: Tree of partition specs, each of whose leaves covers a subtree of ``shapes``.
         """
         if self.mesh is None:
             return shapes
@@ -152,7 +152,7 @@ class Layout:
 
         Args:
             replay: Replay of one learner, [rollouts * E, ...].
-            num_envs: E, environments in this part.
+            num_envs: E, number of environments in this part.
         """
         count = self.shards.count
         if count == 1:
@@ -170,7 +170,7 @@ class Layout:
 
 
 def put_array(array: Any, sharding: Any) -> jax.Array:
-    """Place an array, possibly on devices of several processes: all of them call this with the same array."""
+    """Place an array, possibly on devices of several processes, all of which must call this with the same array."""
     if sharding.is_fully_addressable or getattr(array, "sharding", None) == sharding:
         return jax.device_put(array, sharding)
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
@@ -181,14 +181,14 @@ def put_array(array: Any, sharding: Any) -> jax.Array:
 
 
 ONE_DEVICE = Layout()
-"""Everything on JAX's first device."""
+"""Layout with everything on JAX's first device."""
 
 
 def _avoid_shardy() -> None:
     """Let XLA partition programs by GSPMD if Shardy would crash.
 
-    In jaxlib 0.11 a pass of Shardy reads past the end of a list, and so dies of a segmentation fault, where constants that a
-    `jax.shard_map` closes over turn out to be unused (`ManualComputationUnusedInputsPattern`); physics models are full of them.
+    In jaxlib 0.11 a pass of Shardy reads past the end of a list and crashes with a segmentation fault if constants that a
+    `jax.shard_map` closes over are unused (`ManualComputationUnusedInputsPattern`), as is common with physics models.
     """
     if jax.__version_info__ >= (0, 11):
         jax.config.update("jax_use_shardy_partitioner", False)
@@ -198,7 +198,7 @@ def make_layout(config: Config) -> Layout:
     """Place the seeds of a run, and the shards of each learner, on devices.
 
     Args:
-        config: The run; its ``devices`` and ``data_devices``.
+        config: Configuration of the run, of which ``devices``, ``data_devices`` and ``seeds`` are used.
 
     Raises:
         RequestError: There are too few devices.

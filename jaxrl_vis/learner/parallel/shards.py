@@ -1,7 +1,7 @@
-"""Shards of one learner, seen from within one of them: averaging, and each shard's share.
+"""Shards of one learner, seen from within one of them: averages over the shards, and each shard's part of an array.
 
-Every function here is called in a mapped axis (of `jax.shard_map` or `jax.vmap`) called `DATA`, unless there is one part only:
-then each returns its argument, and leaves nothing in the program.
+Every function here is called within a mapped axis `DATA` (of `jax.shard_map` or `jax.vmap`), unless there is only one shard:
+then each returns its argument, and adds nothing to the program.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ import jax
 from jax.flatten_util import ravel_pytree
 
 DATA = "data"
-"""Name of the axis."""
+"""Name of the mapped axis of shards."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Shards:
         return array if self.count == 1 else jax.lax.psum(array, DATA)
 
     def whole(self, mean: jax.Array) -> jax.Array:
-        """Average over the shards, with the gradient of this shard alone, which `mean` then averages, too."""
+        """Average over the shards, with the gradient of this shard alone, which is itself to be averaged by `mean`."""
         return mean if self.count == 1 else mean + jax.lax.stop_gradient(self.mean(mean) - mean)
 
     def part(self, array: jax.Array) -> jax.Array:
@@ -48,16 +48,16 @@ class Shards:
         return jax.lax.dynamic_slice_in_dim(array, jax.lax.axis_index(DATA) * size, size)
 
     def draw(self, draw: Callable[[tuple[int, ...]], jax.Array], shape: tuple[int, ...]) -> jax.Array:
-        """Draw this shard's part, of ``shape``, of the random numbers of the whole learner.
+        """Sample this shard's part, of ``shape``, of the random numbers of the whole learner.
 
         Args:
-            draw: shape -> random numbers, with a key that all parts share.
-            shape: Shape of this part; the first axis is the one that is divided.
+            draw: shape -> random numbers, with a key that all shards share.
+            shape: Shape of this part; the first axis is divided among shards.
         """
         return self.part(draw((shape[0] * self.count, *shape[1:])))
 
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-        """Draw standard normal numbers for this shard's images, of ``shape``, independent of the number of shards."""
+        """Sample standard normal numbers of ``shape`` for this shard's images, independent of the number of shards."""
         return self.draw(lambda whole: jax.random.normal(key, whole), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
@@ -74,4 +74,4 @@ class Shards:
 
 
 ONE = Shards()
-"""A learner that is not divided."""
+"""The only shard of an undivided learner."""

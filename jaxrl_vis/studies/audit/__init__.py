@@ -1,6 +1,6 @@
-"""Audit of reward functions against the truth of a simulated task.
+"""Audit of reward functions against the ground truth of a simulated task.
 
 episodes   pairs of images and goal images with their true distances, and a random search that maximises a reward
-measures   shares of false rewards, rank correlations, calibration
-report     all rewards on one task: records, table and picture
+measures   fractions of false rewards, rank correlations, calibration
+report     all rewards on one task: records, table and figure
 """

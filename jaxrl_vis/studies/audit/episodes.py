@@ -1,8 +1,8 @@
 """Images, goal images and true distances of a task, without a trained policy.
 
-hindsight   episodes of slowly changing random actions; each one's last image is its goal, so that all of them succeed
-pairs       images of episodes with goals: their own last image, those of other episodes, and the goals that were given
-search      for each of some goals, the best of many random sequences of actions by a reward: can it be exploited?
+hindsight   episodes of slowly changing random actions; the last image of each is its goal, so that all of them succeed
+pairs       images of episodes paired with goals: their own last image, that of another episode, and the goal that was given
+search      for each of several goals, the random sequence of actions with the highest reward: can the reward be exploited?
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ import jaxrl_vis_envs
 from jaxrl_vis_envs import goals as truth
 from jaxrl_vis_envs.base import GoalEnv
 
-_PERSISTENCE = 0.8  # share of an action that the next one keeps
+_PERSISTENCE = 0.8  # autocorrelation of successive actions
 
 Reward = Callable[[jax.Array, jax.Array], jax.Array]
 """(images [B, C, H, W] uint8, goal images of the same shape) -> rewards [B] float32 between 0 and 1."""
@@ -28,8 +28,8 @@ class Episodes(NamedTuple):
     Attributes:
         images: [E, T+1, ...] observations.
         states: [E, T+1, G] float32, true states.
-        goals: [E, ...] the goal images that were given.
-        goal_states: [E, G] float32, what they show.
+        goals: [E, ...] goal images that were given.
+        goal_states: [E, G] float32, true states of these goals.
     """
 
     images: Any
@@ -55,9 +55,9 @@ class Found(NamedTuple):
     """Result of a search over sequences of actions, for each of E goals.
 
     Attributes:
-        reward: [E] float32, the greatest reward at the end of an episode.
+        reward: [E] float32, maximum reward at the end of an episode.
         is_reached: [E] bool, whether that episode truly reaches the goal.
-        could_reach: [E] bool, whether any of the sequences does.
+        could_reach: [E] bool, whether any of the sequences reaches it.
     """
 
     reward: Any
@@ -66,7 +66,7 @@ class Found(NamedTuple):
 
 
 def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
-    """Draw slowly changing actions [T, A] in [-1, 1]."""
+    """Sample slowly changing actions [T, A] in [-1, 1]."""
 
     def step(action: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
         action = _PERSISTENCE * action + (1.0 - _PERSISTENCE**2) ** 0.5 * noise
@@ -77,7 +77,7 @@ def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
 
 
 def play(env: GoalEnv, count: int, seed: int) -> Episodes:
-    """Play ``count`` episodes of random actions."""
+    """Roll out ``count`` episodes of random actions."""
 
     def episode(key: jax.Array) -> Episodes:
         start_key, action_key = jax.random.split(key)
@@ -97,7 +97,7 @@ def play(env: GoalEnv, count: int, seed: int) -> Episodes:
 
 
 def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
-    """Add camera noise of ``deviation`` grey levels to all images, anew for each: goals were seen at another time."""
+    """Add camera noise of standard deviation ``deviation`` grey levels to all images and goals, independently for each."""
     if deviation == 0.0:
         return pairs
     draw = np.random.default_rng(seed)
@@ -110,7 +110,7 @@ def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
 
 
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
-    """Pair every image after the first with its episode's last, with another episode's, and with the goal that was given."""
+    """Pair every image but the first with the last image of its episode, that of another episode, and the given goal."""
     count, length = episodes.images.shape[0], env.horizon
     draw = np.random.default_rng(seed)
     others = (np.arange(count) + draw.integers(1, max(2, count), count)) % count

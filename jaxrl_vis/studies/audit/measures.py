@@ -1,4 +1,4 @@
-"""Measures of a reward function against the truth, as functions of NumPy arrays. Rewards lie between 0 and 1."""
+"""Metrics of a reward function relative to the ground truth, on NumPy arrays. Rewards lie between 0 and 1."""
 
 import numpy as np
 
@@ -7,28 +7,28 @@ BINS = 10
 
 
 def ranks(values: np.ndarray) -> np.ndarray:
-    """Return the ranks [N] float64 of [N] numbers, from 0; equal ones share their mean rank."""
+    """Return the ranks [N] float64 of [N] numbers, from 0; ties get their mean rank."""
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     ends = np.cumsum(counts)
     return (ends - (counts + 1) / 2.0)[inverse]
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Compute Spearman's rank correlation of [N] numbers; 0 where all of one are equal, which tells nothing about the other."""
+    """Compute Spearman's rank correlation of two arrays [N]; 0 if all values of one are equal."""
     one, other = (ranks(values) - (len(values) - 1) / 2.0 for values in (first, second))
     size = np.sqrt(np.sum(one**2) * np.sum(other**2))
     return 0.0 if size == 0.0 else float(np.sum(one * other) / size)
 
 
 def error_shares(reward: np.ndarray, is_reached: np.ndarray) -> tuple[float, float]:
-    """Compute the shares of false positives among pairs that miss, and of false negatives among pairs that reach.
+    """Compute the fraction of false positives among unreached pairs, and that of false negatives among reached pairs.
 
     Args:
         reward: [N] float32; at least 0.5 counts as positive.
-        is_reached: [N] bool, the truth.
+        is_reached: [N] bool, ground truth.
 
     Returns:
-        Both shares; NaN where there is no such pair.
+        Both fractions; NaN if there is no such pair.
     """
     positive = reward >= 0.5
     parts = positive[~is_reached], ~positive[is_reached]
@@ -37,10 +37,10 @@ def error_shares(reward: np.ndarray, is_reached: np.ndarray) -> tuple[float, flo
 
 
 def calibration(reward: np.ndarray, is_reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compare rewards, read as probabilities, with the share of pairs that reach, in even bins of the reward.
+    """Compare rewards, interpreted as probabilities, with the fraction of reached pairs, in uniform bins of the reward.
 
     Returns:
-        Mean reward, share reached (both NaN in empty bins), and number of pairs: [BINS] each.
+        Mean reward, fraction reached (both NaN in empty bins), and number of pairs: [BINS] each.
     """
     place = np.minimum((np.clip(reward, 0.0, 1.0) * BINS).astype(int), BINS - 1)
     count = np.bincount(place, minlength=BINS)
@@ -50,6 +50,6 @@ def calibration(reward: np.ndarray, is_reached: np.ndarray) -> tuple[np.ndarray,
 
 
 def calibration_error(reward: np.ndarray, is_reached: np.ndarray) -> float:
-    """Compute the expected calibration error: the mean over pairs of |mean reward - share reached| of their bin."""
+    """Compute the expected calibration error: the mean over pairs of |mean reward - fraction reached| of their bin."""
     mean, share, count = calibration(reward, is_reached)
     return float(np.nansum(count * np.abs(mean - share)) / np.sum(count))

@@ -1,4 +1,4 @@
-"""Audit of several rewards on one task: a record for each, as a table and a picture."""
+"""Audit of several rewards on one task: a record for each, shown as a table and a figure."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,12 +26,12 @@ COLUMNS = {
     "solved": "solved",
     "solvable": "solvable",
 }
-"""Keys of a record, and their headings; docs/indicator_rewards.md says what they mean."""
+"""Keys of a record, and their headings; docs/indicator_rewards.md explains them."""
 _BATCH = 512
 
 
 def _described(name: str, reward: Reward) -> Reward:
-    """Return the reward with errors that name it."""
+    """Wrap a reward so that its errors name it."""
 
     def call(images: jax.Array, goals: jax.Array) -> jax.Array:
         try:
@@ -46,14 +46,14 @@ def _described(name: str, reward: Reward) -> Reward:
 
 
 def _rewards(name: str, reward: Reward, images: np.ndarray, goals: np.ndarray) -> np.ndarray:
-    """Compute the rewards [N] of pairs, some at a time.
+    """Compute the rewards [N] of pairs in batches.
 
     Raises:
-        RequestError: They are no numbers between 0 and 1, one for each pair.
+        RequestError: The rewards are not one number between 0 and 1 for each pair.
     """
     compiled, rows = jaxrl_vis_envs.jit(_described(name, reward)), []
     for first in range(0, len(images), _BATCH):
-        part = np.arange(first, first + _BATCH) % len(images)  # the last one is filled up, so that one program serves all
+        part = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
         rows.append(np.asarray(compiled(images[part], goals[part]))[: len(images) - first])
         if rows[-1].shape != (min(_BATCH, len(images) - first),):
             raise RequestError(f"reward {name} has the shape {rows[-1].shape[1:]} for each image: it must be one number")
@@ -75,15 +75,15 @@ def audit(
     """Audit rewards of (images, goal images) on a task.
 
     Args:
-        env: The task; its observations are images.
-        rewards: Functions by name, with values between 0 and 1.
+        env: Environment of the task, with image observations.
+        rewards: Reward functions by name, with values between 0 and 1.
         episodes: Number of episodes of random actions.
         goals, sequences: Number of goals of the search, and of random sequences of actions for each.
-        noise: Standard deviation of camera noise on all images, grey levels. The search has none.
+        noise: Standard deviation in grey levels of camera noise on all images. The search has none.
         seed: Seed of all random numbers.
 
     Returns:
-        Records by name of the reward, with `COLUMNS`; the pairs; and the rewards [N] of the pairs by name.
+        Records by reward, with the keys of `COLUMNS`; the pairs; and the rewards [N] of the pairs by reward.
 
     Raises:
         RequestError: A reward has the wrong shape or range, or the task shows states.
@@ -92,7 +92,7 @@ def audit(
         raise RequestError("rewards are audited on images, and this task shows states: name its Visual variant")
     pairs = with_noise(make_pairs(env, play(env, episodes, seed), seed), noise, seed)
     is_reached = pairs.distance <= env.threshold
-    # Along an episode, up to its own end: the first part of the pairs.
+    # Pairs of images with the end of their own episode are the first part of all pairs.
     own = np.arange(episodes * env.horizon).reshape(episodes, env.horizon)
     time = np.arange(env.horizon)
     records, values = {}, {}
@@ -124,7 +124,7 @@ def table(records: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit: str, out: Path) -> None:
-    """Draw rewards against true distances, their quartiles in bins of the distance, and their calibration."""
+    """Write a figure of rewards against true distances (quartiles in bins of the distance) and of their calibration."""
     names: Sequence[Any] = list(values)
     figure = Figure(figsize=(3.1 * max(2, len(names)), 5.6), layout="constrained")
     axes = figure.subplots(2, max(2, len(names)), squeeze=False)
@@ -156,5 +156,5 @@ def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit:
 
 
 def devices() -> str:
-    """Return the kind of device that audits run on, for records."""
+    """Return the kind of device on which audits run, for records."""
     return jax.devices()[0].device_kind

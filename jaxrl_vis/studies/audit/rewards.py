@@ -1,4 +1,4 @@
-"""Rewards to audit, by name: built-in ones, one that a run has trained along, or ``module:function``."""
+"""Rewards to audit, by name: built-in ones, the reward model of a run, or ``module:function``."""
 
 from pathlib import Path
 from typing import Any
@@ -18,20 +18,20 @@ from jaxrl_vis.studies.audit.episodes import Reward
 from jaxrl_vis.types import Batch
 
 BUILT_IN = ("indicator", "indicator_tolerance", "features")
-"""Rewards that need neither truth nor a run."""
+"""Built-in rewards, which need neither true states nor a run."""
 
 
 def _as_batch(images: jax.Array, goals: jax.Array) -> Batch:
-    """Return a batch in which ``images`` [B, ...] were reached, without actions and true states."""
+    """Return a batch with ``images`` [B, ...] as achieved observations, and placeholders for actions and true states."""
     nothing = jnp.zeros((len(images), 1))
     return Batch(jnp.stack([images, goals, images]), nothing, nothing, nothing)
 
 
 def _of_run(run_dir: Path, trust: bool) -> Reward:
-    """Return the reward that the first seed of a run has trained along.
+    """Return the reward of the model that the first seed of a run has trained, scaled to [0, 1].
 
     Raises:
-        RequestError: The run's rewards are of another kind.
+        RequestError: The run has no reward model; from the reward: images have another shape.
     """
     check_whole(run_dir, "an audit of its reward")
     trainer = open_run(run_dir, trust=trust)
@@ -64,11 +64,11 @@ def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
 
     Args:
         name: One of `BUILT_IN`, a run folder, or ``module:function`` of images and goal images.
-        config: Tolerance and encoder of the built-in ones.
-        trust: As in `run.trained.open_run`.
+        config: Configuration with the tolerance and encoder of the built-in rewards.
+        trust: See `run.trained.restored_run.open_run`.
 
     Raises:
-        RequestError: There is no such reward, or it lacks something.
+        RequestError: The reward is unknown, or something that it needs is missing.
     """
     if name in BUILT_IN:
         function = make_reward(config, METHODS[name])

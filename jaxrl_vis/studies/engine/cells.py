@@ -3,8 +3,8 @@
     runs/FAMILY-STEPS/      a run folder, such as VisualHandReach-ol_aux_5-paper-seeds0to4-2M
     runs/FAMILY-STEPS.log   output of the processes that trained there
 
-Studies share folders: a cell of 600 k steps is read from a run of the same family that has 2 M. The reverse is impossible: a
-finished run has no replay, and could not be extended without changing what it learns.
+Studies share folders: a cell of 600 k steps is read from a run of the same family with 2 M. The reverse is impossible: a
+finished run has no replay, and cannot be extended exactly.
 
 Nothing here imports JAX: the process that manages cells must not occupy an accelerator's memory.
 """
@@ -22,10 +22,10 @@ from jaxrl_vis.run.storage.folder import RunFolder, contradictions, read_config
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A training run that a study needs.
+    """Training run that a study needs.
 
     Attributes:
-        family: Name without the length; the beginning of the folder's name.
+        family: Name without the number of steps; prefix of the folder's name.
         config: Configuration of the run.
     """
 
@@ -44,7 +44,7 @@ class Cell:
 
 
 def show_budget(steps: int) -> str:
-    """Format a number of steps as ``250k`` or ``2.5M``; with all digits if that would round."""
+    """Format a number of steps as ``250k`` or ``2.5M``, or with all digits if that would be inexact."""
     for size, letter in ((10**6, "M"), (10**3, "k")):
         if steps >= size and steps % (size // 100) == 0:
             return f"{steps / size:g}{letter}"
@@ -54,7 +54,7 @@ def show_budget(steps: int) -> str:
 def split_seeds(cell: Cell, count: int) -> list[Cell]:
     """Split a cell into cells of at most ``count`` seeds, for devices with too little memory for all of them.
 
-    Their families end in the seeds.
+    The seeds are appended to their families.
     """
     config = cell.config
     first = [config.run.seed + offset for offset in range(0, config.run.seeds, count)]
@@ -69,7 +69,7 @@ def split_seeds(cell: Cell, count: int) -> list[Cell]:
 
 
 def find_folder(cell: Cell, runs: Path) -> Path:
-    """Find the folder of a cell: a longer run of its family that has come far enough, or else the cell's own."""
+    """Find the folder of a cell: its own, unless only a longer run of its family has reached the cell's steps."""
     own = runs / cell.name
     if _reached(own, cell) is not None or not runs.is_dir():
         return own
@@ -88,7 +88,7 @@ def find_folder(cell: Cell, runs: Path) -> Path:
 def _reached(folder: Path, cell: Cell) -> int | None:
     """Return the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one.
 
-    A run that stops early has come far enough with the evaluation that it stops at.
+    For a run that stops early, the evaluation at which it stops is sufficient.
     """
     steps: dict[int, set[int]] = {}
     rows = RunFolder(folder).rows()
@@ -104,14 +104,14 @@ def differences(cell: Cell, runs: Path) -> list[str]:
     """Describe settings in which the cell's run differs; empty if there is no difference, or no run yet.
 
     Raises:
-        RequestError: Its config.json cannot be read.
+        RequestError: The run's config.json cannot be read.
     """
     folder = find_folder(cell, runs)
     return contradictions(read_config(folder), cell.config) if RunFolder(folder).config.exists() else []
 
 
 def contradiction(cell: Cell, runs: Path) -> str | None:
-    """Return why a cell's folder cannot be used for it, in one line; None if it can, or does not exist yet."""
+    """Return the reason why a cell's folder cannot be used, in one line; None if it can, or does not exist yet."""
     folder, mend = find_folder(cell, runs), "move it away, or choose another --runs"
     try:
         changes = differences(cell, runs)
@@ -131,7 +131,7 @@ def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[s
     Args:
         cell: The cell.
         runs: The folder of run folders.
-        as_it_is: Accept a run with other settings, such as those of a preset in an earlier version.
+        as_it_is: Whether to accept a run with other settings, such as those of a preset in an earlier version.
     """
     folder = find_folder(cell, runs)
     end = _reached(folder, cell)
@@ -141,7 +141,7 @@ def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[s
 
 
 def describe_progress(cell: Cell, runs: Path) -> str:
-    """Describe the progress of an unfinished cell: ``not begun``, or ``120k of 250k steps``."""
+    """Describe the progress of an unfinished cell, such as ``not begun`` or ``120k of 250k steps``."""
     reason = contradiction(cell, runs)
     if reason is not None:
         return reason

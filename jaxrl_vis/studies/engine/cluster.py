@@ -1,7 +1,7 @@
-"""Runs of a grid as cluster jobs, by submitit: on Slurm, or by its local executor, which works the same without a cluster.
+"""Execution of a grid's runs as cluster jobs by submitit: on Slurm, or by its local executor, which needs no cluster.
 
-A job is one training command. A job that Slurm ends, because of its time limit or preemption, has saved by then, and is queued
-again; it resumes by itself. For `grid`, a job looks like a process.
+A job is one training command. A job that Slurm ends because of its time limit or preemption saves first, is queued again, and
+resumes automatically. `grid` handles jobs like processes.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ class Training:
         with self._log.open("a", encoding="utf-8") as file:
             environment = {**os.environ, **self._environment}
             self._child = subprocess.Popen(words, stdout=file, stderr=file, env=environment, cwd=self._folder)
-            if "SLURM_JOB_ID" in os.environ:  # Slurm itself signals every process of a job; a second one would not wait
+            if "SLURM_JOB_ID" in os.environ:  # Slurm signals every process of a job; a second signal would not wait
                 return self._child.wait()
             before = signal.signal(signal.SIGTERM, lambda *_: self._terminate_child())
             try:
@@ -90,7 +90,7 @@ class Job:
         return self.returncode
 
     def send_signal(self, _: int) -> None:
-        """Cancel the job: the run saves and ends."""
+        """Cancel the job; the run saves and ends. The signal's number is ignored."""
         self._is_cancelled = True
         if self._is_local:  # cancelling would kill it a second later
             with contextlib.suppress(ProcessLookupError):
@@ -99,7 +99,7 @@ class Job:
             self._job.cancel()
 
     def kill(self) -> None:
-        """Cancel the job at once, as a cluster does."""
+        """Cancel the job immediately, by the executor's own means."""
         self._is_cancelled = True
         self._job.cancel()
 
@@ -107,7 +107,7 @@ class Job:
         """Wait for the job to end.
 
         Raises:
-            subprocess.TimeoutExpired: It still runs.
+            subprocess.TimeoutExpired: The job has not ended after ``timeout`` seconds.
         """
         end = None if timeout is None else time.monotonic() + timeout
         while self.poll() is None:
@@ -122,8 +122,8 @@ class Cluster:
 
     Args:
         executor: Executor of the jobs.
-        folder: For submitit's own files.
-        options: name=value: parameters of submitit's executor, such as timeout_min=600 or slurm_partition=gpu.
+        folder: Folder for submitit's own files.
+        options: Parameters of submitit's executor as name=value, such as timeout_min=600 or slurm_partition=gpu.
 
     Raises:
         RequestError: submitit or Slurm is missing, or an option is unknown.

@@ -1,4 +1,4 @@
-"""Engine of all studies, which trains a grid of cells, each in a process of its own, one per device.
+"""Engine of all studies, which trains a grid of cells, each in a separate process, one per device.
 
     unfinished cells -> `python -m jaxrl_vis train ... [--resume]`, a free device each -> run folders (`cells`)
 
@@ -31,19 +31,19 @@ from jaxrl_vis.studies.engine.cells import Cell, contradiction, is_finished, lat
 from jaxrl_vis.studies.engine.cluster import Job
 
 _POLL_S = 0.2
-_STATUS_S = 60.0  # between status lines
-_GRACE_S = 20.0  # for processes to end after a second signal
+_STATUS_S = 60.0  # interval between status lines
+_GRACE_S = 20.0  # time for processes to end after a second signal
 
 Command = Callable[[Cell, Path, bool], Sequence[str]]
-"""(cell, its folder, True to resume a run there) -> the words of a command that trains it."""
+"""(cell, its folder, whether to resume a run there) -> words of the command that trains it."""
 
 
 Start = Callable[[Sequence[str], Path, Mapping[str, str]], subprocess.Popen | Job]
-"""(words of a command, log file, variables that restrict it to its device) -> the process that runs it."""
+"""(words of a command, log file, environment variables that restrict it to its device) -> process that runs it."""
 
 
 def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> subprocess.Popen:
-    """Run a command on this machine. See `cluster` for others."""
+    """Start a command on this machine, appending its output to ``log``. See `cluster` for other machines."""
     # In its own session, so that a Ctrl-C of the terminal reaches it only once, from here: a second signal would end it at
     # once.
     with log.open("a", encoding="utf-8") as file:
@@ -82,14 +82,15 @@ def run_cells(
     Args:
         cells: Cells to train: longest first, so that devices finish at about the same time, otherwise in this order.
         runs: Folder of the run folders.
-        find_devices: Returns the devices, with one process at a time on each; called only if there are unfinished cells.
-        seconds: Time after which to save and stop; None: run to completion.
-        command: Makes the command that trains a cell.
-        say: Called with each line of output.
-        start: Starts a command.
+        find_devices: Function that returns the devices, each of which runs one process at a time; called only if there are
+            unfinished cells.
+        seconds: Time in seconds after which to save and stop; None to run to completion.
+        command: Function that returns the command to train a cell.
+        say: Function called with each line of output.
+        start: Function that starts a command.
 
     Returns:
-        A line for each cell that failed.
+        One line for each failed cell.
 
     Raises:
         RequestError: No device was found, or the folder cannot be written to.
@@ -182,7 +183,7 @@ class _Grid:
             self._say(f"{done.cell.name}: stopped after {took}; start again to resume")
         else:
             outcome = "ended before it was finished" if status == 0 else f"failed with exit status {status}"
-            # The log of a run with other settings, such as those of a version installed meanwhile, shows no error.
+            # The log shows no error if settings differ, for example because another version was installed meanwhile.
             cause = (contradiction(done.cell, self._runs) if status == 0 else None) or _last_line(done.log)
             line = f"{done.cell.name}: {outcome} after {took}: {cause} (log: {done.log})"
             self._failures.append(line)

@@ -24,8 +24,8 @@ class Line:
     Attributes:
         task, variant: Names of the task and the variant.
         rows: Evaluations of all seeds, from metrics.jsonl.
-        records: config.json of each of its runs.
-        unlike: Settings in which these runs differ from what would be trained now.
+        records: Contents of config.json of each of its runs.
+        unlike: Settings in which these runs differ from those that would be trained now.
     """
 
     task: str
@@ -36,7 +36,7 @@ class Line:
 
     @property
     def points(self) -> list[tuple[int, float]]:
-        """(environment steps, median success over seeds)."""
+        """Curve of (environment steps, median success over seeds)."""
         return curve(self.rows, SUCCESS)
 
     @property
@@ -69,12 +69,12 @@ def read_lines(
     """Read the lines of finished cells, and list unfinished ones.
 
     Args:
-        cells: (task, variant) -> the runs of a line.
-        runs: The folder of run folders.
-        as_they_are: Also read runs with other settings, such as those of a preset in an earlier version.
+        cells: Runs of each line, by (task, variant).
+        runs: Folder of the run folders.
+        as_they_are: Whether to read runs with other settings as well, such as those of a preset in an earlier version.
 
     Returns:
-        (task, variant) -> line, without lines with an unfinished cell; and a text for each unfinished cell.
+        Lines by (task, variant), without those with an unfinished cell; and a text for each unfinished cell.
     """
     lines, unfinished = {}, []
     for (task, variant), parts in cells.items():
@@ -108,10 +108,10 @@ class Reached:
     """Environment steps at which a level of success was reached, as defined in `jaxrl_vis.report.learning`.
 
     Attributes:
-        level: The level, a fraction.
-        steps: Steps in the median over seeds; None: not within the budget.
-        low, high: Middle half of the steps of single seeds; None: beyond the budget.
-        budget: Steps of the last evaluation.
+        level: Level of success, a fraction.
+        steps: Steps at which the median over seeds reached the level; None if not within the budget.
+        low, high: Quartiles of the steps of single seeds; None if beyond the budget, or for a single seed.
+        budget: Environment steps of the last evaluation.
     """
 
     level: float
@@ -144,7 +144,7 @@ def reached(line: Line, level: float) -> Reached:
     if len(line.seeds) == 1:
         return Reached(level, median, None, None, line.end)
     per_seed = [steps_to(curve([row for row in line.rows if row["seed"] == seed], SUCCESS), level) for seed in line.seeds]
-    # Quartiles of numbers of which some are only known to be large: one of them, without interpolation.
+    # Some values are only known to exceed the budget, so use quartiles without interpolation.
     quartiles = np.percentile([np.inf if steps is None else steps for steps in per_seed], [25, 75], method="inverted_cdf")
     low, high = (float(value) if np.isfinite(value) else None for value in quartiles)
     return Reached(level, median, low, high, line.end)

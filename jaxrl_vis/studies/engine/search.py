@@ -1,10 +1,10 @@
-"""Search for hyper-parameters: Optuna proposes values, `grid` trains them as it does a sweep's runs, and is told the scores.
+"""Hyper-parameter search: Optuna proposes values, `grid` trains them like the runs of a sweep, and Optuna gets the scores.
 
     runs/search.journal    Optuna's journal: every trial, its values and its score
     runs/trial-7-64k/      run folder of a trial
 
-It may be interrupted or killed at any time. Trials without a score are trained on when it is started again. Nothing here
-imports JAX: the accelerator's memory is for the runs.
+It may be interrupted or killed at any time. Training of trials without a score continues when it is started again. Nothing here
+imports JAX: the accelerator's memory is left to the runs.
 """
 
 import dataclasses
@@ -33,13 +33,13 @@ _SHOWN = 5
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Values of an option among which the search chooses.
+    """Search space of an option.
 
     Attributes:
         name: Name of the option.
-        low, high: Ends of a range, with ``words`` empty.
-        log: True if the logarithm is drawn evenly.
-        words: Single values, as they are typed.
+        low, high: Bounds of a range, used if ``words`` is empty.
+        log: Whether to sample on a logarithmic scale.
+        words: Discrete values, as typed on the command line.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Range:
     words: tuple[str, ...] = ()
 
     def distribution(self, optuna: Any) -> Any:
-        """Return the distribution in Optuna's terms."""
+        """Return the search space as a distribution of Optuna."""
         if self.words:
             return optuna.distributions.CategoricalDistribution(self.words)
         if fields.unwrap(OPTIONS[self.name].hint)[0] is int:
@@ -57,7 +57,7 @@ class Range:
         return optuna.distributions.FloatDistribution(self.low, self.high, log=self.log)
 
     def value(self, proposed: Any) -> Any:
-        """Return the value of the option that a proposed one stands for."""
+        """Convert a value proposed by Optuna to a value of the option."""
         return _read(self.name, proposed) if self.words else proposed
 
 
@@ -65,7 +65,7 @@ def read_range(text: str) -> Range:
     """Read ``name=low..high``, ``name=low..high,log`` or ``name=value,value,...``.
 
     Raises:
-        RequestError: It is written otherwise, there is no such option, or it does not take such values.
+        RequestError: The text has another form, the option is unknown, or it does not accept the values.
     """
     name, equals, values = text.partition("=")
     name = name.replace("-", "_")
@@ -101,9 +101,9 @@ class Request:
     """Request for a search.
 
     Attributes:
-        config: Configuration of all runs; the score is that of its last evaluation (`scores.score`).
-        ranges: What varies.
-        trials: Number of trials, those of earlier calls included.
+        config: Configuration of all runs; the score of a run is that of its last evaluation (`scores.score`).
+        ranges: Search spaces of the options that vary.
+        trials: Number of trials, including those of earlier calls.
         runs: Folder of the run folders and the journal.
         seed: Seed of the proposals.
         seconds: Time after which training stops.
@@ -123,14 +123,14 @@ def run_search(
     find_devices: Callable[[], Sequence[Device]] = list_devices,
     command: Command = train_command,
 ) -> bool:
-    """Train trials until there are as many as asked for, as many at a time as there are devices, and print the best.
+    """Train the requested number of trials, one per device at a time, and print the best.
 
     Returns:
-        True if there are.
+        True if all trials have ended.
 
     Raises:
         RequestError: Optuna is missing, the folder holds another search, or see `run_cells`.
-        KeyboardInterrupt, Terminated: After all runs have saved.
+        KeyboardInterrupt, Terminated: A signal arrived; raised after all runs have saved.
     """
     if not request.ranges:
         raise RequestError("nothing varies: name options and their values, such as --vary actor_learning_rate=1e-4..1e-2,log")
@@ -160,14 +160,14 @@ def _open(optuna: Any, request: Request) -> Any:
     """Open the journal's study.
 
     Raises:
-        RequestError: The journal cannot be read or written, or is that of another search.
+        RequestError: The journal cannot be read or written, or belongs to another search.
     """
     file = request.runs / JOURNAL
     asked = _described(request)
     try:
         request.runs.mkdir(parents=True, exist_ok=True)
         storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(file)))
-        # Another seed for each start: the same one would propose what it has proposed before.
+        # A different seed at each start: the same one would repeat earlier proposals.
         study = optuna.create_study(
             storage=storage,
             study_name=_STUDY,
@@ -190,7 +190,7 @@ def _open(optuna: Any, request: Request) -> Any:
 
 
 def _described(request: Request) -> dict[str, Any]:
-    """Describe what all trials of a search have in common, as a JSON value."""
+    """Describe the settings common to all trials of a search, as a JSON value."""
     varied = {part.name for part in request.ranges}
     values = {name: value for name, value in request.config.flat().items() if name not in varied}
     vary = {part.name: dataclasses.asdict(part) for part in request.ranges}
@@ -226,7 +226,7 @@ class _Search:
                 return False
 
     def _cells(self, batch: Mapping[int, Mapping[str, Any]]) -> dict[int, Cell]:
-        """Make the cells of trials; one whose values contradict each other has failed, or that was killed without them."""
+        """Return the cells of trials by number; mark trials with missing or contradictory values as failed."""
         cells = {}
         for number, params in batch.items():
             if not {part.name for part in self._request.ranges} <= set(params):
@@ -241,7 +241,7 @@ class _Search:
         return cells
 
     def _tell(self, cells: Mapping[int, Cell], failures: Sequence[str]) -> bool:
-        """Tell the scores of trials that have ended; return False if one has not, because the time is over."""
+        """Report the scores of trials to Optuna; return False if one has not ended, because time is up."""
         for number, cell in cells.items():
             rows = finished_rows(cell, self._request.runs)
             score = _score(cell, rows)

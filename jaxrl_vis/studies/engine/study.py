@@ -12,7 +12,7 @@ from jaxrl_vis.studies.engine.cells import Cell, split_seeds
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """Variant of a configuration: a line of a figure.
+    """Variant of a configuration, shown as a line of a figure.
 
     Attributes:
         label: Label in the figure.
@@ -35,7 +35,7 @@ class Family:
         tasks: Environments of the subject.
         preset: Default preset of the runs.
         of_task: (preset, environment) -> fields of `Config` that differ from the preset.
-        longest: Preset -> environment -> largest number of environment steps, for presets that need smaller budgets than the
+        longest: Preset -> environment -> maximum number of environment steps, for presets that need smaller budgets than the
             thesis.
         quick: Changes of the preset ``cpu`` for `figure --quick`.
     """
@@ -55,8 +55,8 @@ class Study:
 
     Attributes:
         family: Family of the study.
-        title: The figure's first line.
-        variants: Its lines, in the order of the legend; names of `Family.variants`.
+        title: Title of the figure.
+        variants: Names of its lines in the order of the legend, from `Family.variants`.
         steps: Environment -> environment steps of each run; these are the default tasks of the figure.
         shorter: (environment, variant) -> environment steps of shorter runs.
         extra: Variants that are trained for the tables only.
@@ -80,8 +80,8 @@ class Scope:
         preset: Preset of every run.
         seed: First seed.
         seeds: Number of seeds.
-        seeds_per_run: Largest number of seeds in one program; None: all.
-        env_steps: Budget of every run; None: the study's own.
+        seeds_per_run: Maximum number of seeds in one program; None for all.
+        env_steps: Budget of every run in environment steps; None for that of the study.
         changes: Fields of `Config` to change in every run.
     """
 
@@ -94,18 +94,18 @@ class Scope:
 
 
 Cells = dict[tuple[str, str], list[Cell]]
-"""(environment, variant) -> the cells that make it, one for each group of seeds."""
+"""Cells by (environment, variant), one for each group of seeds."""
 
-# `debug` makes 4 gradient steps per iteration, which OL-AUX-5 does not divide; nor would 5 be divided by TD3's 2.
+# `debug` takes 4 gradient steps per iteration, which is not a multiple of OL-AUX-5's 5; 5 would not be one of TD3's 2.
 _OF_PRESET: dict[str, dict[str, Any]] = {"debug": {"updates_per_iteration": 10}}
 _LONGEST = 1_500_000  # environment steps of a task without a budget in the study
 
 
 def make_cells(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
-    """Make the cells of a study, task after task.
+    """Create the cells of a study, task by task.
 
     Raises:
-        RequestError: There is no such task or variant, or a configuration is invalid.
+        RequestError: A task or variant is unknown, or a configuration is invalid.
     """
     for task in tasks:
         if task not in study.family.tasks:

@@ -15,7 +15,7 @@ from jaxrl_vis.studies.engine.cluster import Cluster, ExecutorName
 from jaxrl_vis.studies.engine.grid import run_cells, start_process
 
 SUBMITTED = "submitit"
-"""Folder of submitit's own files, inside the folder of runs."""
+"""Name of the folder of submitit's own files, within the folder of runs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,12 +26,12 @@ class Request:
         tasks: Environments.
         methods: Methods, the sources of rewards.
         preset: Preset of all runs.
-        changes: Fields of `Config` that differ from it in all runs.
+        changes: Values of `Config` fields that differ from the preset in all runs.
         runs: Folder of the run folders.
-        seeds_per_run: Largest number of seeds in one program; None: all.
-        seconds: Time after which training stops.
-        executor: None: processes on this machine, one per device; otherwise an executor of `cluster`.
-        jobs: Largest number of simultaneous jobs on a cluster.
+        seeds_per_run: Maximum number of seeds in one program; None for all.
+        seconds: Time in seconds after which training stops; None if unlimited.
+        executor: Executor of `cluster`; None for processes on this machine, one per device.
+        jobs: Maximum number of simultaneous jobs on a cluster.
         job_options: See `Cluster`.
     """
 
@@ -48,7 +48,7 @@ class Request:
 
 
 def make_cells(request: Request) -> list[Cell]:
-    """Make the cells of a sweep, task after task.
+    """Create the cells of a sweep, task by task.
 
     Raises:
         RequestError: A configuration is invalid.
@@ -68,11 +68,11 @@ def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> boo
     """Train missing cells, resume unfinished ones, and print a table.
 
     Returns:
-        True if everything is finished.
+        True if all cells are finished.
 
     Raises:
         RequestError: See `make_cells` and `run_cells`.
-        KeyboardInterrupt, Terminated: After all runs have saved.
+        KeyboardInterrupt, Terminated: A signal arrived; raised after all runs have saved.
     """
     cells = make_cells(request)
     find_devices, start = list_devices, start_process
@@ -89,7 +89,7 @@ def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> boo
 
 
 def _table(cells: Sequence[Cell], runs: Path) -> tuple[list[str], list[str]]:
-    """Format lines about finished and about unfinished cells."""
+    """Return the lines of a table of finished cells, and a line for each unfinished one."""
     results: dict[tuple[str, str], dict[int, float]] = {}
     unfinished = []
     for cell in cells:

@@ -1,4 +1,4 @@
-"""Learning curves released by the authors of OL-AUX, digitised from their figures; the head of the data file describes how."""
+"""Learning curves by the authors of OL-AUX, digitised from their figures as described in the header of the data file."""
 
 import csv
 import importlib.resources
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 _FILE = "data/ol_aux_curves.csv"
-_ENVIRONMENTS = {"VisualFinger": "VisualFingerTurn"}  # environments with another name there
+_ENVIRONMENTS = {"VisualFinger": "VisualFingerTurn"}  # environments with another name in the file
 _VARIANTS = {"NoAux": "none", "OL-AUX-5": "ol_aux_5"}
 
 
 def released_curves() -> dict[tuple[str, str], list[tuple[int, float]]]:
-    """Read the curves: (environment, variant) -> (environment steps, success), ascending; both under this project's names."""
+    """Read the curves of (environment steps, success), ascending, by (environment, variant) in this project's names."""
     text = importlib.resources.files("jaxrl_vis.studies").joinpath(_FILE).read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     curves: dict[tuple[str, str], list[tuple[int, float]]] = {}
@@ -27,7 +27,7 @@ def mean_difference(ours: Sequence[tuple[int, float]], theirs: Sequence[tuple[in
 
     Args:
         ours: (environment steps, success), ascending; interpolated linearly.
-        theirs: Likewise, not interpolated.
+        theirs: (environment steps, success), ascending; not interpolated.
 
     Returns:
         The difference; None if there is no such point.

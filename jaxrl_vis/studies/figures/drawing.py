@@ -23,10 +23,10 @@ class Curve:
 
     Attributes:
         label: Label in the legend; lines with the same label share an entry.
-        colour: Its colour.
+        colour: Colour of the line.
         steps: [P] environment steps.
         values: [S, P], one row per seed, NaN for gaps.
-        behind: True for other people's results: thin, dashed, and behind the others.
+        behind: Whether these are published results of others, drawn thin, dashed and behind the others.
     """
 
     label: str
@@ -43,7 +43,7 @@ class Panel:
     Attributes:
         title: Title of the panel.
         curves: Lines of the panel.
-        is_share: True for values in [0, 1] that are shown in percent.
+        is_share: Whether values are fractions in [0, 1], shown in percent.
     """
 
     title: str
@@ -61,7 +61,7 @@ class Picture:
     """Image file of a figure.
 
     Attributes:
-        suffix: Part of its name after the figure's.
+        suffix: Suffix appended to the figure's file name.
         rows: Panels, row by row; all rows have the same length.
         subtitle: Addition to the description of the runs in the second line.
     """
@@ -72,10 +72,10 @@ class Picture:
 
 
 def draw_panels(path: Path, rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> None:
-    """Write a figure.
+    """Compose a figure and write it to a file.
 
     Args:
-        path: A .png, or any other format that Matplotlib can write.
+        path: Path of the file, .png or any other format that Matplotlib can write.
         rows, title, subtitle: See `compose`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -127,7 +127,7 @@ def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figur
 
 
 def _break_lines(text: str, letters: int) -> list[str]:
-    """Break a text after semicolons, into lines of at most a number of characters if its clauses allow."""
+    """Break a text after semicolons into lines of at most ``letters`` characters, except for longer clauses."""
     lines = [""]
     for clause in text.split("; "):
         longer = f"{lines[-1]}; {clause}" if lines[-1] else clause

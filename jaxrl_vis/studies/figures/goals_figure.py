@@ -13,12 +13,12 @@ from jaxrl_vis.studies.goals import VARIANTS
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean
 
 LEVEL = 0.9
-"""Success to which steps and seconds are counted."""
+"""Level of success for which steps and seconds are reported."""
 _WALL, _COMPILATION = "time/wall_s", "time/compile_s"
 
 
 def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Make the content of the figure from its lines."""
+    """Create the content of the figure from its lines."""
     shown = {key: line for key, line in lines.items() if key[1] in variants}
     of_steps = [Panel(f"{task}: success", _curves(shown, task)) for task in tasks]
     of_seconds = [Panel(f"{task}: success, by seconds", _curves(shown, task, by_seconds=True)) for task in tasks]
@@ -43,7 +43,7 @@ def _curves(lines: Mapping[tuple[str, str], Line], task: str, by_seconds: bool =
 
 
 def _seconds(line: Line, steps: int) -> float:
-    """Return the seconds of all seeds together up to a number of environment steps, without compilation."""
+    """Return the wall-clock seconds, for all seeds together and without compilation, up to a number of environment steps."""
     row = next(row for row in line.rows if row["env_steps"] >= steps)
     return float((row.get(_WALL) or 0.0) - (row.get(_COMPILATION) or 0.0))
 

@@ -30,7 +30,7 @@ _ORACLE_WORKS: dict[str, tuple[str, float]] = {
 
 
 def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Make the content of a figure from its lines."""
+    """Create the content of a figure from its lines."""
 
     def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:
         return [Panel(f"{task}: {title}", _curves(lines, task, variants, metric), is_share) for task in tasks]
@@ -58,7 +58,7 @@ def _curves(lines: Mapping[tuple[str, str], Line], task: str, variants: Sequence
 
 
 def _values(line: Line, metric: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return env_steps [P] and the metric [S, P]; precision is NaN where the filter is inactive, as in the tables."""
+    """Return env_steps [P] and the metric [S, P]; the filter's precision is NaN where it is inactive, as in the tables."""
     steps, values = line.values(metric)
     if metric == _PRECISION:
         values = np.where(line.values(_FILTERED)[1] >= _ACTIVE, values, np.nan)
@@ -124,7 +124,7 @@ def _cells(figures: Mapping[str, Quartiles | float]) -> list[str]:
 
 
 def _csv(value: Quartiles | float) -> list[tuple[str, float | None]]:
-    """Return suffixes of a column's name, and their values."""
+    """Return the suffixes of a column's name in the CSV file, with their values."""
     low, median, high = value if isinstance(value, tuple) else (None, value, None)
     rounded = [
         (end, None if number is None or np.isnan(number) else round(number, 5))
@@ -134,7 +134,7 @@ def _csv(value: Quartiles | float) -> list[tuple[str, float | None]]:
 
 
 def _oracle_notes(lines: Mapping[tuple[str, str], Line]) -> list[str]:
-    """Make notes on tasks where the oracle itself fails, so that methods cannot be compared."""
+    """Return notes on tasks where the oracle itself fails, so that methods cannot be compared."""
     notes = []
     for (task, variant), line in lines.items():
         if variant == "oracle" and task in _ORACLE_WORKS:

@@ -1,10 +1,10 @@
-"""Figures of training runs: trains missing runs, draws, and writes tables.
+"""Creation of figures: training of missing runs, plots and tables.
 
-FIGURE.png   the lines of finished cells; in figures 5.4 to 5.7 also, dashed, those released by the authors
-FIGURE.md    the tables, and a description of the runs
-FIGURE.csv   the same numbers, for further computation
+FIGURE.png   lines of finished cells; in figures 5.4 to 5.7 also those released by the authors, dashed
+FIGURE.md    tables, and a description of the runs
+FIGURE.csv   the same numbers, for further processing
 
-`ol_aux`, `indicator` and `goals` define the runs of a figure; files of the same names here their presentation.
+`ol_aux`, `indicator` and `goals` define the runs of a figure; files with similar names in this folder their presentation.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> b
     """Train missing cells and draw finished ones.
 
     Returns:
-        True if all cells are finished, and so drawn.
+        True if all cells are finished and thus plotted.
 
     Raises:
         RequestError: The request cannot be fulfilled, see `make_cells` and `run_cells`.
@@ -86,7 +86,7 @@ def _write(
 
 
 def _about(request: Request, lines: Sequence[Line]) -> str:
-    """Describe preset, seeds and updates per step, which every figure must state."""
+    """Describe options, preset, seeds and update ratio, which every figure must state."""
     seeds = sorted({seed for line in lines for seed in line.seeds})
     seeds_text = f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}; line: median, band: 25 to 75 %"
     ratios = sorted({f"{line.steps_per_update:.3g}" for line in lines}, key=float)

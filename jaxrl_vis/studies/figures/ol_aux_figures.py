@@ -1,4 +1,4 @@
-"""Content of figures 5.4 to 5.7: curves of success with the authors' behind, curves of weights, and tables."""
+"""Content of figures 5.4 to 5.7: curves of success, with those of the authors, curves of weights, and tables."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ Lines = Mapping[tuple[str, str], Line]
 
 
 def show(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Make the content of a figure from its lines."""
+    """Create the content of a figure from its lines."""
     is_weights = request.figure == WEIGHTS
     panels = [Panel(task, (_weights if is_weights else _success)(lines, task, variants), not is_weights) for task in tasks]
     text, rows = _weights_table(request, lines, tasks) if is_weights else _steps_table(lines, tasks)

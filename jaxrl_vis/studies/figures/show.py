@@ -16,14 +16,14 @@ class Request:
     Attributes:
         figure: Name of the figure.
         study: Study of the figure.
-        out: Path of the image; the tables are written beside it.
+        out: Path of the image; tables are written to the same folder.
         runs: Folder of the run folders.
-        tasks: Environments; empty: those of the study.
-        variants: Names of variants of its family; empty: those of the study.
+        tasks: Environments; empty for those of the study.
+        variants: Names of variants of its family; empty for those of the study.
         scope: Scope of the runs.
-        draw_only: Train nothing: draw existing runs, including those with other settings, which are noted.
-        seconds: Time after which training stops.
-        per_device: Parallel runs per device.
+        draw_only: Whether to plot existing runs without training, including runs with other settings, which are noted.
+        seconds: Time in seconds after which training stops; None if unlimited.
+        per_device: Number of parallel runs per device.
     """
 
     figure: str
@@ -47,7 +47,7 @@ class FigureContent:
         text: Tables, as lines of Markdown.
         rows: The same tables as rows of data.
         notes: Sentences below the tables.
-        title: Replacement of the study's title, if the selected lines need another one.
+        title: Replacement for the study's title; empty to keep it.
     """
 
     pictures: Sequence[Picture]

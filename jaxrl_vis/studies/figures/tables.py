@@ -17,8 +17,8 @@ class Named:
     """Line with its label in tables.
 
     Attributes:
-        label: Label of its method.
-        line: The line.
+        label: Label of the method.
+        line: Results of the method.
         source: Origin of the results: ``here``, or their publisher.
     """
 
@@ -33,8 +33,8 @@ def steps_table(
     """Tabulate steps to each level, and speed-ups over the baseline of the same source.
 
     Args:
-        lines: Task -> its lines.
-        levels: Task -> levels of success.
+        lines: Lines by task.
+        levels: Levels of success by task.
 
     Returns:
         Lines of Markdown, one table per task; and rows for `spreadsheets.to_csv`.
@@ -101,10 +101,10 @@ def weights_table(
     The gain is the difference of mean success to the run without auxiliary losses, up to the shorter run's end.
 
     Args:
-        weighted: Task -> the run with all losses.
-        alone: (task, auxiliary loss) -> the run with only that loss, if it exists.
-        bases: Task -> the run without auxiliary losses, if it exists.
-        names: Auxiliary loss -> its label.
+        weighted: Runs with all losses, by task.
+        alone: Runs with a single auxiliary loss, by (task, auxiliary loss), as far as they exist.
+        bases: Runs without auxiliary losses, by task, as far as they exist.
+        names: Labels of the auxiliary losses, by name.
     """
     text: list[str] = []
     rows: list[dict[str, Any]] = []

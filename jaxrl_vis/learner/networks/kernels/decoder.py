@@ -1,19 +1,20 @@
 """Finest two layers of a decoder and its squared error in one GPU kernel (Pallas, by Triton), including gradients.
 
-A decoder's layers (`auxtasks.heads`) double its image's sides, so nearly all numbers that it makes are those of the last two:
-for an image of 64x64 pixels with four channels 16,384 each, beside an observation of as many. As separate products they would
-be written and read a dozen times on the way there and back. Here a tile of *cells*, 4x4 pixels each, passes through all of it:
+Each layer of a decoder (`auxtasks.heads`) doubles the height and width of its image, so nearly all activations are those of the
+last two: for an image of 64x64 pixels with four channels 16,384 each, as many as in the observation. As separate products they
+would be written and read a dozen times in the forward and backward passes. Here a tile of *cells*, 4x4 pixels each, passes
+through all steps:
 
     cells    [R, 64]       with bias and rectifier
     layer    [R, 4 * 16]   4 quarters of a cell       @ [64, 64]
     layer    [R, 16 C']    16 pixels of it, C' channels      @ [64, 16 C'], block-diagonal
-    error    of these pixels, and the way back at once: the gradient of a squared error is known as soon as the error is
+    error    of these pixels, followed by the backward pass at once: the gradient of a squared error follows from the error
 
 Pixels have the order of the encoder's patches (`kernels.patches`): channel, row, column within a cell, and cells in
-nested blocks. So an autoencoder's targets are the encoder's inputs, byte for byte.
+nested blocks. Targets of an autoencoder are thus identical to the encoder's inputs.
 
-The gradient of the cells is written in the networks' dtype, those of the weights are added up in float32 as in
-`kernels.passes`; both are multiplied by the gradient that comes in.
+The gradient with respect to cells is written in the networks' dtype, those with respect to weights are accumulated in float32
+as in `kernels.passes`; both are multiplied by the incoming gradient.
 """
 
 import functools
@@ -40,13 +41,13 @@ from jaxrl_vis.learner.networks.kernels.passes import (
 from jaxrl_vis.learner.networks.kernels.patches import divisor, padded_channels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
-_MOST_CHANNELS = 4  # beyond, the weights' gradients no longer fit into registers
-# Cells in a tile, tiles that one program works through at most, and how they are run.
+_MOST_CHANNELS = 4  # with more, the weights' gradients do not fit into registers
+# Cells in a tile, maximum number of tiles per program, and compiler parameters.
 _CELLS, _TILES, _PARAMS = 64, 32, plgpu.CompilerParams(num_warps=4, num_stages=1)
 
 
 class Weights(NamedTuple):
-    """Layers in the form that the kernel multiplies, float32.
+    """Weights of the layers in the layout that the kernel multiplies, float32.
 
     Attributes:
         bias_in: [F], added to cells before their rectifier.
@@ -70,19 +71,19 @@ def supports(channels: int, cell_features: int, quarter_features: int) -> bool:
 
 
 def make_weights(bias_in: jax.Array, finer: dict[str, jax.Array], finest: dict[str, jax.Array]) -> Weights:
-    """Make the kernel's weights from a decoder's last two layers.
+    """Convert a decoder's last two layers to the kernel's weights.
 
     Args:
-        bias_in: [F], of the layer before.
-        finer: kernel [F, 4 G] and bias [G] of the last but one.
-        finest: kernel [G, 4 C] and bias [C] of the last.
+        bias_in: [F], bias of the layer before.
+        finer: kernel [F, 4 G] and bias [G] of the second-to-last layer.
+        finest: kernel [G, 4 C] and bias [C] of the last layer.
     """
     features, channels = finest["kernel"].shape[0], finest["bias"].shape[0]
     missing = padded_channels(channels) - channels
     window = finest["kernel"].reshape(features, 2, 2, channels)  # feature, row and column in a quarter, channel
     window = jnp.pad(window, [(0, 0), (0, 0), (0, 0), (0, missing)]).transpose(0, 3, 1, 2)
-    # To (quarter's row and column, feature) and (channel, quarter's row, row, quarter's column, column), where a quarter makes
-    # its own pixels only.
+    # To (quarter's row and column, feature) and (channel, quarter's row, row, quarter's column, column), where a quarter only
+    # contributes to its own pixels.
     same = jnp.eye(2, dtype=window.dtype)
     of_rows, of_columns = same[:, None, None, None, :, None, None, None], same[None, :, None, None, None, None, :, None]
     cell = window[None, None, :, :, None, :, None, :] * of_rows * of_columns
@@ -139,7 +140,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
     sums, squares = jax.lax.fori_loop(0, cells_ref.shape[0] // tile, one_tile, start)
     first = 0
     for like, value in zip((*weights, weights.bias_2), (*sums, squares), strict=True):
-        if value.shape != like.shape:  # sixteen times the same sum
+        if value.shape != like.shape:  # sixteen copies of the same sum
             value = jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS)
         sums_ref[pl.ds(first, like.size)] = value.reshape(-1)
         first += like.size
@@ -208,17 +209,17 @@ _squared_error.defvjp(_squared_error_forward, _squared_error_backward)
 
 
 def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False) -> jax.Array:
-    """Sum the squared errors over pixels, times ``scale``: [] float32; differentiable with respect to cells and weights.
+    """Compute ``scale`` times the sum of squared errors, [] float32; differentiable with respect to cells and weights.
 
     Args:
         cells: [M, F], M a multiple of 16: output of the previous layer, without its bias.
-        target: [at least M, 16 C'], of which the first M rows count; padding must be 0.
+        target: [at least M, 16 C'], of which the first M rows are used; padding must be 0.
         weights: From `make_weights`.
-        scale: A number, so that the kernel writes the scaled gradient directly.
+        scale: Python number, so that the kernel writes the scaled gradient directly.
         interpret: Run the kernel without a GPU, slowly.
 
     Raises:
-        ValueError: M is something else.
+        ValueError: M is not a multiple of 16.
     """
     if cells.shape[0] % LEAST_ROWS:
         raise ValueError(f"{cells.shape[0]} cells are not a multiple of {LEAST_ROWS}")

@@ -1,23 +1,22 @@
 """First three layers of the encoder in one GPU kernel per direction (Pallas, by Triton).
 
-Windows of 2x2 pixels with stride 2 never overlap, so three layers see a *patch* of 8x8 pixels at a time and nothing else. A
-tile of R patches (`kernels.patches` makes them, in an order that has windows side by side) passes through all three
-without leaving the chip:
+Windows of 2x2 pixels with stride 2 never overlap, so the receptive field of three layers is a *patch* of 8x8 pixels. A tile of
+R patches (from `kernels.patches`, in an order that makes windows contiguous) passes through all three without leaving the chip:
 
     4 R quarters of 4x4 pixels     [4 R, 16 C']  @ [16 C', 4 F1]   layer 1, its four windows at once: block-diagonal
                                    [4 R, 4 F1]   @ [4 F1, F2]      layer 2
     R patches                      [R, 4 F2]     @ [4 F2, F3]      layer 3
 
-Layer 1 multiplies three zeros for every number, because products 16 wide leave a GPU's matrix units idle anyway. As separate
-products, the layers would spend nine tenths of their time on writing and reading each other's activations. A fourth layer would
-see four patches at a time, so that a tile has too few rows of it: in here, it made gradient steps a third slower.
+Layer 1 multiplies three zeros for every nonzero weight, because products 16 wide leave a GPU's matrix units idle anyway. As
+separate products, the layers would spend 90 % of their time on writing and reading each other's activations. A fourth layer
+would read four patches at a time, so that a tile has too few rows of it: fusing it made gradient steps a third slower.
 
-The backward kernel computes all layers but the last again, keeps the gradients of the weights in registers over several tiles,
-and writes a partial sum for each program; those are added up in a fixed order, so a resumed run repeats itself exactly.
+The backward kernel recomputes all layers but the last, keeps the gradients of the weights in registers over several tiles, and
+writes a partial sum for each program; these are summed in a fixed order, so a resumed run is reproduced exactly.
 
-`networks` has the same function as plain matrix products: these are the reference, and run in processes without such a GPU.
-Where there is one, images are put into patches whatever a program is compiled for, and a program for another platform computes
-the layers here, from the same patches, in plain JAX.
+`networks` has the same function as plain matrix products: these are the reference, and run in processes without such a GPU. In
+a process with one, images are converted to patches for any target platform, and programs for other platforms compute the
+layers here, from the same patches, in plain JAX.
 """
 
 import functools
@@ -48,7 +47,7 @@ def make_weights(params: dict[str, Any], channels: int) -> Weights:
     window = params["kernel_0"].reshape(2, 2, channels, -1)  # row, column, channel, filter
     window = jnp.pad(window, [(0, 0), (0, 0), (0, padded_channels(channels) - channels), (0, 0)])
     # From (channel, window's row, row, window's column, column) to (window's row, window's column, filter), where a window only
-    # sees itself. Written as a product by zeros and ones, which XLA makes one pass of.
+    # reads its own pixels. Written as a product with zeros and ones, which XLA fuses into one pass.
     same = jnp.eye(2, dtype=window.dtype)
     same = same[:, None, None, None, :, None, None] * same[:, None, None, :, None]
     quarter = window.transpose(2, 0, 1, 3)[:, None, :, None, :, None, None, :] * same
@@ -72,15 +71,16 @@ def prepare(
     shift: jax.Array | None = None,
     interpret: bool = False,
 ) -> jax.Array:
-    """Normalise images and put them into patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
+    """Normalise images and convert them to patches: [B, C, H, W] uint8 -> [B, patches, 64 C'] of ``dtype``.
 
     Args:
         images: Planar images.
         mean, scale: [C, H, W] float32.
-        levels: All the encoder's layers; borders that do not fill a block of 2^levels pixels are cropped.
-        limit: Normalised values are clipped to plus and minus this.
-        dtype: Of the result.
-        shift: [B, 2] int32, pixels by which normalised images move, down and to the right; what moves in is 0.
+        levels: Total number of the encoder's layers; borders that do not fill a block of 2^levels pixels are cropped.
+        limit: Maximum magnitude, to which normalised values are clipped.
+        dtype: Dtype of the result.
+        shift: [B, 2] int32, pixels by which to shift normalised images down and to the right, filling with 0; None for no
+            shift.
         interpret: Run the kernel without a GPU, slowly.
     """
     settings = {"levels": levels, "limit": limit, "dtype": dtype}
@@ -94,7 +94,7 @@ def prepare(
 def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), interpret: bool = False) -> jax.Array:
     """Encode the images ``which`` by `apply`: [B, patches, 64 C'] -> [images, patches, F], same dtype.
 
-    Images are chosen here rather than by slicing before, because a slice that a kernel reads is a copy.
+    Images are selected here rather than sliced beforehand, because passing a slice to a kernel would copy it.
     """
     batch, of_image, size = patches.shape
     images = range(batch)[which]

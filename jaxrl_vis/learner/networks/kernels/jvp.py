@@ -1,7 +1,7 @@
-"""Kernel of the encoder's first layers with tangents along a direction of the weights.
+"""Kernel that computes the encoder's first layers and their tangents along a direction of the weights.
 
-And the same in plain JAX, as in `kernels.passes`. Used by weightings that need dot products of gradients
-(`learner.tangents`).
+Has an equivalent in plain JAX, as in `kernels.passes`. Used by weightings that need dot products of gradients
+(`networks.forward_mode`).
 """
 
 import functools

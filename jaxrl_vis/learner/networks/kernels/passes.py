@@ -1,6 +1,6 @@
 """Forward and backward kernels of the encoder's first layers (`kernels.encoder`; `kernels.jvp` has a third).
 
-Each has an equivalent in plain JAX, as reference and for processes without such a GPU.
+Each has an equivalent in plain JAX, as a reference and for processes without such a GPU.
 """
 
 import functools
@@ -18,19 +18,19 @@ from jaxrl_vis_envs.compiling.compilation import accelerator, dispatch_by_platfo
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 LEAST_ROWS = 16
-"""Least number of rows of a product in a kernel."""
+"""Minimum number of rows of a product in a kernel."""
 TILE = 16
 """Patches in a tile."""
-# Measured on an H200: tiles that one program works through (at most, on the way back), and how they are run.
+# Tuned on an H200: number of tiles per program (a maximum in the backward pass), and compiler parameters.
 FORWARD_TILES, FORWARD = 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
 _BACKWARD_TILES, _BACKWARD = 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
-# As many sums as these fit into the registers of four warps; more need eight.
+# Maximum number of sums that fit into the registers of four warps; more need eight.
 _MOST_SUMS, _BACKWARD_WITH_MORE = 16_384, plgpu.CompilerParams(num_warps=8, num_stages=1)
 _LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors
 
 
 class Weights(NamedTuple):
-    """Layers in the form that the kernels multiply, float32.
+    """Weights of the layers in the layout that the kernels multiply, float32.
 
     Attributes:
         kernels: [16 C', 4 F1] for a quarter, where C' is C padded to a power of two; [4 F1, F2]; [4 F2, F3].
@@ -95,7 +95,7 @@ def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
 
 
 def rectified(values: jax.Array) -> jax.Array:
-    """Rectify, with gradient 0 at 0 like `jax.nn.relu` and unlike `jnp.maximum`: blank parts of images lie there."""
+    """Rectify, with gradient 0 at 0 like `jax.nn.relu` and unlike `jnp.maximum`, because blank image regions are exactly 0."""
     return jnp.where(values > 0.0, values, 0.0)
 
 
@@ -105,7 +105,7 @@ def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
 
 
 def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
-    """Return the output of each layer for [4 R, 16 C'] quarters of patches; `joined` says in which rows."""
+    """Return the output of each layer for quarters of patches [4 R, 16 C']; see `joined` for their rows."""
     outputs, values = [], quarters
     for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
         values = layer(joined(values, level), kernel, bias)
@@ -148,7 +148,7 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
     hidden_layers = Weights(weights.kernels[:-1], weights.biases[:-1])
 
     def add_rows(values):
-        """Sum over rows, in every row of the result: as a matrix product, it costs half as much as a reduction."""
+        """Sum over rows, repeated in every row of the result: as a matrix product, this takes half the time of a reduction."""
         return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(tile, sums):
@@ -168,7 +168,7 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         tuple(jnp.zeros((LEAST_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
     )
     sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, start), 0
-    # A bias's are sixteen times the same sum.
+    # Sums of biases are sixteen copies of the same row.
     for value in (*sums.kernels, *(jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS) for value in sums.biases)):
         sums_ref[pl.ds(first, value.size)] = value.reshape(-1)
         first += value.size
@@ -185,12 +185,12 @@ def rows(count: int, columns: int, skipped: int = 0) -> pl.BlockSpec:
 
 
 def tiles_of_program(tiles: int, total: int, limit: int) -> int:
-    """Return the number of tiles per program: as many as keep all processors busy, for few partial sums.
+    """Return the largest number of tiles per program that keeps all processors busy, so that there are few partial sums.
 
     Args:
-        tiles: What the number must divide.
-        total: Tiles of all programs.
-        limit: Upper bound.
+        tiles: Number that the result must divide.
+        total: Number of tiles of all programs.
+        limit: Maximum of the result.
     """
     most = divisor(tiles, limit)
     while most > 1 and total < most * _LEAST_PROGRAMS:
@@ -212,7 +212,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
     Args:
         patches: [M, 64 C'] from `prepare`.
         weights: From `make_weights`.
-        first, count: Which patches; both multiples of `TILE`.
+        first, count: Index of the first patch, and number of patches; both multiples of `TILE`.
         interpret: Run the kernel without a GPU, slowly.
     """
     place = {"first": first, "count": count}
@@ -221,7 +221,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
 
 
 def as_quarters(patches: jax.Array, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
-    """Return patches as the kernels read them, and the specification of a program's ``block`` of them."""
+    """Return patches in the shape that the kernels read, and the specification of a program's ``block`` of them."""
     size = patches.shape[1] // 4
     return patches.reshape(-1, size), rows(4 * block, size, first // block)
 

@@ -1,6 +1,6 @@
-"""Images in the order that `kernels.encoder` reads: normalised, in patches of 8x8 pixels, four quarters each.
+"""Conversion of images to the layout that `kernels.encoder` reads: normalised, in patches of 8x8 pixels, four quarters each.
 
-As one GPU kernel (Pallas, by Triton), and the same in plain JAX; `kernels.encoder.prepare` chooses.
+Implemented as one GPU kernel (Pallas, by Triton) and in plain JAX; `kernels.encoder.prepare` chooses between them.
 """
 
 import functools
@@ -16,10 +16,10 @@ from jaxrl_vis.learner.networks.blocks import shifted
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 LEVELS = 3
-"""Layers of which a patch is one row of the result."""
+"""Number of layers that reduce a patch to one row."""
 _SIDE = 4
 """Side of a quarter of a patch, in pixels."""
-# Measured on an H100: numbers, of one image, and images of one program, and how it is run.
+# Tuned on an H100: elements of one image and number of images per program, and compiler parameters.
 _PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 4096, 16, plgpu.CompilerParams(num_warps=8, num_stages=2)
 
 
@@ -34,9 +34,9 @@ def divisor(number: int, limit: int) -> int:
 
 
 def _prepare_kernel(images_ref, mean_ref, scale_ref, *refs, shape, levels, limit):
-    """Rearrange adjacent blocks of several images into patches on the chip, reading them in the order of the image.
+    """Rearrange adjacent blocks of several images into patches on the chip, reading pixels in image order.
 
-    The last of ``refs`` is the result; before it is how far each image moves, if they do.
+    The last of ``refs`` is the result, preceded by the shift of each image, if images are shifted.
     """
     *moves, out_ref = refs
     images, patches, size = out_ref.shape
@@ -85,7 +85,7 @@ def prepare_on_gpu(
     dtype: Any,
     interpret: bool = False,
 ) -> jax.Array:
-    """Compute `kernels.encoder.prepare` by a kernel; ``interpret`` runs it without a GPU."""
+    """Compute `kernels.encoder.prepare` with the GPU kernel; ``interpret`` runs it without a GPU, slowly."""
     batch, *shape = images.shape
     channels, height, width = shape
     rows, columns, of_block = height >> levels, width >> levels, 4 ** (levels - LEVELS)
@@ -124,9 +124,9 @@ def prepare_plainly(
 def to_patches(images: jax.Array, levels: int) -> jax.Array:
     """Rearrange [..., C, H, W] to [..., patches, 64 C']; padding channels are zeros.
 
-    Patches run over the 2^levels blocks of the image, row by row, and within a block over its halves of halves (as
-    `blocks.to_blocks`), so that the next layers find their windows side by side. Pixels of a patch run over (quarter's row,
-    quarter's column, channel, row, column).
+    Patches are ordered by blocks of 2^levels pixels, row by row, and within a block by recursive 2x2 subdivision (as in
+    `blocks.to_blocks`), so that the windows of the next layers are contiguous. Pixels of a patch are in the order (quarter's
+    row, quarter's column, channel, row, column).
     """
     *batch, channels, height, width = images.shape
     rows, columns, finer = height >> levels, width >> levels, (2,) * (levels - LEVELS)
