@@ -16,7 +16,7 @@ from jaxrl_vis_envs.plants.truth import outline, stalks_in_view
 
 
 def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]]:
-    """Measure one pair: return visibility, confidence and error (mm) of each method, for stalks that are at least 0.3 visible."""
+    """Measure one pair: return visibility, confidence and error (mm) by method, for stalks that are at least 0.3 visible."""
     sequence = Sequence.of(draw(family, seed))
     pair, drive = sequence[frame], sequence.drive
     instance, left, right = np.asarray(pair.instance), grey(np.asarray(pair.left)), grey(np.asarray(pair.right))
