@@ -174,7 +174,7 @@ def final_distance() -> Column:
 
 
 def final_median(metric: str, title: str, digits: int = 3) -> Column:
-    """Return the column of the median at the last evaluation; 0 for a missing metric."""
+    """Return the column of the median at the last evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(record.end, metric)
@@ -204,7 +204,7 @@ def p(reference: Record, label: str, budget: int | None = None) -> Column:
 
 
 def training_precision() -> Column:
-    """Return the column of the fraction of dropped negatives that were false over training; empty if the filter was inactive."""
+    """Return the column of the fraction of dropped negatives that were false over training; empty for an inactive filter."""
 
     def cell(record: Record) -> str:
         dropped = np.median(record.means(metric=_FILTERED))

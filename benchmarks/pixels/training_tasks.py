@@ -164,8 +164,7 @@ TASKS = {
             **_COMMON,
             "num_timesteps": 3_000_000,
             "num_evals": 11,
-            # Environments start anew, with other goals, so many times between two evaluations: brax's own restarts repeat the
-            # first episode.
+            # Number of resets with new goals between two evaluations: brax's automatic resets repeat the first episode.
             "num_resets_per_eval": 3,
             "episode_length": 50,
             "num_envs": 2048,
