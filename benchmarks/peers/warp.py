@@ -136,7 +136,7 @@ def render_options(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[st
 def may_show_backs(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[str, np.ndarray]]) -> bool:
     """Return True if a camera may see a surface from inside: it is within a geom's bounding sphere, or there are triangles.
 
-    Planes do not count: both renderers render both sides of them, Warp because it does not cull them.
+    Planes do not count: our renderer renders both sides of them, as does Warp without culling.
     """
     if {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF} & set(scene.object_types):
         return True

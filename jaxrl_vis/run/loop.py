@@ -2,14 +2,14 @@
 
     dispatch iteration k+1                 the device never waits for the host ...
     read the metrics of iteration k        ... because the host reads one iteration late
-    at a boundary (evaluation, checkpoint, signal): read the current iteration too, then evaluate, write metrics, save
+    at a boundary (evaluation, checkpoint, signal): also read the current iteration, then evaluate, write metrics, save
 
-Everything that can refuse a run (folder, lock, memory, checkpoints, compilation, memory again) comes before the first byte is
+All checks that can refuse a run (folder, lock, memory, checkpoints, compilation, memory again) come before the first byte is
 written or deleted. Metrics are on the disk before the checkpoint of the same iteration is, so a checkpoint never runs ahead of
-metrics.jsonl; and nothing is saved before the iteration's metrics were read and found finite.
+metrics.jsonl; and nothing is saved before the iteration's metrics have been read and found finite.
 
-Of several processes (`jaxrl_vis.host.distributed`) all train, evaluate and save; the first alone writes everything else. They
-look for signals at boundaries only, where they wait for each other anyway.
+With several processes (`jaxrl_vis.host.distributed`), all train, evaluate and save; only the first writes everything else. They
+check for signals only at boundaries, where they synchronise anyway.
 """
 
 import contextlib
@@ -50,7 +50,7 @@ from jaxrl_vis.types import LoopState
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
 GUARD = "guard/"
-"""Metrics whose names begin like this stop a run where they are not 0; all others reach metrics.jsonl."""
+"""Name prefix of metrics that stop a run if they are not 0; all others are written to metrics.jsonl."""
 
 
 class RunLoop:
@@ -60,8 +60,8 @@ class RunLoop:
         programs: Programs of the run.
         folder: Folder of its files.
         log: Names of the loggers, see `loggers`.
-        on_begun: Called when the folder is this run's.
-        callbacks: Called after each evaluation, when all is saved.
+        on_begun: Called once the folder belongs to this run.
+        callbacks: Called after each evaluation, once everything is saved.
     """
 
     def __init__(
@@ -88,19 +88,19 @@ class RunLoop:
         self._progress = Progress()
         self._goodput = Goodput(folder.processes)
         self._done = 0
-        self._recent_at: int | None = None  # what this process has gone on from, if it was a recent state
-        self._replay_lost = False  # by this process, which has gone on from a light checkpoint
+        self._recent_at: int | None = None  # iteration of the recent state from which this process resumed
+        self._replay_lost = False  # True if this process resumed from a light checkpoint
         self._loop: LoopState | None = None
         self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
         self._started, self._compile_s = time.monotonic(), 0.0
         self._pace = Pace(self._program.steps_per_iteration * self._config.run.seeds)
         self._is_left_alone = False
-        self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
-        self._evaluates_ahead = False  # while the iteration before is still learned from
-        self._evaluated_at = 0  # the last evaluation that what was restored knows of
-        self._owed_evaluation = False  # what was restored owes an evaluation, and would whenever it is restored
-        self.has_begun = False  # the folder is this run's
+        self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration from which the run resumes
+        self._evaluates_ahead = False  # True if an evaluation is dispatched before the last iteration has finished
+        self._evaluated_at = 0  # last evaluation according to the restored checkpoint
+        self._owed_evaluation = False  # True if the restored checkpoint lacks its evaluation
+        self.has_begun = False  # True once the folder belongs to this run
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """Run to the end, yielding reports; see `Trainer.run`."""
@@ -112,7 +112,7 @@ class RunLoop:
         shapes, layout = self._programs.shapes, self._programs.layout
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
-        distributed.meet("checked")  # before the first of them writes anything that the others would find
+        distributed.meet("checked")  # before the first process writes anything that the others would detect
         if goes_on:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with run_lock(self._folder.path, self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
@@ -123,9 +123,9 @@ class RunLoop:
                 return
             interruption = Interruption()
             try:
-                with safe_streams():  # libraries that warn as they compile
+                with safe_streams():  # for warnings of libraries during compilation
                     compiled = self._prepare(goes_on, memory)
-                # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
+                # Not before: while XLA compiles, no Python code can check the flag, and there is nothing to save.
                 with interruption:
                     self._begin(compiled, goes_on, overwrite)
                     yield from self._train(interruption)
@@ -142,7 +142,7 @@ class RunLoop:
             except NonFiniteError:
                 raise
             except (KeyboardInterrupt, SystemExit):
-                if not interruption:  # raised by a handler of the caller's own, which was left in charge
+                if not interruption:  # raised by the caller's own handler, which was kept
                     self._rescue()
                 raise
             except Exception as error:
@@ -166,7 +166,7 @@ class RunLoop:
             self._folder.check_ours(self._checkpoints.run_id, self._held)
 
     def _gone(self) -> FolderGoneError | None:
-        """Reason why nothing can be saved any more; None while the run folder is this run's."""
+        """Return why nothing can be saved any more; None if the run folder still belongs to this run."""
         try:
             self._check_ours()
         except FolderGoneError as gone:
@@ -176,10 +176,10 @@ class RunLoop:
 
     def _rescue(self) -> None:
         self._console.stop()
-        if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may be another's, or gone
+        if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may belong to another run
             return
         if distributed.are_several():
-            self._is_left_alone = True  # whatever went wrong, the others may have ended, and saving would wait for them
+            self._is_left_alone = True  # the other processes may have ended, and saving would wait for them
             return
         with contextlib.suppress(Exception):
             while self._unread:
@@ -209,7 +209,7 @@ class RunLoop:
         return compiled
 
     def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
-        """Check the memory once more, the last check that can refuse the run; then prepare folder and state."""
+        """Check the memory again, the last check that can refuse the run; then prepare folder and state."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
@@ -238,7 +238,7 @@ class RunLoop:
         self._pace.begin(self._done)
 
     def _open(self, goes_on: bool, overwrite: bool) -> None:
-        """Prepare the folder, unless it was moved or deleted since it was locked: compiling takes a while."""
+        """Prepare the folder, unless it was moved or deleted during compilation."""
         assert self._held is not None
         self._folder.check_place(self._held)
         try:
@@ -255,9 +255,9 @@ class RunLoop:
         """Truncate the metrics to the iteration from which the run continues, and open the loggers.
 
         Args:
-            goes_on: True if it does.
-            damaged: Checkpoints that were set aside.
-            foreign: Those of other runs.
+            goes_on: True if the run resumes.
+            damaged: Damaged checkpoints that were set aside.
+            foreign: Checkpoints of other runs that were set aside.
         """
         if goes_on:
             if said := earlier.cut_back(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
@@ -337,7 +337,7 @@ class RunLoop:
             yield report
 
     def _end_early(self, report: Report) -> None:
-        """Make this iteration the last one if an evaluation, or a callback that is told of it, asks for that."""
+        """Make this iteration the last one if an evaluation or a callback requests it."""
         if (reason := self._milestones.ends(report, self._callbacks)) and self._done < self._total:
             self._say(f"stopped at iteration {self._done} of {self._total}: {reason}")
             self._total = self._done
@@ -353,7 +353,7 @@ class RunLoop:
         """Wait for the metrics of the oldest unread iteration, and record them.
 
         Raises:
-            NonFiniteError: A guard has counted something.
+            NonFiniteError: A guard metric is not 0.
         """
         iteration, pending = self._unread[0]
         values = pending.read_per_seed(self._config.run.seeds)
@@ -367,7 +367,7 @@ class RunLoop:
         return self._report(iteration, values)
 
     def _begin_evaluation(self) -> Pending:
-        """Start evaluating the learner; `_evaluate` waits for the outcome."""
+        """Dispatch an evaluation of the learner; `_evaluate` waits for the outcome."""
         assert self._loop is not None
         self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)

@@ -41,12 +41,12 @@ def is_trusted(run_dir: Path, config: Config) -> bool:
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
-    """Remember that the custom parts of a run may be imported.
+    """Store the permission to import the custom parts of a run.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        was_trained_here: Allow later changes of the file, which a user who trains also edits; not if it lies in the run folder.
+        was_trained_here: Also permit later changes of the files by the user, except of files in the run folder.
     """
     changing, as_it_is = _names(run_dir, config)
     is_inside = any(_is_inside(run_dir, file) for file in _files(config).values())
@@ -62,13 +62,13 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
 
 
 def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True") -> None:
-    """Check that the code of a run may be imported; permission by ``may`` is stored.
+    """Check that the code of a run may be imported; the permission ``may`` is stored.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
         may: Permission by the user.
-        mend: Instruction for giving the permission, for the message.
+        mend: Hint on how to give the permission, for the message.
 
     Raises:
         RequestError: There is no permission.

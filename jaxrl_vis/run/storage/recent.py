@@ -4,12 +4,12 @@
     checkpoints/recent/<iteration>.rollout   the episodes collected in this iteration
 
 A rollout stays in the replay until the ring buffer overwrites it, so a state needs several files of earlier iterations and one
-new file: some milliseconds, where a full checkpoint writes the whole replay. That is worthwhile on a CPU, where reading the
-arrays costs nothing, for a replay of moderate size: `is_cheap`.
+new file: some milliseconds, whereas a full checkpoint writes the whole replay. It is used on a CPU, where reading the arrays is
+free, for replays of moderate size: `is_cheap`.
 
 Nothing is synced to the disk. A killed process leaves what it has written; a power cut may not, which the checksums detect, and
-the run then resumes from a light or a full checkpoint, which are synced. A file appears under its name only when it is
-complete. The newest two states are kept.
+the run then resumes from a light or a full checkpoint, which are synced. Files are written atomically. The newest two states
+are kept.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ _EPISODES = "replay.episodes."
 
 
 def is_cheap(replay: ReplayState) -> bool:
-    """Return True if this replay (or one of these shapes) is cheap to keep up to date in files, in time and disk space."""
+    """Return True if a replay (arrays or shapes) is cheap to keep up to date in files, in time and disk space."""
     return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
 
 
@@ -217,7 +217,7 @@ class Recent:
                 array[:, start : start + num_envs], offset = _array(contents, offset, shape, array.dtype)
 
     def resume_from(self, iteration: int | None) -> None:
-        """Prepare for resuming from the state of an iteration, and delete later rollouts; None: from none, so deletes all."""
+        """Prepare for resuming from the state of an iteration, and delete later rollouts; None: from no state; delete all."""
         if iteration is None:
             self.clear()
             return
@@ -304,7 +304,7 @@ def _bytes(array: np.ndarray) -> memoryview:
 
 
 def _array(contents: bytes, offset: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
-    """Return the array of a shape that begins at an offset, and the offset of its end."""
+    """Return the array of the given shape and dtype at an offset, and the offset of its end."""
     count = int(np.prod(shape))
     end = offset + count * np.dtype(dtype).itemsize
     if end > len(contents):
