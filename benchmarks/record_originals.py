@@ -159,8 +159,8 @@ def record_pushes(rng: np.random.Generator, sequences: int, control: bool) -> di
     """Record N pushes of FetchPush's object.
 
     Returns:
-        ``actions`` [N, T, 4]; ``observations`` [N, T + 1, 25] float32, rounded to 5 decimals (1e-5 m); and ``touches``
-        [N, T + 1] bool, True if a finger touches the object.
+        ``actions`` [N, T, 4]; ``observations`` [N, T + 1, 25] float32, rounded to 5 decimals; and ``touches`` [N, T + 1] bool,
+        True if a finger touches the object.
     """
     import gymnasium  # pyright: ignore[reportMissingImports]
     import gymnasium_robotics  # pyright: ignore[reportMissingImports]

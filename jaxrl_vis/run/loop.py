@@ -313,12 +313,12 @@ class RunLoop:
             recent = self._saver.is_recent_due(light)
             if not (evaluation or light or full or recent or (interruption and not distributed.are_several())):
                 continue
-            # Before the metrics are read, so that the device does not wait for the host meanwhile.
+            # Before the metrics are read, so that the device does not wait for the host.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None
             report = self._read()
             if interruption.reached_any():
                 self._save_and_end(evaluation, interruption)
-            if recent:  # and once more after an evaluation, which takes so long that a process may be killed meanwhile
+            if recent:  # and again after an evaluation, during which the process may be killed
                 self._progress.evaluation_due = evaluation
                 self._saver.recent(self._loop, self._done, self._progress_now())
             if evaluation:
@@ -329,7 +329,7 @@ class RunLoop:
                 self._saver.light(self._loop, self._done, self._progress_now())
             if full:
                 self._saver.full(self._loop, self._done, self._progress_now())
-            # A signal that came during the evaluation must not wait for another iteration.
+            # A signal received during the evaluation must not wait for another iteration.
             if self._done < self._total and interruption.reached_any():
                 self._save_and_end(False, interruption)
             if evaluation:
@@ -401,7 +401,7 @@ class RunLoop:
             self._loggers.rows(rows)
         progress.evaluation_due = False
         self._warn_if_filtered(means)
-        # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
+        # The last evaluation may lie between two scheduled ones; a longer run, resumed from here, continues the means.
         if self._is_due(self._config.run.eval_interval):
             progress.since_evaluation = []
         self._show(values, speed)
@@ -416,7 +416,7 @@ class RunLoop:
         env_steps = self._done * self._program.steps_per_iteration
         words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {show_shares(success)}"]
         words.append(f"distance {np.median(distance):.3f} {unit}")
-        if self._done > self._pace.begun:  # none yet where an evaluation is made up for: nobody knows the speed
+        if self._done > self._pace.begun:  # the speed is unknown if only a missed evaluation was made up for
             words.append(f"{speed:,.0f} steps/s")
             if self._done < self._total:
                 words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")

@@ -21,7 +21,7 @@ from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
-_MOST = 2000  # runs that are stored; the oldest are deleted
+_MOST = 2000  # maximum number of stored runs; the oldest are deleted
 _trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 
@@ -31,7 +31,7 @@ def is_own(config: Config) -> bool:
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
-    """Return True if a run's code was trusted before and is, as far as can be told, unchanged; or if it has none.
+    """Return True if a run has no custom code, or if its code was trusted before and appears unchanged.
 
     Raises:
         RequestError: There is no run in ``run_dir``, or a part of it is not written ``module:Name``.
@@ -71,7 +71,7 @@ def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True
         mend: Hint on how to give the permission, for the message.
 
     Raises:
-        RequestError: There is no permission.
+        RequestError: Permission is missing.
     """
     if not is_own(config) or is_trusted(run_dir, config):
         return

@@ -165,7 +165,7 @@ def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout =
     """Return True if all programs fit into memory at once, so that one may be launched while another still runs.
 
     Args:
-        programs, already_there, layout: As of `check_compiled`.
+        programs, already_there, layout: As in `check_compiled`.
     """
     there = _least_available(layout)
     state, scratch = _sizes(programs)

@@ -299,7 +299,7 @@ class Checkpoints:
     def retire_full(self, has_ended: bool = False) -> None:
         """Delete full checkpoints older than a light one that is safely on the disk: they are no longer needed for resuming.
 
-        Recent states that are not kept up to date any more go likewise.
+        Recent states that are no longer kept up to date are also deleted.
 
         Args:
             has_ended: Also delete equally new ones: the run is complete.

@@ -32,8 +32,8 @@ from jaxrl_vis.types import LoopState, ReplayState
 SCHEMA = 1
 ANY_RUN = "*"
 _KEPT = 2
-_MOST_BYTES = 2**30  # of a replay
-_SHARE = 0.03  # largest fraction of the time spent on saving: about every iteration of `cpu` on two cores
+_MOST_BYTES = 2**30  # maximum size of a replay
+_SHARE = 0.03  # maximum fraction of the time spent on saving: about every iteration of `cpu` on two cores
 _EPISODES = "replay.episodes."
 
 
@@ -43,7 +43,7 @@ def is_cheap(replay: ReplayState) -> bool:
 
 
 class Unusable(Exception):
-    """Damaged checkpoint of any tier, or state with a damaged rollout. The message gives the reason in a few words."""
+    """Damaged checkpoint of any tier, or state with a damaged rollout. The message is a short reason."""
 
 
 class Recent:
@@ -68,7 +68,7 @@ class Recent:
         """Return True if enough time has passed since the last save for saving to take only a small fraction of it.
 
         Args:
-            in_any_case: Ignore the time.
+            in_any_case: Ignore the time since the last save.
         """
         return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
 
@@ -94,7 +94,7 @@ class Recent:
     def save(
         self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
     ) -> None:
-        """Write a state and its missing rollouts; if there is no space, this is reported, and nothing more is saved.
+        """Write a state and its missing rollouts; if there is no space, report it and disable further saving.
 
         Args:
             iteration: Iterations completed.

@@ -40,7 +40,7 @@ def play_auxiliary(
         checkpoint: The checkpoint.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, no auxiliary task to show, or no way to write ``out``.
+        RequestError: There is no run, no usable checkpoint, no auxiliary task to show, or ``out`` cannot be written.
     """
     out = Path(out)
     videos.check_output(out)

@@ -102,15 +102,15 @@ def evaluate_run(
 
     Args:
         run_dir: The run folder.
-        episodes: Number of episodes; None: as during training.
-        keep_programs, trust: As of `open_run`.
+        episodes: Number of episodes; None for that of the training.
+        keep_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Returns:
         ``eval/success``, ``eval/goal_distance`` etc.: one number per seed.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
+        RequestError: There is no run, no usable checkpoint, or too little memory for this number of episodes.
     """
     trainer = open_run(run_dir, keep_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir, checkpoint)
@@ -136,11 +136,11 @@ def play_run(
         episodes: Number of episodes.
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
             variants.
-        keep_programs, trust: As of `open_run`.
+        keep_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
+        RequestError: There is no run, no usable checkpoint, no image to show, or ``out`` cannot be written.
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)

@@ -232,7 +232,7 @@ def _compared(row: Mapping[str, Any]) -> Row:
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield names whose values are not written identically, with both values."""
+    """Yield the names of values that differ as JSON text, with both values."""
     compared = _compared(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
