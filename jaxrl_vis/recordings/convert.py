@@ -1,4 +1,4 @@
-"""Reading and writing of recorded episodes, with the format inferred from the path."""
+"""Reading (with the format inferred from the path) and writing of recorded episodes."""
 
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def check_out(out: Path, kind: str) -> None:
     """Check that episodes can be written to ``out``. Call it before recording them.
 
     Raises:
-        RequestError: ``out`` is in use or not writable, or a package is missing.
+        RequestError: The file exists, the folder is not empty, ``out`` is not writable, or a package is missing.
     """
     if kind == LEROBOT:
         lerobot.check_packages()

@@ -97,7 +97,7 @@ class RunLoop:
         self._pace = Pace(self._program.steps_per_iteration * self._config.run.seeds)
         self._is_left_alone = False
         self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration from which the run resumes
-        self._evaluates_ahead = False  # True if an evaluation is dispatched before the last iteration has finished
+        self._evaluates_ahead = False  # True if evaluations are dispatched before the iteration's metrics are read
         self._evaluated_at = 0  # last evaluation according to the restored checkpoint
         self._owed_evaluation = False  # True if the restored checkpoint lacks its evaluation
         self.has_begun = False  # True once the folder belongs to this run
@@ -274,7 +274,7 @@ class RunLoop:
         self._done, self._evaluated_at = restored.iteration, earlier.last_evaluation(restored)
         if earlier.has_ended_early(self._folder, self._config, self._programs.seeds, self._done):
             self._total = min(self._total, self._done)
-        # A run that has come far enough before it was evaluated, or that is asked for fewer steps than it has, ends with that.
+        # A run that had all its steps but not the evaluation, or is resumed with fewer total steps, ends with an evaluation.
         self._progress.evaluation_due |= self._done >= self._total and not earlier.is_evaluated(
             self._folder, self._programs.seeds, restored
         )

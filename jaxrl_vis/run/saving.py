@@ -61,7 +61,7 @@ class Saver:
         self._keeps_full = programs.config.run.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
-        """Return True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
+        """Return True if a tier has a checkpoint of an iteration; all processes return the same answer."""
         return distributed.any_process(iteration in self._checkpoints.iterations(tier))
 
     def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
