@@ -1,8 +1,8 @@
-"""Computes every published figure that comes from records of learning again, and lists those that differ.
+"""Recompute every published figure derived from learning records, and list those that differ.
 
 python benchmarks/check_claims.py    # exit 1 if anything differs
 
-Covered are the tables of docs/lab/results.md, docs/lab/target_decay.md and docs/lab/ablations.md, all tables of
+Covers the tables of docs/lab/results.md, docs/lab/target_decay.md and docs/lab/ablations.md, all tables of
 `benchmarks.claims.pages`, and the numbers in sentences of README.md, docs/index.md and the pages of the studies
 (`benchmarks.claims.sentences`).
 """
@@ -19,11 +19,11 @@ OF_LEARNING = {
     "docs/lab/target_decay.md": "tables",
     "docs/lab/ablations.md": "curves",
 }
-"""Tables of the ledger that come from records of learning."""
+"""Tables of the ledger derived from learning records: page -> name in its markers."""
 
 
 def ledger_differences() -> Iterator[str]:
-    """List tables of the ledger that differ from the records."""
+    """Yield a line for each table of the ledger that differs from the records."""
     for page, name in OF_LEARNING.items():
         text = (CHECKOUT / page).read_text(encoding="utf-8")
         if ledger.filled(text, {name: ledger.PAGES[page][name]}) != text:

@@ -1,10 +1,10 @@
-"""Measures the weight of the source: sizes, imports, lists of option names, and calls from command line to critic loss.
+"""Measure the complexity of the source: sizes, imports, lists of option names, and calls from command line to critic loss.
 
     python benchmarks/house.py [--json FILE] [--without-calls]
 
 Calls are the frames of this project's own files in the traceback of an exception that is raised in ``critic_loss`` while
-``jaxrl-vis train`` traces it. A list of option names is a tuple, list, set or dictionary with two or more names of fields of
-the configuration, outside of what defines it.
+``jaxrl-vis train`` traces it. A list of option names is a tuple, list, set or dictionary with two or more names of
+configuration fields, outside of the configuration's definition.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("jaxrl_vis", "envs", "benchmarks")
 STALKS = ("phenotyping", "grasping", "plants", "stalks")
-"""Folders of another product, which are counted apart."""
+"""Folders of the stalks product, which are counted separately."""
 
 _RAISE = """
 import sys, traceback
@@ -41,18 +41,18 @@ except LookupError as error:
 
 
 def sources() -> list[Path]:
-    """Python files of the packages and of the benchmarks."""
+    """List the Python files of the packages and of the benchmarks."""
     return sorted(path for folder in SOURCES for path in (ROOT / folder).rglob("*.py"))
 
 
 def is_of_stalks(path: Path) -> bool:
-    """Return True if a file belongs to the farm: its folder, or a command of it."""
+    """Return True if a file belongs to the stalks product, by its folder or its name."""
     parts = path.relative_to(ROOT).parts
     return bool(set(parts) & set(STALKS)) or path.name.startswith(("phenotype", "grasp", "stalk", "families"))
 
 
 def field_names() -> set[str]:
-    """Names of all fields of the configuration, of its groups, too."""
+    """Return the names of all fields of the configuration, including those of its groups."""
     from jaxrl_vis.config import Config
 
     names, pending = set(), [Config]
@@ -66,7 +66,7 @@ def field_names() -> set[str]:
 
 
 def lists_of_names(path: Path, names: set[str]) -> list[int]:
-    """Lines of a file in which a tuple, list, set or dictionary with two or more field names begins."""
+    """Return the line numbers at which tuples, lists, sets or dictionaries with two or more field names begin."""
     lines = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Dict):
@@ -81,7 +81,7 @@ def lists_of_names(path: Path, names: set[str]) -> list[int]:
 
 
 def own_imports(path: Path) -> int:
-    """Number of this project's modules that a file imports."""
+    """Count this project's modules that a file imports."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -99,7 +99,7 @@ def _is_module(name: str) -> bool:
 
 
 def calls() -> list[str]:
-    """Frames of own files from the command line to the critic's loss."""
+    """Return the frames of own files from the command line to the critic's loss."""
     with tempfile.TemporaryDirectory() as folder:
         code = _RAISE.format(root=str(ROOT), folder=f"{folder}/run")
         done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
@@ -110,7 +110,7 @@ def calls() -> list[str]:
 
 
 def measure(with_calls: bool = True) -> dict[str, Any]:
-    """Measure all; counts leave out the stalks unless they say so."""
+    """Compute all figures; counts exclude the stalks unless their names say otherwise."""
     files, names = sources(), field_names()
     ours = [path for path in files if not is_of_stalks(path)]
     packages = [path for path in ours if path.relative_to(ROOT).parts[0] != "benchmarks"]
@@ -136,7 +136,7 @@ def measure(with_calls: bool = True) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Read the command line and print the figures."""
+    """Print the figures; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="a file for the figures")
     parser.add_argument("--without-calls", action="store_true", help="trace nothing")

@@ -1,16 +1,16 @@
-"""Smoke test of the installation: the commands of a new user on an unprepared machine, with the result of each.
+"""Smoke test of the installation: a new user's commands on an unprepared machine.
 
     python benchmarks/install_smoke_test.py [--python python3.12 python3.13] [--ways wheel clone notebooks] [--whole]
 
-wheel      builds a wheel, installs it with pip, runs every command, trains a task of one's own, and makes mistakes
-clone      clones the repository, `make train`, then the commands of docs/start.md; nothing may be left untracked
-notebooks  a Jupyter without this project, and the notebooks in a folder of their own: without an address they stop, with one
-           that cannot be cloned too, and with that of a clone they run
+wheel      build a wheel, install it with pip, run every command, train a custom task, and try invalid commands
+clone      clone the repository, `make train`, then the commands of docs/start.md; no untracked files may remain
+notebooks  Jupyter without this project, and the notebooks in a separate folder: they must stop without a repository address or
+           with one that cannot be cloned, and run with that of a clone
 
-Each of them has a home folder, a virtual environment and caches of its own, all new and empty; packages come from the registry
-that pip is configured for. Settings are tiny (the robots learn nothing), except for notebooks with ``--whole``. Each command is
-printed with its exit status and its time. Exits with 1 where a status is not the one expected, where a mistake is answered with
-more than one line, or where a text that a command should show is missing. Takes about ten minutes a Python on two idle cores.
+Each has an empty home folder, virtual environment and caches of its own; packages come from the registry that pip is configured
+for. Settings are tiny (the robots learn nothing), except for notebooks with ``--whole``. Each command is printed with its exit
+status and its time. Exits with 1 if an exit status is unexpected, an invalid command is answered with more than one line, or an
+expected output is missing. Takes about ten minutes per Python version on two idle cores.
 """
 
 import argparse
@@ -29,19 +29,19 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ("01_quickstart", "02_new_environment")
 TINY = "--preset debug --env-steps 400"
-# What of the caller's environment says how to reach a registry; everything else starts afresh.
+# Parts of names of inherited variables, which configure the access to registries; all others are dropped.
 _KEPT = ("PIP_", "UV_", "SSL", "CA_BUNDLE", "PROXY")
-_SHOWN_LINES = 4  # of a command's output
+_SHOWN_LINES = 4  # lines of a command's output that are shown
 
 
 @dataclasses.dataclass
 class Shell:
-    """Terminal of a new user.
+    """Shell of a new user.
 
     Attributes:
         folder: The current folder.
         environment: Environment variables.
-        failures: What was not as expected.
+        failures: Unexpected results, one line each.
     """
 
     folder: Path
@@ -49,13 +49,13 @@ class Shell:
     failures: list[str] = dataclasses.field(default_factory=list)
 
     def type(self, words: str, status: int = 0, shows: str = "", **variables: str) -> str:
-        """Run a command line, print what came of it, and return its output.
+        """Run a command line, print the result, and return its output.
 
         Args:
             words: The command line.
-            status: The exit status that it should have.
-            shows: A text that its output should hold.
-            **variables: More environment variables.
+            status: Expected exit status; with 2, the output must be one line.
+            shows: Text that the output must contain.
+            **variables: Additional environment variables.
         """
         prefix = "".join(f"{name}={shlex.quote(value)} " for name, value in variables.items())
         print(f"$ {prefix}{words}", flush=True)
@@ -90,7 +90,7 @@ class Shell:
 
 
 def new_shell(folder: Path, python: Path) -> Shell:
-    """A terminal in a new folder, with ``python`` as python3, and a home in which there is nothing yet."""
+    """Create a shell in a new folder, with ``python`` as python3, and an empty home folder."""
     (folder / "home").mkdir(parents=True)
     (folder / "work").mkdir()
     (folder / "bin").mkdir()
@@ -112,14 +112,14 @@ def new_shell(folder: Path, python: Path) -> Shell:
 
 
 def puck_push() -> str:
-    """The file of a task that notebook 02 writes."""
+    """Return the source of the task that notebook 02 writes."""
     cells = json.loads((CHECKOUT / "notebooks/02_new_environment.ipynb").read_text())["cells"]
     (source,) = (text for cell in cells if (text := "".join(cell["source"])).startswith("%%writefile puck_push.py\n"))
     return source.partition("\n")[2]
 
 
 def mistakes() -> list[tuple[str, Mapping[str, str]]]:
-    """Command lines that are wrong, and environment variables: each is answered with one line and exit status 2."""
+    """Return invalid command lines with environment variables; each must fail with one line and exit status 2."""
     train = "jaxrl-vis train"
     lines = [
         "jaxrl-vis",
@@ -147,13 +147,13 @@ def mistakes() -> list[tuple[str, Mapping[str, str]]]:
 
 
 def wheel(shell: Shell, python: Path) -> None:
-    """From a wheel, with pip."""
+    """Test the installation of a wheel with pip."""
     shell.type(f"git clone --quiet {CHECKOUT} source")
     shell.type(f"{python.name} -m venv .venv")
     shell.activate(shell.folder / ".venv")
     shell.type("pip wheel --quiet --no-deps --wheel-dir dist ./source")
     shell.type('pip install --quiet "$(ls dist/*.whl)[video]"')
-    shutil.rmtree(shell.folder / "source")  # nothing but the wheel is there
+    shutil.rmtree(shell.folder / "source")  # leave nothing but the wheel
     shell.type("pip check")
     shell.type("jaxrl-vis --version", shows="0.")
     shell.type("python -m jaxrl_vis --version", shows="0.")
@@ -180,13 +180,13 @@ def wheel(shell: Shell, python: Path) -> None:
 
 
 def first_commands() -> list[str]:
-    """The commands of the program that docs/start.md shows, without their comments."""
+    """Return the program's commands in docs/start.md, without comments."""
     lines = [line.partition(" # ")[0].strip() for line in (CHECKOUT / "docs" / "start.md").read_text().splitlines()]
     return [line for line in lines if line.startswith("jaxrl-vis ")]
 
 
 def tiny(line: str) -> str:
-    """A command of docs/start.md at tiny settings, and without the preset that would make it large."""
+    """Return a command of docs/start.md with tiny settings and without its preset."""
     words = shlex.split(line)
     if words[1] == "train" and "--resume" not in words:
         for option in {"--preset", "--env-steps"}.intersection(words):
@@ -199,7 +199,7 @@ def tiny(line: str) -> str:
 
 
 def clone(shell: Shell, python: Path) -> None:
-    """From a clone, with make, and then what docs/start.md shows."""
+    """Test the installation of a clone with make, and the commands of docs/start.md."""
     shell.type(f"git clone --quiet {CHECKOUT} jaxrl-vis")
     shell.folder /= "jaxrl-vis"
     shell.type("make help", shows="make train")
@@ -207,7 +207,7 @@ def clone(shell: Shell, python: Path) -> None:
     shell.type(f"make train {tiny_run} ARGS='--env-steps 400' && ls runs/first", shows="video.gif")
     shell.type(".venv/bin/python --version", shows=f"Python {python.name.removeprefix('python')}")
     shell.activate(shell.folder / ".venv")
-    # What the page says next to the commands that need it.
+    # Extras that the page names next to the commands that need them.
     shell.type(".uv/bin/uv pip install --quiet '.[tensorboard,wandb]'")
     for line in first_commands():
         shell.type(tiny(line))
@@ -217,7 +217,7 @@ def clone(shell: Shell, python: Path) -> None:
 
 
 def notebooks(shell: Shell, python: Path, whole: bool) -> None:
-    """In a Jupyter that has nothing of this project, with the notebooks in a folder of their own."""
+    """Test the notebooks, in a separate folder, in a Jupyter without this project."""
     shell.type(f"{python.name} -m venv .venv")
     shell.activate(shell.folder / ".venv")
     shell.type("pip install --quiet nbconvert nbclient ipykernel")
@@ -239,7 +239,7 @@ def notebooks(shell: Shell, python: Path, whole: bool) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the transcript; 1 where anything was not as expected."""
+    """Print the transcript; return 1 if anything was unexpected, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--python", nargs="+", default=["python3.12", "python3.13"], help="names or paths of interpreters")
     parser.add_argument("--ways", nargs="+", choices=("wheel", "clone", "notebooks"), default=["wheel", "clone", "notebooks"])

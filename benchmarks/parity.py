@@ -1,8 +1,8 @@
-"""Drives our tasks with recordings of the originals, and says how far they drift apart.
+"""Drive our tasks with recorded actions of the originals, and report the deviations.
 
     python benchmarks/parity.py ENV FILE.npz        e.g. FetchReach tests/data/fetch_reach.npz
 
-A recording holds N sequences of T actions in [-1, 1], and the states at their T + 1 instants:
+A recording holds N sequences of T actions in [-1, 1], and the states at their T + 1 time steps:
 
     FetchPush    actions [N, T, 4], observations [N, T + 1, 25]; Gymnasium-Robotics
     FetchReach   actions [N, T, 4], grip_pos_m [N, T + 1, 3]; Gymnasium-Robotics
@@ -10,8 +10,8 @@ A recording holds N sequences of T actions in [-1, 1], and the states at their T
     HandReach    actions [N, T, 20], qpos [N, T + 1, 24] (rad), tip_pos_m [N, T + 1, 15]; Gymnasium-Robotics
     Reacher      actions [N, T, 2], qpos_rad and qvel_rad_s [N, T + 1, 2], fingertip_pos_m [N, T + 1, 3]; Gymnasium (torque)
 
-Prints one line for each error; its bound, where it has one, stands beside it. Exit status: 0 all within their bounds; 1 a
-bound is broken; 2 there is nothing to compare (no such task or file, or a key is missing).
+Prints one line for each error, with its bound if there is one. Exit status: 0 all errors are within their bounds; 1 a bound is
+violated; 2 there is nothing to compare (no such task or file, or a key is missing).
 """
 
 import argparse
@@ -33,7 +33,7 @@ Recording = Mapping[str, np.ndarray]
 
 
 class Figure(NamedTuple):
-    """One error of ours against the recording, in ``unit``; ``bound`` is the most it may be, None for mere information."""
+    """Deviation from the recording, in ``unit``; ``bound`` is its maximum permitted value, None if it is only informative."""
 
     name: str
     value: float
@@ -50,11 +50,11 @@ class Figure(NamedTuple):
 
 
 class NothingToCompareError(ValueError):
-    """The recording lacks something, or no recording is known for the task."""
+    """The recording lacks an array or has wrong shapes, or the task has no known recordings."""
 
 
 def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Play N sequences of T actions.
+    """Step N episodes with T actions each.
 
     Returns:
         qpos [N, T, nq] and the achieved states [N, T, G] after each action.
@@ -68,7 +68,7 @@ def play(env: Any, state: State, actions: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def distance_figures(name: str, error: np.ndarray, median: float | None, high: float | None, percentile: int) -> list[Figure]:
-    """Median and a high percentile of ``error`` [...] (m) against their bounds (m)."""
+    """Return the median and a high percentile of ``error`` [...] (m), with their bounds (m)."""
     return [
         Figure(f"{name}: median error", float(np.median(error)), "m", median),
         Figure(f"{name}: {percentile}th percentile of the error", float(np.percentile(error, percentile)), "m", high),
@@ -76,13 +76,13 @@ def distance_figures(name: str, error: np.ndarray, median: float | None, high: f
 
 
 def fetch_reach(recording: Recording) -> list[Figure]:
-    """Grip position, up to where the recorded one leaves its neighbourhood."""
+    """Compare grip positions, until the recorded one leaves the neighbourhood of its start."""
     env = environments.make("FetchReach")
     actions, recorded = _take(recording, "actions", "grip_pos_m")
     start, _ = environments.reset(env, jax.random.split(jax.random.key(0), len(actions)))
     _, grip = play(env, start, actions)
-    # Only while the grip has not yet left the box around its start (goals lie within .15 m): farther out the arm stretches,
-    # swings through the table's edge or its own base, and tells little about the task.
+    # Only until the grip leaves the box around its start (goals lie within .15 m): farther out the arm stretches or swings
+    # through the table's edge or its own base, which is irrelevant to the task.
     is_outside = (np.abs(recorded - recorded[:, :1]) > 0.25).any(axis=-1)
     is_inside = np.cumsum(is_outside, axis=1) == 0
     error = np.linalg.norm(grip - recorded[:, 1:], axis=-1)[is_inside[:, 1:]]
@@ -93,7 +93,7 @@ def fetch_reach(recording: Recording) -> list[Figure]:
 
 
 def fetch_push(recording: Recording) -> list[Figure]:
-    """Grip position until the box first moves, when that is, and where the box ends; and whether it moves at all."""
+    """Compare the grip until the box first moves, the time of that move, and the box's final position; check that it moves."""
     env = environments.make("FetchPush")
     actions, recorded = _take(recording, "actions", "observations")
     ours = play_push(env, actions, recorded[:, 0, 3:5])
@@ -111,7 +111,7 @@ def fetch_push(recording: Recording) -> list[Figure]:
 
 
 def play_push(env: Any, actions: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Observations [N, T + 1, 25] of FetchPush under actions [N, T, 4], where the box starts at ``places`` [N, 2] (m)."""
+    """Return observations [N, T + 1, 25] of FetchPush for actions [N, T, 4] and initial box positions ``places`` [N, 2] (m)."""
     begin, see = push_programs(env)
     state = jax.device_get(begin(places))
     observations = [see(state.data)]
@@ -123,19 +123,19 @@ def play_push(env: Any, actions: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def push_programs(env: Any) -> tuple[Callable, Callable]:
-    """Place of the box [N, 2] -> State, and physics -> observations [N, 25]."""
+    """Return two jitted functions: position of the box [N, 2] (m) -> State, and physics data -> observations [N, 25]."""
     begin = jax.vmap(lambda place: env.state_at(env.start_with_box(place), jnp.zeros(3)))
     return jaxrl_vis_envs.jit(begin), jaxrl_vis_envs.jit(jax.vmap(env.observe_state))
 
 
 def _first_move(observations: np.ndarray) -> np.ndarray:
-    """First instant at which the box is 1 mm from its start, or T + 1: [N] of observations [N, T + 1, 25]."""
+    """Return the first time step [N] at which the box is 1 mm from its start, or T + 1, from observations [N, T + 1, 25]."""
     has_moved = np.linalg.norm(observations[..., 3:6] - observations[:, :1, 3:6], axis=-1) > 0.001
     return np.where(has_moved.any(axis=1), has_moved.argmax(axis=1), observations.shape[1])
 
 
 def finger_turn(recording: Recording) -> list[Figure]:
-    """Joint angles with K physics steps in a control step, for each K that was recorded. Only 21 is bounded: the task's own."""
+    """Compare joint angles with K physics steps per control step, for each recorded K. Only 21, the task's own, is bounded."""
     figures = []
     for substeps in (21, 2):
         keys = (f"qpos_rad_nsub{substeps}", f"qvel_rad_s_nsub{substeps}")
@@ -155,12 +155,12 @@ def finger_turn(recording: Recording) -> list[Figure]:
 
 
 def _share_moving(qpos: np.ndarray) -> float:
-    """Share of the sequences in which the spinner moves so far that contact matters: below a half the recording says little."""
+    """Return the fraction of sequences in which the spinner moves by contact; below 0.5 the recording is hardly informative."""
     return float((np.ptp(qpos[:, :, 2], axis=1) > 0.3).mean())
 
 
 def hand_reach(recording: Recording) -> list[Figure]:
-    """Fingertips, with contacts and, to show that the bounds would tell, without."""
+    """Compare fingertips with contacts and, to show that the bounds are sensitive to these, without."""
     actions, qpos, tips = _take(recording, "actions", "qpos", "tip_pos_m")
     figures = []
     for contacts in (True, False):
@@ -175,7 +175,7 @@ def hand_reach(recording: Recording) -> list[Figure]:
 
 
 def reacher(recording: Recording) -> list[Figure]:
-    """Joint angles and fingertip under torque control."""
+    """Compare joint angles and the fingertip under torque control."""
     env = environments.make("Reacher", control="torque")
     actions, qpos, qvel, fingertip = _take(recording, "actions", "qpos_rad", "qvel_rad_s", "fingertip_pos_m")
     our_qpos, our_fingertip = play(env, environments.start_at(env, qpos[:, 0], qvel[:, 0]), actions)
@@ -198,10 +198,10 @@ COMPARISONS: dict[str, Callable[[Recording], list[Figure]]] = {
 
 
 def compare(name: str, recording: Recording) -> list[Figure]:
-    """Errors of the environment ``name`` against a recording; those that see images have the physics of their state variants.
+    """Compare an environment with a recording; image variants are compared through their state variants.
 
     Raises:
-        NothingToCompareError: Recordings of that task are unknown, or this one lacks a key or holds a wrong shape.
+        NothingToCompareError: The task has no known recordings, or this one lacks a key or has a wrong shape.
     """
     task = registry.state_variant(name) if name in registry.list_envs() else None
     if task not in COMPARISONS:
@@ -210,7 +210,7 @@ def compare(name: str, recording: Recording) -> list[Figure]:
 
 
 def _take(recording: Recording, *keys: str) -> list[np.ndarray]:
-    """The arrays under ``keys``, actions first, whose number and length of sequences agree."""
+    """Return the arrays under ``keys``, actions first, and check that their numbers and lengths of sequences agree."""
     missing = [key for key in keys if key not in recording]
     if missing:
         raise NothingToCompareError(f"the recording lacks {', '.join(missing)}; it holds {', '.join(recording)}")
@@ -223,7 +223,7 @@ def _take(recording: Recording, *keys: str) -> list[np.ndarray]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the errors: 0 within all bounds, 1 where one is broken, 2 where the request was wrong."""
+    """Print the deviations; return 0 if all are within bounds, 1 if not, 2 for an invalid request."""
     parser = argparse.ArgumentParser(description="Compares a task with a recording of its original.")
     parser.add_argument("env", help=f"one of {', '.join(COMPARISONS)}")
     parser.add_argument("file", help="the recording, .npz")

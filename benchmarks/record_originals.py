@@ -1,15 +1,15 @@
-"""Recorder of the original environments, for the comparison by benchmarks/parity.py.
+"""Record the original environments, for comparison by benchmarks/parity.py.
 
     python benchmarks/record_originals.py ENV FILE.npz [--sequences 24] [--seed 0] [--lower 0] [--control]
 
-ENV is FetchPush, FetchReach, HandReach, Reacher (Gymnasium) or FingerTurn (dm_control). Needs an environment of its own, with
-the MuJoCo that the originals were published for: later ones treat the weld that pulls FetchReach's gripper differently.
+ENV is FetchPush, FetchReach, HandReach, Reacher (Gymnasium) or FingerTurn (dm_control). Needs a virtual environment of its own,
+with the MuJoCo release of the originals: later ones treat the weld that moves FetchReach's gripper differently.
 
     pip install gymnasium-robotics==1.4.2 dm_control==1.0.27 mujoco==3.2.7
 
-Actions are of three kinds in turn: independent, held for ten steps, and wandering. ``--lower`` is taken off the third component
-of each: .25 takes FetchReach's gripper to the table. FetchPush's actions are those of a scripted pusher that sees the object,
-or, with ``--control``, of one that passes over it.
+Actions alternate between three kinds: independent, held for ten steps, and autocorrelated. ``--lower`` is subtracted from the
+third component of each: .25 moves FetchReach's gripper to the table. FetchPush's actions are those of a scripted pusher that
+observes the object or, with ``--control``, of one that passes over it.
 """
 
 import argparse
@@ -27,7 +27,7 @@ MOST_OBLIQUE = 0.1  # standard deviation of the direction of a push from a face'
 
 
 def sample_actions(rng: np.random.Generator, sequences: int, size: int, lower: float) -> np.ndarray:
-    """Actions [N, 50, ``size``] float32 in [-1, 1]."""
+    """Sample actions [N, 50, ``size``] float32 in [-1, 1]."""
     actions = np.empty((sequences, STEPS, size))
     for number, sequence in enumerate(actions):
         if number % 3 == 0:
@@ -44,7 +44,7 @@ def sample_actions(rng: np.random.Generator, sequences: int, size: int, lower: f
 
 
 def play(env, actions: np.ndarray, read: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Play sequences and read the state at their T + 1 instants: [N, T + 1, ...] float32."""
+    """Step through sequences and read the state at their T + 1 time steps: [N, T + 1, ...] float32."""
     sequences = []
     for number, sequence in enumerate(actions):
         env.reset(seed=number)
@@ -57,7 +57,7 @@ def play(env, actions: np.ndarray, read: Callable[[], dict[str, np.ndarray]]) ->
 
 
 def gymnasium_task(identifier: str, read: Callable) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """A recorder of an environment of Gymnasium; ``read`` takes the environment."""
+    """Return the recorder of a Gymnasium environment; ``read`` maps the environment to the recorded arrays."""
     import gymnasium  # pyright: ignore[reportMissingImports]
     import gymnasium_robotics  # pyright: ignore[reportMissingImports]
 
@@ -67,17 +67,17 @@ def gymnasium_task(identifier: str, read: Callable) -> Callable[[np.ndarray], di
 
 
 def fetch_reach() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """A recorder of the grip: [N, T + 1, 3] m."""
+    """Return a recorder of the grip: [N, T + 1, 3] m."""
     return gymnasium_task("FetchReach-v4", lambda env: {"grip_pos_m": env._get_obs()["achieved_goal"]})
 
 
 def hand_reach() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """A recorder of the fingertips, [N, T + 1, 15] m, and the joints, [N, T + 1, 24] rad."""
+    """Return a recorder of the fingertips, [N, T + 1, 15] m, and the joints, [N, T + 1, 24] rad."""
     return gymnasium_task("HandReach-v3", lambda env: {"tip_pos_m": env._get_obs()["achieved_goal"], "qpos": env.data.qpos})
 
 
 def reacher() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """A recorder of the two joints, [N, T + 1, 2] rad and rad/s, and the fingertip, [N, T + 1, 3] m."""
+    """Return a recorder of the two joints, [N, T + 1, 2] rad and rad/s, and the fingertip, [N, T + 1, 3] m."""
 
     def read(env) -> dict[str, np.ndarray]:
         joints = {"qpos_rad": env.data.qpos[:2], "qvel_rad_s": env.data.qvel[:2]}
@@ -87,7 +87,7 @@ def reacher() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
 
 
 def finger_turn() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """From random configurations without contact, with 21 and with 2 physics steps for each action."""
+    """Return a recorder from random configurations without contact, with 21 and with 2 physics steps per action."""
     from dm_control.suite import finger  # pyright: ignore[reportMissingImports]
 
     model = mujoco.MjModel.from_xml_string(*finger.get_model_and_assets())
@@ -121,20 +121,20 @@ def finger_turn() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
 
 
 class Pusher:
-    """A scripted pusher: over the object, down behind it, and along the table to a place."""
+    """Scripted pusher: above the object, down behind it, and along the table to a target position."""
 
     def __init__(self, rng: np.random.Generator, middle: np.ndarray, thing: np.ndarray, control: bool) -> None:
-        """Choose where to push ``thing`` [2] (m), within 15 cm of ``middle`` [2] on each axis; ``control`` passes over it."""
+        """Sample a target for ``thing`` [2] (m), within 15 cm of ``middle`` [2] on each axis; ``control``: pass over it."""
         self.rng, self.control, self.is_down = rng, control, False
         self.height, self.speed = rng.uniform((0.418, 0.3), (0.44, 1.0))
         self.place = thing
         while not np.linalg.norm(self.place - thing) > LEAST_PUSH or np.abs(self.place - middle).max() > 0.15:
-            # Against one of the four faces, for a push against a corner says little: the box turns either way.
+            # Against one of the four faces, because a push against a corner can turn the box either way.
             angle = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, MOST_OBLIQUE)
             self.place = thing + rng.uniform(LEAST_PUSH, 0.3) * np.array([np.cos(angle), np.sin(angle)])
 
     def act(self, grip: np.ndarray, thing: np.ndarray) -> np.ndarray:
-        """An action [4] at the position of the grip [3] and of the object [3], m."""
+        """Return the action [4] for the positions of the grip [3] and the object [3], m."""
         way = self.place - thing[:2]
         left = np.linalg.norm(way)
         way = way / max(left, 1e-6)
@@ -156,11 +156,11 @@ class Pusher:
 
 
 def record_pushes(rng: np.random.Generator, sequences: int, control: bool) -> dict[str, np.ndarray]:
-    """Pushes of the object of FetchPush, N of them.
+    """Record N pushes of FetchPush's object.
 
     Returns:
-        ``actions`` [N, T, 4] and ``observations`` [N, T + 1, 25] float32, the latter to a hundredth of a millimetre; and
-        ``touches`` [N, T + 1] bool, where a finger touches the object at that instant.
+        ``actions`` [N, T, 4]; ``observations`` [N, T + 1, 25] float32, rounded to 5 decimals; and ``touches`` [N, T + 1] bool,
+        True if a finger touches the object.
     """
     import gymnasium  # pyright: ignore[reportMissingImports]
     import gymnasium_robotics  # pyright: ignore[reportMissingImports]

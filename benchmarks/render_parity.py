@@ -1,13 +1,13 @@
-"""Compares our renderer with MuJoCo's own on many models, live, and prints a table. Needs a GL library.
+"""Compare our renderer with MuJoCo's own on many models, and print a table. Needs a GL library.
 
     MUJOCO_GL=egl python benchmarks/render_parity.py [MODEL ...] [--poses N] [--size PIXELS] [--out FILE] [--print | --page]
     MUJOCO_GL=egl python benchmarks/render_parity.py FOLDER [--size PIXELS] [--pictures FOLDER]
 
-Every model of tests/render_models.py is drawn in N seeded random poses by both, with shadows, reflections and multisampling
-off. What is measured, and the bounds, are in tests/render_comparison.py. The exit status is 1 where a bound does not hold. A
-model that our renderer refuses is a row of the table like any other, with the reason. `--page` writes the table of the rows
-that --out holds into docs/lab/renderer_parity.md. With a FOLDER of anyone's models (MJCF or URDF, at any depth) these are
-compared, each at its start and in a scattered pose: see `rendering.model_folder`.
+Every model of tests/render_models.py is rendered in N seeded random poses by both, with shadows, reflections and multisampling
+off. Measures and bounds are defined in tests/render_comparison.py. The exit status is 1 if a bound is violated. A model that
+our renderer refuses is a row of the table like any other, with the reason. `--page` writes the table of the rows in --out into
+docs/lab/renderer_parity.md. With a FOLDER of third-party models (MJCF or URDF, at any depth), these are compared instead, each
+in its initial and in a random pose: see `rendering.model_folder`.
 """
 
 import argparse
@@ -22,8 +22,8 @@ from typing import Any
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "envs"), str(ROOT / "tests")]
 if __name__ == "__main__" and sys.platform == "linux" and "DISPLAY" not in os.environ:
-    os.environ.setdefault("MUJOCO_GL", "egl")  # without a screen nothing else will do
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # the images are few, and MuJoCo's renderer is what takes the time
+    os.environ.setdefault("MUJOCO_GL", "egl")  # the only choice without a display
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # there are few images, and MuJoCo's renderer dominates the time
 
 import jax  # noqa: E402
 import mujoco  # noqa: E402
@@ -37,7 +37,7 @@ from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 TARGET = ROOT / "benchmarks" / "results" / "render_parity.json"
 PAGE = ROOT / "docs" / "lab" / "renderer_parity.md"
-BATCH = 10  # poses that we draw at a time
+BATCH = 10  # poses rendered at a time by ours
 COLUMNS = {
     "segmentation": ("segm %", 100.0, 3),
     "iou": ("min IoU", 1.0, 3),
@@ -52,7 +52,7 @@ COLUMNS = {
 
 
 def compare(name: str, poses: int, size: int) -> dict[str, Any]:
-    """Draw one model with both renderers and measures: the model's row."""
+    """Render one model with both renderers, and compare the images; return the model's row."""
     entry = render_models.MODELS[name]
     device = jax.devices()[0].device_kind
     row: dict[str, Any] = {"model": name, "source": entry.source, "poses": poses, "size": size, "device": device}
@@ -66,7 +66,7 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
     with ReferenceRenderer(render_models.build(name, truth=True)[0], size, size, site_groups=entry.site_groups) as reference:
         for first in range(0, poses, BATCH):
             theirs, inputs = [], []
-            # The last batch is filled up, so that there is one compiled program; what is too much is dropped.
+            # The last batch is padded, so that there is one compiled program; the surplus images are dropped.
             for number in range(first, first + BATCH):
                 render_models.set_pose(mj_model, mj_data, number)
                 inputs.append(render_models.poses_of(mj_data))
@@ -95,7 +95,7 @@ def named(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, 
 
 
 def table_row(row: dict[str, Any]) -> str:
-    """One line of the table, Markdown. A figure that is out of its bound is bold."""
+    """Format one row of the table as Markdown; a value that violates its bound is bold."""
     if "refused" in row:
         return (
             f"| {row['model']} | {row['source']} | | " + " | ".join("" for _ in COLUMNS) + f" | **refused**: {row['refused']} |"
@@ -110,7 +110,7 @@ def table_row(row: dict[str, Any]) -> str:
 
 
 def table_head() -> str:
-    """Names and bounds of the columns, Markdown."""
+    """Format names and bounds of the columns as Markdown."""
     names = ["model", "from", "drawn", "poses", *(title for title, _, _ in COLUMNS.values()), "verdict"]
     bounds = ["bound", "", "", ""]
     for name, (_, scale, _) in COLUMNS.items():
@@ -120,7 +120,7 @@ def table_head() -> str:
 
 
 def table(rows: Iterable[dict[str, Any]]) -> str:
-    """The whole table, Markdown."""
+    """Format the whole table as Markdown."""
     return "\n".join([table_head(), *map(table_row, rows)]) + "\n"
 
 
@@ -130,7 +130,7 @@ def read_rows(file: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    """Compare the models that were named, or all."""
+    """Compare the named models, or all; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="*", metavar="MODEL", help="all if none is named; or the path of one folder of models")
     parser.add_argument("--poses", type=int, default=200)
@@ -149,7 +149,7 @@ def main() -> int:
         parser.error(f"no model {', '.join(sorted(unknown))}; there are {', '.join(render_models.MODELS)}")
     stored = json.loads(options.out.read_text()) if options.out.exists() else {"rows": []}
     rows = {row["model"]: row for row in stored["rows"] if row["model"] in render_models.MODELS}
-    versions = render_models.versions()  # first: a package may be missing
+    versions = render_models.versions()  # first, because a package may be missing
     failed = 0
     if options.page:
         PAGE.write_text(fill(PAGE.read_text(), "table", table(rows.values())))

@@ -1,11 +1,11 @@
-"""Trains a fixed set of short runs and compares every number of their metrics, bit for bit, with those of another revision.
+"""Train a fixed set of short runs and compare all their metrics, bit for bit, with those of another revision.
 
-    python benchmarks/same_numbers.py --write before.json      # at the revision that is to be preserved
+    python benchmarks/same_numbers.py --write before.json      # at the reference revision
     python benchmarks/same_numbers.py --compare before.json    # after a change; exit status 1 and a table if a number differs
     python benchmarks/same_numbers.py --compare before.json --only cosine resumed
 
-The runs use the command line alone, so that the same file serves revisions whose modules differ. Times and run ids are left
-out. Both files must come from one machine and one version of JAX.
+Runs are started only through the command line, so that this script works for revisions with different modules. Times and run
+ids are excluded. Both files must come from the same machine and JAX version.
 """
 
 import argparse
@@ -46,11 +46,11 @@ RUNS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "make_train": (("VisualFetchReach", "--preset", "cpu"),),
 }
-"""Name -> options of one command after the other, in one run folder."""
+"""Options of successive commands in one run folder, by name."""
 
 
 def train(name: str, folder: Path) -> list[dict[str, Any]]:
-    """Train one of `RUNS`; its rows without times and ids.
+    """Train one of `RUNS`; return its rows without times and ids.
 
     Raises:
         RuntimeError: A command failed.
@@ -66,7 +66,7 @@ def train(name: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def differences(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> list[str]:
-    """Columns that differ, with the first row and the two values."""
+    """List the columns that differ, with the first differing iteration and both values."""
     if [row["iteration"] for row in before] != [row["iteration"] for row in after]:
         return ["rows of other iterations"]
     lines = []
@@ -78,7 +78,7 @@ def differences(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> li
 
 
 def main() -> int:
-    """Read the command line and do what it asks for."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", type=Path, help="file for the numbers of this revision")
     parser.add_argument("--compare", type=Path, help="file of another revision's numbers")

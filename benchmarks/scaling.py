@@ -2,18 +2,18 @@
 
     python benchmarks/scaling.py [--devices 2 4 8] [--json FILE] [--quick]
 
-For each number of devices N, beside one device of the same machine:
+For each number of devices N, compared with one device of the same machine:
 
     seeds          N seeds on N devices; iterations with the host reading their metrics, and the evaluations of a run
-    weak 2048, 512 one learner: a batch of 2048 (512) transitions and as many environments on each device
+    weak 2048, 512 one learner: a batch of 2048 (512) transitions and the same number of environments on each device
     strong         one learner: a batch of 2048 (512) and the environments of one device divided among N
     all-reduce     the mean of as many numbers as an update averages, alone
-    resume         what N devices saved, restored on one device and on others: parameters, optimisers and replay bit-equal, and
-                   trained further on one
-    processes      seeds and weak 2048 of the most devices once more, by two processes with half of the devices each
+    resume         a checkpoint of N devices, restored on one device and on others: parameters, optimisers and replay must be
+                   bit-equal; training continues on one
+    processes      seeds and weak 2048 on the maximum number of devices again, by two processes with half of the devices each
 
-All programs are compiled before, by processes of their own side by side, which leave them in the compile cache: tracing is
-Python, and goes one by one in a process. ``--quick`` takes small images and few updates, to see that it works: on a CPU with
+All programs are compiled beforehand into the compilation cache by parallel processes, because tracing is Python and sequential
+within a process. ``--quick`` uses small images and few updates, to test the script: on a CPU with
 XLA_FLAGS=--xla_force_host_platform_device_count=2.
 """
 
@@ -61,17 +61,17 @@ QUICK = {
     "latent_size": 16,
     "hidden_sizes": (32,),
 }
-REDUCTIONS = 100  # in one program, so that the time of its start does not count
+REDUCTIONS = 100  # per program, so that the launch overhead does not count
 BATCHES, SMALL_BATCHES = (2048, 512), (32, 16)
 
 
 class Timed:
-    """One configuration, compiled and trained for a while.
+    """Configuration that is compiled and timed.
 
     Args:
-        config: What is trained.
+        config: The configuration.
         env: The environment.
-        evaluates: Whether evaluations are measured, too.
+        evaluates: Include evaluations in the timing.
     """
 
     def __init__(self, config: Config, env: Any, evaluates: bool):
@@ -80,14 +80,14 @@ class Timed:
 
     @functools.cached_property
     def programs(self) -> Programs:
-        """Made when they are needed: one of two processes has none for one device."""
+        """Programs, created on first use: a process of two has no programs for one device."""
         return Programs(self.config, make_train_step(self.env, self.config))
 
     def run(self, cycles: int) -> list[float]:
-        """Seconds of an iteration in each of several cycles; one cycle goes before.
+        """Return the mean time of an iteration (s) in each of ``cycles`` cycles, after a first one that is not counted.
 
-        A cycle is what lies between two evaluations. As in a run, the host reads the metrics of each iteration during the
-        next one, and those of a cycle's last one during the evaluation, which it then waits for.
+        A cycle consists of the iterations between two evaluations. As in a run, the host reads the metrics of each iteration
+        during the next one, and those of a cycle's last iteration during the evaluation, which it then waits for.
         """
         programs, count = self.programs, self.config.run.eval_interval
         loop = programs.init(programs.run_keys) if self.loop is None else self.loop
@@ -111,7 +111,7 @@ class Timed:
         return seconds
 
     def compile(self) -> None:
-        """Compile its programs, or find them in the compile cache."""
+        """Compile the programs, or load them from the compilation cache."""
         self.programs.compiled("init")
         self.programs.of_training()
         if self.evaluates:
@@ -119,10 +119,10 @@ class Timed:
 
 
 def compile_all(everything: list[Timed]) -> float:
-    """Fill the compile cache by a process for each configuration, side by side, and read it; the seconds it took.
+    """Fill the compilation cache by parallel processes, one per configuration, and read it; return the time, s.
 
     Raises:
-        SystemExit: One of the processes failed; what it printed stands before.
+        SystemExit: One of the processes failed, after printing its error.
     """
     start = time.perf_counter()
     children = [
@@ -137,7 +137,7 @@ def compile_all(everything: list[Timed]) -> float:
 
 
 def all_reduce_seconds(numbers: int, devices: int) -> float:
-    """Seconds of the mean of so many float32 numbers over all devices."""
+    """Return the time of the mean of ``numbers`` float32 numbers over all devices, s."""
     layout = make_layout(preset("fast", devices=devices, num_envs=devices, batch_size=devices, eval_episodes=devices))
 
     def reduce_many(values: jax.Array) -> jax.Array:
@@ -156,7 +156,7 @@ def all_reduce_seconds(numbers: int, devices: int) -> float:
 
 
 def words(tree: Any) -> dict[str, bytes]:
-    """The bytes of all leaves of a learner or a replay, by name."""
+    """Return the bytes of all leaves of a learner or a replay, by name."""
     plain = {
         name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
         for name, leaf in named_leaves(tree).items()
@@ -165,7 +165,11 @@ def words(tree: Any) -> dict[str, bytes]:
 
 
 def check_resume(saved: Timed, others: list[Config], env: Any, single: Timed) -> list[str]:
-    """Save a loop state, restore it for other numbers of devices, and compare all bytes; a line for each."""
+    """Save a loop state, restore it for other numbers of devices, and compare all bytes; return a line for each.
+
+    Raises:
+        AssertionError: Restored arrays differ.
+    """
     lines = []
     with tempfile.TemporaryDirectory() as folder:
         checkpoints = Checkpoints(Path(folder))
@@ -191,12 +195,12 @@ def check_resume(saved: Timed, others: list[Config], env: Any, single: Timed) ->
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """One configuration on several devices, beside what it is compared with.
+    """Configuration on several devices, and its reference.
 
     Attributes:
         kind: seeds, weak or strong.
-        timed: It.
-        one: The same on one device.
+        timed: The configuration.
+        one: Its reference on one device.
     """
 
     kind: str
@@ -205,7 +209,7 @@ class Figure:
 
 
 def make_figures(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Figure]:
-    """Everything that is measured."""
+    """Create all configurations to be measured."""
     one_of = {batch: Timed(base.replace(batch_size=batch), env, False) for batch in batches}
     one_seeds, figures = Timed(base.replace(seeds=seeds), env, True), []
     for count in numbers:
@@ -219,14 +223,14 @@ def make_figures(base: Config, env: Any, numbers: list[int], batches: tuple[int,
 
 
 def compare(kind: str, config: Config, one: list[float], seconds: list[float], ideal: int) -> tuple[str, Measurement]:
-    """A line of the table, and the record.
+    """Compare a configuration with its reference; return a line of the table, and the record.
 
     Args:
         kind: seeds, weak, strong or processes.
-        config: What was trained.
-        one: Seconds of an iteration of what it is compared with.
-        seconds: Its own.
-        ideal: The speed-up at an efficiency of one.
+        config: The configuration.
+        one: Times of an iteration of the reference, s.
+        seconds: Times of an iteration of the configuration, s.
+        ideal: Speed-up at an efficiency of one.
     """
     before, after = statistics.median(one), statistics.median(seconds)
     speedup = before / after * (1 if kind == "strong" else ideal)
@@ -245,7 +249,7 @@ def compare(kind: str, config: Config, one: list[float], seconds: list[float], i
 
 
 def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
-    """The time of an update's all-reduce: a line, and the record."""
+    """Measure the time of an update's all-reduce; return a line, and the record."""
     train, count = figure.timed.programs.shapes.train, figure.timed.config.run.devices
     numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.agent.actor, train.agent.critic)))
     seconds = all_reduce_seconds(numbers, count)
@@ -259,12 +263,12 @@ def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
 
 
 def in_processes(figures: list[Figure], positions: list[int], times: list[list[float]]) -> list[tuple[str, Measurement]]:
-    """Time the same training by two processes with half of the devices each: lines of the table, and the records.
+    """Time the same training by two processes with half of the devices each; return lines of the table, and the records.
 
     Args:
-        figures: To be trained once more, all on equally many devices.
-        positions: Of each among all configurations.
-        times: Seconds of an iteration of each, by one process.
+        figures: Configurations to be repeated, all on the same number of devices.
+        positions: Index of each among all configurations.
+        times: Times of an iteration of each by one process, s.
     """
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -274,7 +278,7 @@ def in_processes(figures: list[Figure], positions: list[int], times: list[list[f
     children = []
     for index in range(2):
         variables = dict(os.environ, CUDA_VISIBLE_DEVICES=",".join(visible[index * half : (index + 1) * half]))
-        if "XLA_FLAGS" in variables:  # a CPU's devices
+        if "XLA_FLAGS" in variables:  # simulated devices of a CPU
             variables["XLA_FLAGS"] = re.sub(r"(device_count=)\d+", rf"\g<1>{half}", variables["XLA_FLAGS"])
         command = [sys.executable, *sys.argv, *place, "--process-id", str(index)]
         children.append(subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, text=True))
@@ -290,7 +294,7 @@ def in_processes(figures: list[Figure], positions: list[int], times: list[list[f
 
 
 def measure_as_process(timed: list[Timed], cycles: int) -> None:
-    """One of two processes: compiles and trains each configuration, and prints a list of the seconds of an iteration."""
+    """Act as one of two processes: compile and time each configuration, and print the times of an iteration (s) as JSON."""
     seconds = []
     for configuration in timed:
         configuration.compile()
@@ -301,7 +305,7 @@ def measure_as_process(timed: list[Timed], cycles: int) -> None:
 
 
 def write_records(file: Path | None, watch: Watch, measurements: list[Measurement]) -> None:
-    """Write what has been measured so far, if there is a file for it."""
+    """Write all measurements so far, if a file is given."""
     if file is not None:
         conditions = watch.conditions()
         write_json(file, [to_record(measurement, conditions) for measurement in measurements])
@@ -315,7 +319,7 @@ HEAD = (
 
 
 def main() -> None:
-    """Read the command line, measures, print a table, and keep records."""
+    """Measure, print a table, and store the records."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, nargs="+", help="numbers of devices; 2, 4 and 8 if there are so many")
     parser.add_argument("--env", default="VisualFetchReach")
@@ -323,12 +327,12 @@ def main() -> None:
     parser.add_argument("--seeds-per-device", type=int, default=1)
     parser.add_argument("--json", type=Path, help="also write the records here")
     parser.add_argument("--quick", action="store_true", help="small, to see that it works")
-    parser.add_argument("--positions", type=int, nargs="+", help=argparse.SUPPRESS)  # of one of two processes
+    parser.add_argument("--positions", type=int, nargs="+", help=argparse.SUPPRESS)  # for one of two processes
     parser.add_argument("--coordinator", help=argparse.SUPPRESS)
     parser.add_argument("--process-id", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--compile-only", type=int, metavar="N", help="fill the compile cache for the N-th configuration")
     options = parser.parse_args()
-    # Processes that compile share the devices' memory with this one.
+    # Compiling processes share the devices' memory with this one.
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     enable_compilation_cache()
     if options.coordinator:

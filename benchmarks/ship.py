@@ -1,9 +1,9 @@
-"""Puts the policy of a run into the package, under a name: `python -m benchmarks.ship RUN NAME [--checkpoint best]`.
+"""Add the policy of a run to the package, under a name: `python -m benchmarks.ship RUN NAME [--checkpoint best]`.
 
-The folder jaxrl_vis/pretrained/NAME receives the run's config.json, the weights in float16 (statistics of observations in
-float32), and a card. The card's score is that of the shipped file, over fresh episodes: none of them was seen in the training
-or its evaluations. The score of the float32 weights over the same episodes stands beside it. The table in docs/play.md wants a
-row for each policy, which a test compares with its card.
+The folder jaxrl_vis/pretrained/NAME receives the run's config.json, the weights in float16 (observation statistics in float32),
+and a card. The card's score is that of the shipped file on fresh episodes, which occurred neither in training nor in its
+evaluations, with the score of the float32 weights on the same episodes beside it. The table in docs/play.md must have a row for
+each policy; a test compares it with the card.
 """
 
 import argparse
@@ -24,12 +24,12 @@ from jaxrl_vis.run.trained.policy import load_policy
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 
 FRESH_KEY = 59_000_000
-"""Seed of the fresh episodes: beyond all seeds of runs, and not that of evaluations."""
+"""Seed of the fresh episodes: larger than all seeds of runs, and different from that of evaluations."""
 MOST_BYTES = 2 * 1024**2
 
 
 def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, episodes: int) -> Score:
-    """Evaluate one seed of a run, or a policy alone, over fresh episodes."""
+    """Evaluate one seed of a run, or a policy alone, on fresh episodes."""
     trainer = open_run(run_dir, keep_programs=True, eval_episodes=episodes)
     metrics = trainer.evaluate(load(trainer, run_dir, checkpoint).train, jax.random.key(FRESH_KEY))
     row = {name: float(values[trainer.seeds.index(seed)]) for name, values in metrics.items()}

@@ -1,6 +1,7 @@
-"""Puts trained weights into the package, with 10 bits a number: `python benchmarks/ship_weights.py FILE`.
+"""Add trained weights to the package, quantised to 10 bits: `python benchmarks/ship_weights.py FILE`.
 
-FILE is what `jaxrl-vis phenotype train` or `jaxrl-vis grasp train` wrote, a segmentation. The wheel has no room for 16 bits.
+FILE is the segmentation network written by `jaxrl-vis phenotype train` or `jaxrl-vis grasp train`. With 16 bits the wheel would
+become too large.
 """
 
 import sys
@@ -13,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector import weights
 
 
 def main(trained: Path) -> None:
-    """Write trained weights into the package, in the room of the network that they fit; exit with a line if they fit none."""
+    """Replace the packaged network whose architecture the trained weights match; exit with an error line if there is none."""
     for room in (weights, painter):
         try:
             params, settings, origin = room.read_weights(trained)

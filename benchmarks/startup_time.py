@@ -1,15 +1,15 @@
-"""Startup time of a run: imports, environment, then all programs, and the first iteration.
+"""Startup time of a run: imports, environment, compilation of all programs, and the first iteration.
 
     python benchmarks/startup_time.py [ENV] [--preset P] [--seeds S] [--json FILE]
 
-Two processes are started, one after the other, with a compilation cache of their own:
+Two processes are started one after the other, with a common, initially empty compilation cache:
 
     cold     as a run starts: `Programs.compile`, then the first iteration
     warm     the same once more, with everything in the cache
 
-Seconds are wall-clock; processor seconds (of all threads) stand beside them, because they say more on a machine that does other
-things as well. What a first start after an installation takes longer, Python's compilation of its modules, is included where
-Python may not keep it (PYTHONDONTWRITEBYTECODE).
+Times are wall-clock seconds, with processor seconds (of all threads) beside them, which are more reliable on a busy machine.
+Python's compilation of modules to bytecode, which slows down the first start after an installation, is included only if Python
+may not cache it (PYTHONDONTWRITEBYTECODE).
 """
 
 import argparse
@@ -23,14 +23,14 @@ from pathlib import Path
 from typing import Any
 
 STARTED = "JAXRL_VIS_START_TIME"
-"""Environment variable of the moment at which a process was asked for, seconds since the epoch."""
+"""Environment variable with the time at which a process was launched, seconds since the epoch."""
 
 
 class Clock:
     """Laps of wall-clock and processor seconds.
 
     Attributes:
-        laps: Name -> (wall-clock seconds, processor seconds).
+        laps: Pairs of (wall-clock seconds, processor seconds) by name.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Clock:
 
 
 def imported(clock: Clock, options: argparse.Namespace) -> Any:
-    """The programs of a run, nothing of them traced yet."""
+    """Import everything and return the programs of a run, untraced."""
     import jax
 
     clock.lap("import jax")
@@ -58,7 +58,7 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
     from jaxrl_vis.learner.train_step import make_train_step
     from jaxrl_vis.run.compiled.programs import Programs
 
-    # As `make_trainer` does it: devices start while MuJoCo is imported.
+    # As in `make_trainer`: devices are initialised while MuJoCo is imported.
     start_devices()
     locate_env(preset("fast", env=options.env))
     clock.lap("import the environment")
@@ -73,7 +73,7 @@ def imported(clock: Clock, options: argparse.Namespace) -> Any:
 
 
 def start(clock: Clock, options: argparse.Namespace) -> None:
-    """Start as a run does."""
+    """Start like a run: compile, then do the first iteration."""
     import jax
 
     programs = imported(clock, options)
@@ -88,7 +88,7 @@ MODES = ("cold", "warm")
 
 
 def measured(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
-    """The laps of a process of its own."""
+    """Measure in a new process; return its laps."""
     command = [sys.executable, __file__, options.env, "--seeds", str(options.seeds), "--mode", mode]
     command += ["--preset", options.preset] if options.preset else []
     variables = {
@@ -102,7 +102,7 @@ def measured(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tu
 
 
 def show(mode: str, laps: dict[str, tuple[float, float]]) -> None:
-    """Print a table."""
+    """Print the table of a process."""
     print(f"{mode:32}{'wall-clock s':>14}{'processor s':>14}")
     total = [sum(seconds) for seconds in zip(*laps.values(), strict=True)]
     for name, (wall, processor) in [*laps.items(), ("total", total)]:
@@ -110,13 +110,13 @@ def show(mode: str, laps: dict[str, tuple[float, float]]) -> None:
 
 
 def main() -> None:
-    """Measure, print, and write a file if asked to."""
+    """Measure, print, and write a file if requested."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("env", nargs="?", default="VisualFetchReach")
     parser.add_argument("--preset")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--mode", choices=MODES, help=argparse.SUPPRESS)  # of the processes that it starts
+    parser.add_argument("--mode", choices=MODES, help=argparse.SUPPRESS)  # for its child processes
     options = parser.parse_args()
     if options.mode:
         clock = Clock()

@@ -28,7 +28,7 @@ TASKS = {
     "VisualFingerTurn": ("VisualFingerTurn", (0.3, 0.5, 0.9), 1_000_000),
     "VisualHandReach-view=fingertips": ("VisualHandReach as the authors saw it", (0.1, 0.2, 0.3), 1_000_000),
 }
-"""Heading, levels of success, and budget of the mean success, by the task in a record's name."""
+"""Heading, success levels, and budget of the mean success (environment steps), by the task in a record's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Group:
 
     Attributes:
         rows: Evaluations of all seeds.
-        revisions: Revisions and devices of the runs, in words.
+        revisions: Revisions and devices of the runs, as text.
     """
 
     rows: list[dict[str, Any]]
@@ -50,11 +50,11 @@ class Group:
 
     @property
     def points(self) -> list[tuple[int, float]]:
-        """Curve of (environment steps, median success) at the evaluations that every seed has."""
+        """Points (environment steps, median success) at the evaluations common to all seeds."""
         return curve(self.rows, SUCCESS)
 
     def means(self, budget: int) -> np.ndarray:
-        """Mean success of the evaluations up to ``budget``, [S]."""
+        """Return the mean success over the evaluations up to ``budget`` environment steps, [S]."""
         return np.array(
             [
                 np.mean([row[SUCCESS] for row in self.rows if row["seed"] == seed and row["env_steps"] <= budget])
@@ -64,7 +64,7 @@ class Group:
 
 
 def read_groups(studies: Path) -> dict[tuple[str, str, float], Group]:
-    """Read the runs by task, variant and decay; without fresh seeds at a decay, those of figure 5.4 (seeds 0 to 4)."""
+    """Read the runs by task, variant and decay; if a decay has no fresh seeds, use those of figure 5.4 (seeds 0 to 4)."""
     folders = collections.defaultdict(list)
     for folder in sorted((studies / "target_decay").iterdir()):
         task, variant, decay = re.fullmatch(r"(.+)-(\w+)-paper-decay([\d.]+)-seeds\d+to\d+", folder.name).groups()
@@ -85,7 +85,7 @@ def _read_group(decay: float, folders: list[Path]) -> Group:
 
 
 def steps_cell(group: Group, level: float) -> str:
-    """Format the environment steps to a level, or the budget that did not suffice."""
+    """Format the environment steps to a level, or the budget within which it was not reached."""
     steps = steps_to(group.points, level)
     return f"> {show_steps(group.points[-1][0])}" if steps is None else show_steps(steps)
 

@@ -1,15 +1,15 @@
-"""Verification of a release: two builds that are equal byte for byte, and a smoke test from an empty environment.
+"""Verification of a release: two builds must be equal byte for byte, and pass a smoke test in an empty environment.
 
     python -m benchmarks.verify_release [--out dist] [--python python3.12] [--skip-install]
 
-1. Exports the last commit twice, into folders of other names, and builds wheel and sdist of each. All times in them are that of
-   the commit (SOURCE_DATE_EPOCH), so that anybody who builds the commit gets the same bytes.
-2. Compares both; a difference is told file by file.
-3. Installs the wheel into an empty environment, with packages from the registry that pip is configured for, and types what a
-   newcomer types. Writes the bill of materials (CycloneDX, JSON) of that environment: `sbom.cdx.json`.
-4. Leaves wheel, sdist, bill and SHA256SUMS in the folder ``--out``.
+1. Export the last commit twice, into folders of different names, and build wheel and sdist of each. All times in them are that
+   of the commit (SOURCE_DATE_EPOCH), so that every build of the commit gives the same bytes.
+2. Compare both; differences are reported file by file.
+3. Install the wheel into an empty environment, with packages from the registry that pip is configured for, and run the commands
+   of a new user. Write the bill of materials (CycloneDX, JSON) of that environment: `sbom.cdx.json`.
+4. Leave wheel, sdist, bill and SHA256SUMS in the folder ``--out``.
 
-Exits with 1 where anything is not as it should be. Takes about four minutes on two idle cores.
+Exits with 1 on any failure. Takes about four minutes on two idle cores.
 """
 
 import argparse
@@ -37,9 +37,9 @@ SMOKE = (
     ("jaxrl-vis push runs/smoke --to policy", "policy"),
     ("python -c \"import jaxrl_vis; print(jaxrl_vis.load_policy('policy').env_name)\"", "VisualReacher"),
     ("jaxrl-vis play fetch --episodes 1", "fetch/play.gif"),
-    ("python ten_lines.py", "['depth', 'edges'] True"),
+    ("python -c 'import jaxrl_vis.weighting as w; print(w.__name__)'", "jaxrl_vis.weighting"),
 )
-"""Commands of the smoke test, and what each must show; ten_lines.py is the first example of docs/weighting.md."""
+"""Commands of the smoke test, and the text that the output of each must contain."""
 
 
 def commit_time(checkout: Path) -> int:
@@ -49,7 +49,7 @@ def commit_time(checkout: Path) -> int:
 
 
 def export(checkout: Path, folder: Path) -> None:
-    """Write the files of the last commit into a new folder: nothing that is not committed gets into a release."""
+    """Write the files of the last commit into a new folder, so that a release has committed files only."""
     folder.mkdir(parents=True)
     archive = folder.with_suffix(".tar")
     subprocess.run(["git", "-C", str(checkout), "archive", "--output", str(archive), "HEAD"], check=True)
@@ -64,7 +64,7 @@ def build(source: Path, out: Path, seconds: int) -> list[Path]:
     Args:
         source: The sources.
         out: Folder of the files.
-        seconds: Time of everything in them, s since 1970.
+        seconds: Modification time of all their members, s since 1970.
     """
     command = [sys.executable, "-m", "build", "--wheel", "--sdist", "--no-isolation", "--outdir", str(out), str(source)]
     done = subprocess.run(command, env=os.environ | {"SOURCE_DATE_EPOCH": str(seconds)}, capture_output=True, text=True)
@@ -106,7 +106,7 @@ def differences(first: Path, second: Path) -> Iterator[str]:
 
 
 def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
-    """Write the bill of materials of an environment, without the place where its packages lie here.
+    """Write the bill of materials of an environment, without local paths.
 
     Args:
         python: The environment's interpreter.
@@ -118,7 +118,7 @@ def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
     command += ["--output-format", "JSON", "--output-file", str(path)]
     subprocess.run(command, check=True, capture_output=True, text=True)
     bill = json.loads(path.read_text())
-    # pip came with the environment, and what is released is the root.
+    # Omit pip, which comes with the environment, and the released package, which is the root component.
     root, left_out = bill["metadata"]["component"], {"pip", "setuptools", _OURS}
     refs = {part["bom-ref"]: part["name"] for part in bill["components"]}
     bill["components"] = [part for part in bill["components"] if part["name"] not in left_out]
@@ -129,14 +129,8 @@ def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
     path.write_text(json.dumps(bill, indent=1) + "\n")
 
 
-def first_example(page: Path) -> str:
-    """Return the first block of Python of a page."""
-    return page.read_text().partition("```python\n")[2].partition("```")[0]
-
-
 def smoke_test(shell: Shell, wheel: Path) -> None:
-    """Install a wheel into a new environment, and type the commands of `SMOKE`."""
-    (shell.folder / "ten_lines.py").write_text(first_example(CHECKOUT / "docs" / "weighting.md"))
+    """Install a wheel into a new environment, and run the commands of `SMOKE`."""
     shell.type("python3 -m venv venv")
     shell.activate(shell.folder / "venv")
     shell.type(f"pip install --quiet {wheel}")

@@ -2,13 +2,13 @@
 
     python -m benchmarks.weighted_digits [--only NAME ...] [--json FILE]
 
-    pairs       two digits over each other: which is the upper, which the lower one?
+    pairs       two superimposed digits: classify the upper and the lower one
     questions   five questions about one digit: which, even, above four, how many holes, how much ink
-    helped      the same with 100 images: which digit it is counts, the other four questions are to help
+    helped      the same with 100 images: the digit's class is the main task, the other four are auxiliary
 
-Each method is trained with Adam at `RATES` on seeds 0 to 14; the rate with the best accuracy on validation images is used for
-seeds 100 to 114, whose accuracy on test images is reported. Methods with a main loss take part in ``helped`` alone, where only
-the main loss's accuracy counts. The record is written after each method, and what it holds is not trained again.
+Each method is trained with Adam at `RATES` on seeds 0 to 14; the rate with the best validation accuracy is used for seeds 100
+to 114, whose test accuracy is reported. Methods with a main loss are tested only on ``helped``, where only the main task's
+accuracy counts. The record is written after each method, and methods that it already holds are not trained again.
 """
 
 import argparse
@@ -31,11 +31,11 @@ from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import write_atomically
 
 RATES = (1e-3, 3e-3, 1e-2)
-TUNING_SEEDS, TEST_SEEDS = range(15), range(100, 115)  # as many, so that one program serves both
+TUNING_SEEDS, TEST_SEEDS = range(15), range(100, 115)  # equally many, so that one program serves both
 STEPS, BATCH, WIDTH = 2000, 64, 32
 BASELINE = "sum"
 TARGET = Path(__file__).parent / "results" / "weighted_digits.json"
-_HOLES = np.array([1, 0, 0, 0, 1, 0, 1, 0, 2, 1])  # of the digits as they are usually written
+_HOLES = np.array([1, 0, 0, 0, 1, 0, 1, 0, 2, 1])  # in digits 0 to 9 as usually written
 _LABELLED = 100
 
 Split = dict[str, np.ndarray]  # inputs under x, and labels of each task under its name
@@ -56,7 +56,7 @@ class Problem(NamedTuple):
 
 
 def problems() -> dict[str, Problem]:
-    """Return the three problems by name; no image is in two splits."""
+    """Return the three problems by name; no image is in more than one split."""
     data = load_digits()
     images, digits = data.images.astype(np.float32) / 16.0, data.target
     order = np.random.default_rng(0).permutation(len(images))
@@ -99,7 +99,7 @@ def problems() -> dict[str, Problem]:
 
 
 def initialize(key: jax.Array, problem: Problem) -> Any:
-    """Draw the parameters: a trunk of two layers and a linear head for each task."""
+    """Initialise the parameters: a trunk of two layers and a linear head for each task."""
 
     def layer(key: jax.Array, rows: int, columns: int) -> jax.Array:
         return jax.random.normal(key, (rows, columns)) / np.sqrt(rows)
@@ -126,7 +126,7 @@ def losses(params: Any, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
 
 
 def make_training(problem: Problem, weighting: jw.Weighting) -> Callable[[jax.Array, jax.Array], dict[str, jax.Array]]:
-    """Return the compiled training of runs side by side: (rates [R], seeds [R]) -> accuracies [R] of each split but train's."""
+    """Return the jitted training of R parallel runs: (rates [R], seeds [R]) -> accuracies [R] on each split except train."""
     gradient = jw.weighted_grad(losses, weighting, shared=lambda params: params["trunk"])
     optimizer = optax.scale_by_adam()
     known = {name: jnp.asarray(values) for name, values in problem.splits["train"].items()}
@@ -162,7 +162,7 @@ def measure(problem: Problem, name: str) -> dict[str, Any]:
     rates = [jnp.full(len(TUNING_SEEDS), rate) for rate in RATES]
     valid = [float(jnp.mean(train(rate, jnp.array(TUNING_SEEDS))["valid"])) for rate in rates]
     best = int(np.argmax(valid))
-    started = time.perf_counter()  # it is compiled
+    started = time.perf_counter()  # after compilation
     test = np.asarray(train(rates[best], jnp.array(TEST_SEEDS))["test"])
     return {
         "method": name,
@@ -174,7 +174,7 @@ def measure(problem: Problem, name: str) -> dict[str, Any]:
 
 
 def methods(problem: Problem) -> Iterator[str]:
-    """Yield the weightings that a problem suits, the baseline first: those with a main loss want one among the tasks."""
+    """Yield the weightings applicable to a problem, the baseline first; those with a main loss need a main task."""
     for name in (BASELINE, *(name for name in jw.WEIGHTINGS if name != BASELINE)):
         weighting = jw.make_weighting(name)
         if jw.MAIN not in problem.classes:

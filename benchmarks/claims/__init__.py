@@ -1,13 +1,13 @@
-"""Tables and claims of the documentation, computed from the kept records of learning.
+"""Tables and claims of the documentation, computed from the stored learning records.
 
-    records      kept runs, by the names that tables use
+    records      stored runs, by the names that tables use
     columns      statistics of a record as cells of a table
     ol_aux       tables of the study of auxiliary losses (figures 5.4 to 5.7)
     indicator    tables of the study of rewards without ground truth (figures 5.1, 5.2, estimators, cameras)
     ablations    tables of single runs with one option changed
-    thesis       claims of the thesis beside the records, for docs/claims.md and in short for the README
-    prose        sentences that quote numbers, compared with their pages
-    sentences    these sentences, computed
+    thesis       claims of the thesis compared with the records, for docs/claims.md and, abridged, the README
+    prose        comparison of sentences that quote numbers with their pages
+    sentences    these sentences, with computed numbers
     pages        all tables, by page and marker
     markdown     rows of records as a table in Markdown
 

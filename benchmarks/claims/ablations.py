@@ -15,7 +15,7 @@ def _at(*thousands: float) -> list[c.Column]:
 
 
 def _rows(labels: Sequence[tuple[str, str]]) -> list[Row]:
-    """Rows of ablations, by label and the file's name; a row without a name has no record."""
+    """Return the rows of ablations, from pairs of label and file name; without a name, a row has no record."""
     return [Row(label, ablation(name) if name else None) for label, name in labels]
 
 
@@ -106,7 +106,7 @@ TWENTY = {
     "6 pixels, `--balance-probability 0.2 --relabel-probability 0.8`": "shift6bal2rel8",
     "6 pixels, `--balance-probability 0.3 --relabel-probability 0.8`: `fast`": "shift6bal3rel8",
 }
-"""Setting -> the end of its record's name."""
+"""Suffix of the record's name by setting."""
 
 
 def _fetch_twenty() -> str:
@@ -235,7 +235,7 @@ _WEIGHTINGS = {
 
 
 def _fast(task: str, prefix: str, step: float, last: int) -> str:
-    """Table of all weightings on a task; their means are up to the shortest run's end."""
+    """Return the table of all weightings on a task, with means up to the shortest run's end."""
     rows = _rows([(label, f"{prefix}_fast_{name}") for label, name in _WEIGHTINGS.items()])
     best, end = ablation(f"{prefix}_fast_ol_aux_5"), min(row.record.end for row in rows if row.record)
     columns = [
@@ -274,7 +274,7 @@ def _actor_loss() -> str:
 
 
 def _options() -> str:
-    """Main table of the guide: a few settings on three tasks."""
+    """Return the main table of the guide: a few settings on three tasks."""
     hand, fetch, finger = 500 * _K, 20 * _K, 500 * _K
     settings = [
         ("VisualHandReach", "no shifts, 500 environments", ablation("hand_shared"), hand),
@@ -298,7 +298,7 @@ def _options() -> str:
 
 
 def tables() -> dict[str, dict[str, str]]:
-    """Page -> marker -> text."""
+    """Return the tables, page -> marker -> text."""
     return {
         GUIDE: {"options": _options()},
         OPTIONS: {

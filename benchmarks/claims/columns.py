@@ -1,4 +1,4 @@
-"""Statistics of a record over its seeds as cells of a table; a cell is empty where the run has no such evaluation."""
+"""Statistics of a record over its seeds as cells of a table; a cell is empty if the run has no such evaluation."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -14,31 +14,31 @@ from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_
 SIGNIFICANT = 0.05
 AUTHORS = "authors"
 _TRUTH, _FILTERED = "train/filtered_false_share", "train/filtered_share"
-_ACTIVE = 0.01  # share of dropped negatives below which a filter counts as inactive, and has no precision
+_ACTIVE = 0.01  # fraction of dropped negatives below which a filter counts as inactive, and has no precision
 
 
 class Column(NamedTuple):
-    """A column of a table: its title, and the cell of a record."""
+    """Column of a table: its title, and a function that formats the cell of a record."""
 
     title: str
     cell: Callable[[Record], str]
 
 
 def band(values: np.ndarray, digits: int = 3) -> str:
-    """Median and quartiles, ``0.665 (0.635 to 0.685)``; the median alone where all three are printed alike."""
+    """Format median and quartiles, ``0.665 (0.635 to 0.685)``; only the median if all three round to the same."""
     low, median, high = (f"{value:.{digits}f}" for value in np.percentile(values, [25, 50, 75]))
     return median if low == median == high else f"{median} ({low} to {high})"
 
 
 def interval(values: np.ndarray, digits: int = 3) -> str:
-    """Interquartile mean and its 95 % bootstrap interval."""
+    """Format the interquartile mean and its 95 % bootstrap interval."""
     low, high = bootstrap_interval([values])
     return f"{interquartile_mean([values]):.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 @functools.cache
 def p_value(first: Record, second: Record, budget: int | None = None) -> float:
-    """Exact two-sided permutation test of two records' mean success up to a budget."""
+    """Return the p-value of an exact two-sided permutation test of two records' mean success up to a budget."""
     return permutation_p_value(first.means(budget), second.means(budget))
 
 
@@ -48,15 +48,15 @@ def show_p(value: float) -> str:
 
 
 def verdict(record: Record, reference: Record, budget: int | None = None) -> str:
-    """``better``, ``worse`` or ``level``: the first two only where the permutation test says so."""
+    """Return ``better`` or ``worse`` if the permutation test is significant, else ``level``."""
     if p_value(record, reference, budget) > SIGNIFICANT:
         return "level"
     return "better" if record.means(budget).mean() > reference.means(budget).mean() else "worse"
 
 
 def speed_up(record: Record, reference: Record, level: float) -> str:
-    """Number of times the steps of ``record`` that ``reference`` takes to a level, or a bound; empty where ``record`` did not
-    reach it.
+    """Format the steps of ``reference`` to a level relative to those of ``record``: a lower bound if only ``record`` reaches
+    it, empty if ``record`` does not.
     """
     steps, baseline = record.steps_to(level), reference.steps_to(level)
     if not steps:
@@ -65,7 +65,7 @@ def speed_up(record: Record, reference: Record, level: float) -> str:
 
 
 def steps_cell(record: Record, level: float) -> str:
-    """Environment steps to a level, or the budget within which it was not reached."""
+    """Format the environment steps to a level, or the budget within which it was not reached."""
     steps = record.steps_to(level)
     return f"> {show_steps(record.points[-1][0])}" if steps is None else show_steps(steps)
 
@@ -76,13 +76,13 @@ def _source(record: Record) -> str:
 
 @functools.cache
 def authors(task: str, variant: str, budget: int) -> Record:
-    """The authors' released curve up to a budget, as a record of one seed."""
+    """Return the authors' released curve up to a budget, as a record of one seed."""
     points = [point for point in released_curves()[task, variant] if point[0] <= budget]
     return Record(f"{AUTHORS}/{task}-{variant}", tuple({"seed": 0, "env_steps": at, SUCCESS: value} for at, value in points))
 
 
 def show_seeds(record: Record) -> str:
-    """First and last seed; nothing for a published curve."""
+    """Format the first and last seed; empty for a published curve."""
     if _source(record) == AUTHORS:
         return ""
     return f"{record.seeds[0]} to {record.seeds[-1]}" if len(record.seeds) > 1 else str(record.seeds[0])
@@ -93,12 +93,12 @@ def _of_seeds(record: Record, text: Callable[[], str]) -> str:
 
 
 def seeds() -> Column:
-    """First and last seed."""
+    """Return the column of the first and last seed."""
     return Column("seeds", show_seeds)
 
 
 def steps_to(level: float, *references: Record) -> Column:
-    """Steps to a level of success, with the speed-up over the reference of the same source in parentheses."""
+    """Return the column of steps to a success level, with the speed-up over the reference of the same source in parentheses."""
 
     def cell(record: Record) -> str:
         same = [reference for reference in references if _source(reference) == _source(record)]
@@ -109,7 +109,7 @@ def steps_to(level: float, *references: Record) -> Column:
 
 
 def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = None) -> Column:
-    """Median at one evaluation."""
+    """Return the column of the median at one evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(steps, metric)
@@ -119,7 +119,7 @@ def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = N
 
 
 def of_seeds(steps: int, digits: int = 2) -> Column:
-    """Success of every seed at one evaluation."""
+    """Return the column of every seed's success at one evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
@@ -129,7 +129,7 @@ def of_seeds(steps: int, digits: int = 2) -> Column:
 
 
 def least(steps: int) -> Column:
-    """Least success of any seed at one evaluation."""
+    """Return the column of the minimum success over seeds at one evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
@@ -139,7 +139,7 @@ def least(steps: int) -> Column:
 
 
 def mean_at(steps: int) -> Column:
-    """Mean over seeds at one evaluation."""
+    """Return the column of the mean success over seeds at one evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
@@ -149,7 +149,7 @@ def mean_at(steps: int) -> Column:
 
 
 def success_at(steps: int) -> Column:
-    """Median success and middle half of the seeds at one evaluation."""
+    """Return the column of median success and quartiles over seeds at one evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(steps)
@@ -159,7 +159,7 @@ def success_at(steps: int) -> Column:
 
 
 def final(metric: str = SUCCESS, title: str = "success at the end", digits: int = 3) -> Column:
-    """Median and middle half of the seeds at the last evaluation."""
+    """Return the column of median and quartiles over seeds at the last evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(record.end, metric)
@@ -169,12 +169,12 @@ def final(metric: str = SUCCESS, title: str = "success at the end", digits: int 
 
 
 def final_distance() -> Column:
-    """Median and middle half of the final distance at the last evaluation."""
+    """Return the column of median and quartiles of the final distance at the last evaluation."""
     return final(DISTANCE, "distance at the end")
 
 
 def final_median(metric: str, title: str, digits: int = 3) -> Column:
-    """Median at the last evaluation; 0 where there is none of it."""
+    """Return the column of the median at the last evaluation."""
 
     def cell(record: Record) -> str:
         values = record.at(record.end, metric)
@@ -184,18 +184,18 @@ def final_median(metric: str, title: str, digits: int = 3) -> Column:
 
 
 def training_mean(metric: str, title: str, digits: int = 3) -> Column:
-    """Mean over training, in the median over seeds."""
+    """Return the column of the median over seeds of the mean over training."""
     return Column(title, lambda record: f"{np.median(record.means(metric=metric)):.{digits}f}")
 
 
 def mean_success(budget: int | None = None) -> Column:
-    """Interquartile mean over seeds of the mean success up to a budget, with its bootstrap interval."""
+    """Return the column of the interquartile mean over seeds of the mean success up to a budget, with bootstrap interval."""
     title = f"mean success to {show_steps(budget)}" if budget else "mean success over training"
     return Column(f"{title}, IQM (95 %)", lambda record: _of_seeds(record, lambda: interval(record.means(budget))))
 
 
 def p(reference: Record, label: str, budget: int | None = None) -> Column:
-    """p-value of the permutation test of mean success against a reference."""
+    """Return the column of the p-value of the permutation test of mean success against a reference."""
 
     def cell(record: Record) -> str:
         return "" if record is reference else _of_seeds(record, lambda: show_p(p_value(record, reference, budget)))
@@ -204,7 +204,7 @@ def p(reference: Record, label: str, budget: int | None = None) -> Column:
 
 
 def training_precision() -> Column:
-    """Share of dropped negatives that were false over training; empty where the filter was inactive."""
+    """Return the column of the fraction of dropped negatives that were false over training; empty for an inactive filter."""
 
     def cell(record: Record) -> str:
         dropped = np.median(record.means(metric=_FILTERED))
@@ -214,7 +214,7 @@ def training_precision() -> Column:
 
 
 def final_precision() -> Column:
-    """Median over seeds of the filter's precision at the end; empty where the filter was inactive over training."""
+    """Return the column of the median of the filter's final precision; empty if the filter was inactive over training."""
 
     def cell(record: Record) -> str:
         if np.median(record.means(metric=_FILTERED)) < _ACTIVE:
@@ -226,7 +226,7 @@ def final_precision() -> Column:
 
 
 def distance_to_authors(task: str, variant: str) -> Column:
-    """Mean absolute distance of the median to the authors' released curve."""
+    """Return the column of the mean absolute difference between the median and the authors' released curve."""
     curve = released_curves()[task, variant]
 
     def cell(record: Record) -> str:
@@ -239,7 +239,7 @@ def distance_to_authors(task: str, variant: str) -> Column:
 
 
 def _resampled_medians(record: Record, count: int = 2_000) -> list[list[tuple[int, float]]]:
-    """Median curves of seeds drawn with replacement."""
+    """Return median curves of bootstrap samples of seeds."""
     steps = [at for at, _ in record.points]
     success = np.stack([record.at(at) for at in steps])
     draws = np.random.default_rng(0).integers(len(record.seeds), size=(count, len(record.seeds)))
@@ -247,12 +247,12 @@ def _resampled_medians(record: Record, count: int = 2_000) -> list[list[tuple[in
 
 
 def names() -> Column:
-    """Place of the record below benchmarks/results, without the folder that the page names."""
+    """Return the column of the record's path below benchmarks/results, without the folder named by the page."""
     return Column("record", lambda record: "" if _source(record) == AUTHORS else f"`{record.name.partition('/')[2]}`")
 
 
 def weights(losses: Sequence[str]) -> list[Column]:
-    """Mean weight of each auxiliary loss over training, in the median over seeds."""
+    """Return a column per auxiliary loss: the median over seeds of its mean weight over training."""
     return [
         Column(
             loss.replace("_", " "), lambda record, loss=loss: _weight(np.median(record.means(metric=f"train/weight/{loss}")))

@@ -1,4 +1,4 @@
-"""Tables of figures 5.1 and 5.2 and their kin: docs/lab/indicator.md, and the main table of docs/indicator_rewards.md."""
+"""Tables of figures 5.1, 5.2 and related ones: docs/lab/indicator.md, and the main table of docs/indicator_rewards.md."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ _PARTS = {
 
 @functools.cache
 def run(task: str, variant: str) -> Record:
-    """Return a run of these studies: fresh seeds where they are there."""
+    """Return a run of these studies, with fresh seeds if there are any."""
     return study("indicator", f"{task}-{variant}-fast", fresh=True)
 
 
@@ -37,7 +37,7 @@ def _rows(task: str, labels: Mapping[str, str]) -> list[Row]:
 
 
 def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more: Sequence[c.Column] = ()) -> str:
-    """Table of evaluations at the end and over training, with a test against one of the rows."""
+    """Return the table of results at the end and over training, with a test against one of the rows."""
     base = run(task, reference)
     columns = [
         c.final(),
@@ -50,7 +50,7 @@ def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more
 
 
 def _rewards(task: str, precision: bool) -> str:
-    """Table of the shares that are logged about rewards, over training and at the end."""
+    """Return the table of logged reward statistics, over training and at the end."""
     pairs = [("positive rewards", "train/positive_share"), ("negatives that are false", "train/false_negative_share")]
     if precision:
         pairs = [("negatives dropped", "train/filtered_share"), pairs[1]]
@@ -101,7 +101,7 @@ def _cameras() -> str:
 
 
 def _main() -> str:
-    """Main table of the guide: success and distance at the end on five tasks."""
+    """Return the main table of the guide: success and distance at the end on five tasks."""
     rows, oracles = [], {}
     for task in (REACHER, FETCH, SAWYER, HAND, FINGER):
         for variant, label in METHODS.items():
@@ -124,7 +124,7 @@ def _main() -> str:
 
 
 def tables() -> dict[str, dict[str, str]]:
-    """Page -> marker -> text."""
+    """Return the tables, page -> marker -> text."""
     states = {
         "oracle": "oracle",
         "indicator": "indicator",

@@ -14,11 +14,11 @@ NO_RECORD = "no record kept"
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A row of a table.
+    """Row of a table.
 
     Attributes:
         label: First cell.
-        record: Run that the other cells are computed from; None where no record is kept.
+        record: Run from which the other cells are computed; None if no record is stored.
         more: Cells between the label and the computed ones.
     """
 
@@ -28,7 +28,7 @@ class Row:
 
 
 def table(heads: Sequence[str], rows: Sequence[Row], columns: Sequence[Column]) -> str:
-    """A table in Markdown, and below it the revision and device of the records where these are kept.
+    """Format a table as Markdown, followed by revision and device of the records, if known.
 
     Args:
         heads: Titles of the label and of the cells in ``more``.
@@ -44,7 +44,7 @@ def table(heads: Sequence[str], rows: Sequence[Row], columns: Sequence[Column]) 
 
 
 def made_by(records: Sequence[Record]) -> str:
-    """Sentence on the revisions and devices of some records; empty where none is kept."""
+    """Return a sentence on the revisions and devices of records; empty if none is known."""
     devices = collections.defaultdict(set)
     for text in {text for record in records for text in record.made}:
         revision, _, device = text.partition(" on ")

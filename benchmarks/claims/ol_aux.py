@@ -14,7 +14,7 @@ from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND, OPTIONS
 LAB, GUIDE = "docs/lab/ol_aux.md", "docs/auxiliary_losses.md"
 VIEW = "view=fingertips-tip_marks=faint-depth_encoding=zbuffer"
 BUDGETS = {FETCH: 240_000, HAND: 1_000_000, FINGER: 1_000_000}
-"""Task -> environment steps up to which success is averaged: all records come that far."""
+"""Environment steps up to which success is averaged, by task; all records reach them."""
 LABELS = {
     "none": "without",
     "balance": "balance",
@@ -27,13 +27,13 @@ LABELS = {
 
 
 def run(task: str, variant: str, view: str = "") -> Record:
-    """Return the run that figures are drawn from: seeds 0 to 4."""
+    """Return the run for figures: seeds 0 to 4."""
     return study("ol_aux", f"{task}-{variant}-paper" + (f"-{view}" if view else ""))
 
 
 @functools.cache
 def claim(task: str, variant: str, budget: int | None = None) -> Record:
-    """Return the run that claims are made with: fresh seeds where they are there."""
+    """Return the run for claims, with fresh seeds if there are any."""
     return study("ol_aux", f"{task}-{variant}-paper", fresh=True, budget=budget or BUDGETS[task])
 
 
@@ -75,7 +75,7 @@ def _figure_5_7(task: str, budget: int, columns: Sequence[c.Column]) -> str:
 
 
 def rank_correlation(task: str) -> float:
-    """Spearman's rank correlation of a loss's mean weight in OL-AUX-5 and what it gains alone."""
+    """Return Spearman's rank correlation between a loss's mean weight in OL-AUX-5 and its gain when used alone."""
     base = np.mean([success for steps, success in run(task, "none").points if steps <= BUDGETS[task]])
     gains = [np.mean([v for steps, v in run(task, name).points if steps <= BUDGETS[task]]) - base for name in AUX_TASKS]
     weights = [np.median(run(task, "ol_aux_5").means(metric=f"train/weight/{name}")) for name in AUX_TASKS]
@@ -99,7 +99,7 @@ DEPARTURES = {
     "`--replay-transitions 160000 --replay-mean-age 40000`": "replay",
     "all but the replay": "all",
 }
-"""Setting -> the end of its record's name."""
+"""Suffix of the record's name by setting."""
 
 
 def _departures() -> str:
@@ -118,7 +118,7 @@ def _departures() -> str:
 
 
 def _gaps() -> str:
-    """Runs with one departure from the authors' release undone, on hand and finger."""
+    """Return the table of runs with one departure from the authors' release undone, on hand and finger."""
     hand = [
         ("VisualHandReach, `paper`", run(HAND, "none")),
         ("the z-buffer", ablation("hand_paper_zbuffer")),
@@ -140,7 +140,7 @@ def _gaps() -> str:
 
 
 def _fresh(task: str) -> str:
-    """All variants that were run with seeds from 100 on."""
+    """Return the table of all variants with seeds from 100 on."""
     budget = BUDGETS[task]
     records = {variant: claim(task, variant) for variant in fresh_variants(task)}
     records = {variant: record for variant, record in records.items() if record.seeds[0] >= FIRST_FRESH_SEED}
@@ -154,7 +154,7 @@ def _fresh(task: str) -> str:
 
 
 def _main() -> str:
-    """Main table of the guide: four choices on three tasks, with the freshest seeds."""
+    """Return the main table of the guide: four choices on three tasks, with fresh seeds if there are any."""
     rows, base = [], {}
     for task in (FETCH, HAND, FINGER):
         for variant in ("none", "balance", "inverse_dynamics", "ol_aux_5"):
@@ -176,7 +176,7 @@ def _main() -> str:
 
 
 def _options() -> str:
-    """Options of OL-AUX-5 on FetchReach, with the seeds that options are chosen by."""
+    """Return the table of OL-AUX-5's options on FetchReach, with the tuning seeds."""
     base, budget = run(FETCH, "ol_aux_5"), BUDGETS[FETCH]
     rows = [Row("OL-AUX-5", base)]
     rows += [Row(f"`{variant}`", run(FETCH, variant)) for variant in OPTIONS if _is_kept(FETCH, variant)]
@@ -193,7 +193,7 @@ def _is_kept(task: str, variant: str) -> bool:
 
 
 def tables() -> dict[str, dict[str, str]]:
-    """Page -> marker -> text."""
+    """Return the tables, page -> marker -> text."""
     four = ("none", "balance", "cosine", "ol_aux_5")
     return {
         GUIDE: {"main": _main()},

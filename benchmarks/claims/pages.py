@@ -1,4 +1,4 @@
-"""Tables of the learning studies by page and marker, and the lines of pages that differ from them."""
+"""Tables of the learning studies by page and marker, and differences between pages and tables."""
 
 import collections
 import difflib
@@ -12,7 +12,7 @@ from benchmarks.ledger.records import CHECKOUT
 
 @functools.cache
 def tables() -> dict[str, dict[str, str]]:
-    """Compute all tables: page, as a path below the root -> name in its markers -> text."""
+    """Compute all tables: page (path below the root) -> name in its markers -> text."""
     pages: dict[str, dict[str, str]] = collections.defaultdict(dict)
     for module in (ol_aux, indicator, ablations, thesis):
         for page, texts in module.tables().items():

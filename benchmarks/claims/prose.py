@@ -1,7 +1,7 @@
-"""Numbers that sentences quote: a sentence is registered in `sentences`, its numbers computed, and must stand in its page.
+"""Check of numbers quoted in prose: a page must contain each sentence registered in `sentences`, with the computed numbers.
 
-A page that is edited without the record fails, and so does a record that changes without the page. On the pages of `OTHERS`,
-decimal fractions outside tables and code that no registered sentence has are listed, too.
+The check fails if a page is edited without the record, or a record changes without the page. On the pages of `OTHERS`, decimal
+fractions outside tables and code that are in no registered sentence are also reported.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "docs/lab/results.md": (),
     "README.md": (),
 }
-"""Page -> numbers in its sentences that are settings, laws, speeds or properties of tasks, not figures of learning records."""
+"""Numbers in the sentences of each page that are not results of learning, but settings, laws, speeds or task properties."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Sentence:
 
     Attributes:
         page: Page below the root.
-        quote: Words with the computed numbers.
+        quote: Text with the computed numbers.
         record: Source of the numbers.
-        holds: True if the records say the same as the words.
+        holds: True if the records support the text.
     """
 
     page: str
@@ -50,13 +50,13 @@ class Sentence:
 
 
 def plain(text: str) -> str:
-    """Text without tables, code blocks and line breaks."""
+    """Return the text without tables, code blocks and line breaks."""
     text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     return re.sub(r"\s+", " ", "\n".join(line for line in text.splitlines() if not line.startswith(("|", "    "))))
 
 
 def differences(sentences: Sequence[Sentence]) -> Iterator[str]:
-    """List sentences that their pages or records do not have, and decimal fractions that are in no registered sentence."""
+    """Yield sentences missing from their pages or unsupported by records, and decimal fractions in no registered sentence."""
     pages = {*OTHERS, *(sentence.page for sentence in sentences)}
     texts = {page: plain((CHECKOUT / page).read_text(encoding="utf-8")) for page in sorted(pages)}
     for sentence in sentences:

@@ -1,4 +1,4 @@
-"""Kept runs of benchmarks/results: all evaluations of one configuration, from one folder or several with other seeds."""
+"""Stored runs of benchmarks/results: all evaluations of one configuration, from one or several folders with different seeds."""
 
 import dataclasses
 import functools
@@ -24,9 +24,9 @@ class Record:
     """All seeds of one configuration.
 
     Attributes:
-        name: Place below benchmarks/results, without file endings.
+        name: Path below benchmarks/results, without file suffixes.
         rows: Evaluations of all seeds.
-        made: Revision and device of each run, as text; empty where neither is kept.
+        made: Revision and device of each run, as text; empty if neither is known.
     """
 
     name: str
@@ -45,22 +45,22 @@ class Record:
 
     @functools.cached_property
     def points(self) -> list[tuple[int, float]]:
-        """(environment steps, median success over seeds)."""
+        """Pairs of (environment steps, median success over seeds)."""
         return curve(self.rows, SUCCESS)
 
     def steps_to(self, level: float) -> int | None:
-        """Environment steps from which this evaluation and the next two reach a level, in the median over seeds."""
+        """Return the first environment steps whose evaluation and the next two reach a level, in the median over seeds."""
         return steps_to(self.points, level)
 
     def at(self, steps: int, metric: str = SUCCESS) -> np.ndarray | None:
-        """Return the metric at one evaluation, [S] by ascending seed; None where not all seeds were evaluated then."""
+        """Return the metric at one evaluation, [S] by ascending seed; None if not all seeds were evaluated then."""
         values = {row["seed"]: row.get(metric) for row in self.rows if row["env_steps"] == steps}
         if set(values) != set(self.seeds) or None in values.values():
             return None
         return np.array([values[seed] for seed in self.seeds])
 
     def median(self, steps: int | None = None, metric: str = SUCCESS) -> float:
-        """Return the median over seeds at one evaluation, the last if none is named.
+        """Return the median over seeds at one evaluation, by default the last.
 
         Raises:
             ValueError: Not all seeds were evaluated then.
@@ -74,7 +74,7 @@ class Record:
         """Return the mean of a metric over the evaluations up to ``budget`` environment steps, [S].
 
         Raises:
-            ValueError: The run ended before.
+            ValueError: The run ended before ``budget``.
         """
         if (budget or 0) > self.end:
             raise ValueError(f"{self.name} ends at {self.end} steps, before {budget}")
@@ -97,7 +97,7 @@ _curves = functools.cache(read_curves)
 
 @functools.cache
 def ablation(name: str) -> Record:
-    """Return a curve of the table of ablations, whose revision and device are kept as far as the docs stated them."""
+    """Return a curve of the table of ablations, with revision and device as far as the docs state them."""
     curve = _curves()[name]
     made = frozenset({f"{curve.revision} on {curve.device}"} if curve.revision and curve.device else ())
     return Record(f"ablations/{name}", tuple(row for row in curve.rows if SUCCESS in row), made)
@@ -105,7 +105,7 @@ def ablation(name: str) -> Record:
 
 @functools.cache
 def learning(*names: str) -> Record:
-    """Return runs of benchmarks/results/learning; several count as seeds of one."""
+    """Return runs of benchmarks/results/learning, combined as seeds of one record."""
     folder, parts = RESULTS / "learning", []
     for name in names:
         about = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
@@ -116,20 +116,20 @@ def learning(*names: str) -> Record:
 
 @functools.cache
 def study(family: str, stem: str, fresh: bool = False, budget: int = 0) -> Record:
-    """Return the runs of a study that differ in seeds alone.
+    """Return the runs of a study that differ only in seeds.
 
     Args:
         family: Folder below benchmarks/results/studies.
-        stem: Beginning of the folders' names, before the seeds: ``VisualFetchReach-none-paper``.
-        fresh: True for runs with seeds from 100 on in the place of seeds 0 to 4, where there are any.
-        budget: Environment steps that fresh runs must have come to.
+        stem: Prefix of the folders' names, before the seeds: ``VisualFetchReach-none-paper``.
+        fresh: True for runs with seeds from 100 on instead of seeds 0 to 4, if there are any.
+        budget: Environment steps that fresh runs must have reached.
 
     Raises:
-        LookupError: No such run is kept.
+        LookupError: No such run is stored.
     """
     folders = _folders(family, stem)
     if fresh:
-        # The study of target networks ran the release's decay with fresh seeds, which is the same configuration.
+        # The study of target networks includes the release's decay with fresh seeds, which is the same configuration.
         candidates = {**_folders("target_decay", f"{stem}-decay0.98"), **folders}
         long_enough = {first: folder for first, folder in candidates.items() if _read_run(folder).end >= budget}
         fresh_folders = {first: folder for first, folder in long_enough.items() if first >= FIRST_FRESH_SEED}
@@ -150,7 +150,7 @@ def fresh_variants(task: str) -> list[str]:
 
 
 def _folders(family: str, stem: str) -> dict[int, Path]:
-    """First seed -> the longest run of that seed."""
+    """Return the folder of the longest run by its first seed."""
     longest: dict[int, tuple[int, Path]] = {}
     for folder in (RESULTS / "studies" / family).glob(f"{stem}-seeds*"):
         match = re.fullmatch(rf"{re.escape(stem)}-seeds(\d+)to\d+(?:-.*)?", folder.name)

@@ -1,4 +1,4 @@
-"""Sentences of the pages, with their numbers and verdicts computed: see `prose`."""
+"""Sentences of the pages with computed numbers and verdicts; see `prose`."""
 
 from collections.abc import Iterator, Sequence
 
@@ -268,7 +268,7 @@ def _parts_of_the_method() -> Iterator[Sentence]:
 
 
 def _choices() -> Iterator[Sentence]:
-    """Advice of the guides, which rests on the freshest seeds."""
+    """Yield the recommendations of the guides, based on fresh seeds if there are any."""
     claim, tasks = ol_aux.claim, ol_aux.BUDGETS
     against = {
         other: [c.verdict(claim(task, "balance"), claim(task, other), tasks[task]) for task in tasks]
@@ -322,7 +322,7 @@ def _devices() -> Iterator[Sentence]:
 
 
 def _decays() -> Iterator[Sentence]:
-    """The sentences of the page on target networks, whose tables have a command of their own."""
+    """Yield the sentences of the page on target networks, whose tables are written by `benchmarks.target_decay`."""
 
     def run(task: str, variant: str, decay: float) -> Record:
         if decay == 0.98 and task == FETCH:
@@ -362,7 +362,7 @@ def _decays() -> Iterator[Sentence]:
 
 
 def sentences() -> list[Sentence]:
-    """All registered sentences."""
+    """Return all registered sentences."""
     parts = (
         _weightings,
         _logarithm,

@@ -1,6 +1,6 @@
-"""Claims of the thesis beside the findings of the records: docs/claims.md, and in short README.md.
+"""Claims of the thesis compared with the records: docs/claims.md and, abridged, README.md.
 
-Verdicts are computed: ``better`` and ``worse`` where the exact permutation test says so, else ``level``.
+Verdicts are computed: ``better`` and ``worse`` if the exact permutation test is significant, else ``level``.
 """
 
 import dataclasses
@@ -31,10 +31,10 @@ _LAB, _INDICATOR = "lab/ol_aux.md", "lab/indicator.md"
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Two records' mean success up to a budget.
+    """Comparison of two records' mean success up to a budget.
 
     Attributes:
-        place: Task and budget in words.
+        place: Task and budget as text.
         first, second: The records.
         budget: Environment steps; None: all.
     """
@@ -46,12 +46,12 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """``better``, ``worse`` or ``level``, of the first."""
+        """Verdict on the first record: ``better``, ``worse`` or ``level``."""
         return c.verdict(self.first, self.second, self.budget)
 
     @property
     def text(self) -> str:
-        """Interquartile means with intervals, and p."""
+        """Interquartile means with intervals, and the p-value, as text."""
         means = " against ".join(c.interval(record.means(self.budget)) for record in (self.first, self.second))
         p = c.show_p(c.p_value(self.first, self.second, self.budget))
         return f"{self.place}: {means}, p {p}" if p.startswith("<") else f"{self.place}: {means}, p = {p}"
@@ -59,16 +59,16 @@ class Comparison:
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A row of the table.
+    """Row of the table.
 
     Attributes:
         claim: Statement of the thesis.
         answer: One of `HOLDS`, `PARTLY` and `FAILS`.
-        finding: Verdicts and figures of the records.
+        finding: Verdicts and numbers from the records.
         interval: Intervals and p-values.
         source: Link to figure and table.
         records: Runs of the comparisons.
-        main: True if the short form has it.
+        main: True if the README includes the claim.
     """
 
     claim: str
@@ -132,7 +132,7 @@ def _better_than_logarithm() -> Claim:
 
 
 def decayed(task: str, variant: str, decay: float) -> Record:
-    """Return the run with a decay of the target networks; the hand as the authors saw it."""
+    """Return the run with a decay of the target networks; for the hand, with the authors' view."""
     stem = f"{task}-{variant}-paper" if task != HAND else f"{HAND}-view=fingertips-{variant}-paper"
     if decay != 0.98:
         return study("target_decay", f"{stem}-decay{decay:g}", fresh=True)
@@ -142,12 +142,12 @@ def decayed(task: str, variant: str, decay: float) -> Record:
 
 
 def speed_up(task: str, level: float, decay: float) -> str:
-    """Speed-up of OL-AUX-5 over none to a level of success, both with one decay of the target networks."""
+    """Format the speed-up of OL-AUX-5 over none to a success level, both with the same decay of the target networks."""
     return c.speed_up(decayed(task, "ol_aux_5", decay), decayed(task, "none", decay), level)
 
 
 LEVELS = {FETCH: 0.5, HAND: 0.2, FINGER: 0.3}
-"""Task -> success at which speed-ups are stated; the hand as the authors saw it."""
+"""Success level at which speed-ups are stated, by task; for the hand, with the authors' view."""
 
 
 def _speed_ups() -> Claim:
@@ -234,7 +234,7 @@ def _order() -> Claim:
 
 
 def _ends(task: str, variants: Sequence[str], metric: str = SUCCESS) -> str:
-    """Medians at the end, the second record's after ``against``."""
+    """Format final medians; the second record's follows ``against``."""
     records = [indicator.run(task, variant) for variant in variants]
     return f"{SHORT[task]} " + " against ".join(f"{record.median(metric=metric):.3f}" for record in records)
 
@@ -255,7 +255,7 @@ def _balancing() -> Claim:
 
 
 def filtered_share(task: str) -> float:
-    """Share of negatives that the filter drops, mean over training, in the median over seeds."""
+    """Return the fraction of negatives dropped by the filter: mean over training, median over seeds."""
     return float(np.median(indicator.run(task, OURS).means(metric="train/filtered_share")))
 
 
@@ -340,12 +340,12 @@ CLAIMS: tuple[Callable[[], Claim], ...] = (
 
 
 DETAILS = (_balance_and_none, _best_single_task, _ablation, _order, CLAIMS[-2])
-"""Claims that the short form leaves out."""
+"""Claims that the README omits."""
 
 
 @functools.cache
 def claims() -> tuple[Claim, ...]:
-    """All claims, computed."""
+    """Compute all claims."""
     return tuple(dataclasses.replace(make(), main=make not in DETAILS) for make in CLAIMS)
 
 
@@ -370,5 +370,5 @@ def _short() -> str:
 
 
 def tables() -> dict[str, dict[str, str]]:
-    """Page -> marker -> text."""
+    """Return the tables, page -> marker -> text."""
     return {PAGE: {"claims": _table()}, "README.md": {"claims": _short()}}

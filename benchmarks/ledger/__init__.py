@@ -1,9 +1,9 @@
-"""Ledger: the stored records in benchmarks/results, the tables that are written from them, and their age.
+"""Ledger: the stored records in benchmarks/results, the tables written from them, and their staleness.
 
     records          reading of records                      evidence     training runs behind learning figures
     result_rows      rows of docs/lab/results.md             staleness    records that are older than the measured code
     result_tables    tables of docs/lab/results.md           ablations    learning curves of the ablations, one table
-    comparison_table figures of the README beside others'    render_table tables of docs/lab/renderer_speed.md
+    comparison_table comparison with peers in the README     render_table tables of docs/lab/renderer_speed.md
     scaling_table    tables of docs/scaling.md               markers      position of a table in its page
     pixels_table     table of docs/pixels.md                 platforms_table  tables of docs/where_it_ran.md
     pages            every page with tables from records
@@ -12,8 +12,8 @@
     python -m benchmarks.ledger stale      list stale records, rows without a record, and outdated tables (`make stale`)
 
 Neither pyperf nor asv replaces it. pyperf repeats every figure in fresh worker processes, each of which would compile its JAX
-programs again (tens of seconds for a figure of milliseconds), and its metadata know no GPU. asv measures a range of commits in
-environments of their own; here a GPU is available once, and the question is which records the code has left behind, without
-measuring again. Both store seconds, while the tables here show rates, ratios and learning curves. The parts that they could
-replace (`jaxrl_vis.bench.timing` and `conditions`, 250 lines) are no longer than the glue to them.
+programs again (tens of seconds for a figure of milliseconds), and its metadata do not include GPUs. asv measures a range of
+commits in separate environments; here a GPU is available only once, and the question is which records are older than the code,
+without measuring again. Both store seconds, while the tables here show rates, ratios and learning curves. The parts that they
+could replace (`jaxrl_vis.bench.timing` and `conditions`, 250 lines) are no longer than the glue code would be.
 """

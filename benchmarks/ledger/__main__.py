@@ -1,7 +1,7 @@
-"""Tables from records, the age of records, and evidence for learning figures.
+"""Tables from records, staleness of records, and evidence for learning figures.
 
 python -m benchmarks.ledger tables         write the tables of README and docs
-python -m benchmarks.ledger stale          list stale records, rows without a record, and outdated tables; exit 1 for any
+python -m benchmarks.ledger stale          list stale records, rows without a record, and outdated tables; exit 1 if any
 python -m benchmarks.ledger keep RUN NAME  store the evaluations of a run under a name of `result_rows.LEARNING`
 """
 
@@ -20,7 +20,7 @@ def complaints(results: Path, checkout: Path) -> list[str]:
 
     Args:
         results: Folder of records.
-        checkout: Checkout of the records' revisions, with the pages; without git, the age of records is not checked.
+        checkout: Checkout of the records' revisions, with the pages; without git, staleness is not checked.
 
     Raises:
         RequestError: The folder of records is missing, or a file in it cannot be read.
@@ -34,7 +34,7 @@ def complaints(results: Path, checkout: Path) -> list[str]:
 
 
 def main(arguments: list[str] | None = None, checkout: Path = CHECKOUT) -> int:
-    """Run the command line; return the exit status: 0, 1 with complaints, 2 for a wrong request."""
+    """Run the command line; return the exit status: 0, 1 with complaints, 2 for an invalid request."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     actions = parser.add_subparsers(dest="action", required=True)
     commands = {name: actions.add_parser(name) for name in ("tables", "stale", "keep")}

@@ -1,6 +1,6 @@
 """Learning curves of the ablations, in one compressed table: benchmarks/results/ablations.jsonl.gz, one curve per line.
 
-name        name of the curve, unique
+name        unique name of the curve
 task        environment
 preset      preset of the revision
 options     options that the docs state for the curve, with remarks in parentheses; null if they state none
@@ -22,12 +22,12 @@ from benchmarks.ledger.result_tables import short
 
 FILE = "ablations.jsonl.gz"
 UNKNOWN = "unknown"
-_PREFIX = "docs/"  # of pages, as seen from the repository's root
+_PREFIX = "docs/"  # folder of pages, relative to the repository's root
 
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """A learning curve and its origin; see the module's docstring for the fields."""
+    """Learning curve and its origin; see the module's docstring for the fields."""
 
     name: str
     task: str
@@ -46,7 +46,7 @@ class Curve:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Rows as in metrics.jsonl, one per seed and evaluation."""
+        """Return rows as in metrics.jsonl, one per seed and evaluation."""
         return [dict(zip(self.metrics, values, strict=True)) for values in zip(*self.metrics.values(), strict=True)]
 
     @property

@@ -1,4 +1,4 @@
-"""Five figures of the README beside what one would use instead, written from the records."""
+"""README table of five figures compared with alternative software, written from the records."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -13,20 +13,20 @@ from benchmarks.ledger.result_tables import MISSING, find, short
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.studies.figures.authors import released_curves
 
-_LEARNT = 0.9  # success whose environment steps are compared
+_LEARNT = 0.9  # success rate at which environment steps are compared
 
 
 @dataclasses.dataclass(frozen=True)
 class Rate:
-    """A row: our rate and a peer's in one call.
+    """Row of the table: our rate and a peer's, measured in one call.
 
     Attributes:
         label: Text of the first column.
         ours: Name of our record.
-        peer: Name of the peer's record. Of several variants, the one that is hardest for us counts.
-        config: Entries that the configurations of both must have.
+        peer: Name of the peer's record; among several variants, the one least favourable to us counts.
+        config: Required entries of both configurations.
         device: Column of the speed table.
-        unit: Unit of the rate, without the second.
+        unit: Unit of the rate, without "per second".
         other: Name of the peer.
     """
 
@@ -69,7 +69,7 @@ def _rate_cells(row: Rate, records: list[dict[str, Any]]) -> tuple[str, str, str
     theirs = find(Figure(row.peer, row.config, "", least="ours_over_peer"), device, records)
     if theirs is None:
         return None
-    same = {name: value for name, value in theirs["config"].items() if name != "images"}  # batches may differ
+    same = {name: value for name, value in theirs["config"].items() if name != "images"}  # batch sizes may differ
     ours = find(Figure(row.ours, same, ""), device, records)
     if ours is None:
         return None
@@ -78,7 +78,7 @@ def _rate_cells(row: Rate, records: list[dict[str, Any]]) -> tuple[str, str, str
 
 
 def _learning_cells(results: Path) -> tuple[str, str, str] | None:
-    """Format environment steps to a success: ours, those of the authors' release and their ratio; None without records."""
+    """Format environment steps to a success rate: ours, the authors' release's, and their ratio; None without records."""
     run = evidence.load("fetch_reach_oracle", results)
     if run is None:
         return None

@@ -1,4 +1,4 @@
-"""Evidence of learning figures: the evaluations of training runs, kept small.
+"""Evidence for learning figures: the evaluations of training runs, in a compact form.
 
     benchmarks/results/learning/NAME.json             schema, name, configuration, command, device, versions, revision, date
     benchmarks/results/learning/NAME.metrics.jsonl    the run's metrics.jsonl, reduced to evaluations and times
@@ -28,7 +28,7 @@ _PREFIXES = ("eval/", "time/", "resume/")
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """A stored run.
+    """Stored run.
 
     Attributes:
         record: Contents of NAME.json.
@@ -82,7 +82,7 @@ def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
 
 
 def load(name: str, results: Path) -> Evidence | None:
-    """Load the evidence of a name; return None if there is none.
+    """Load evidence by its name; return None if there is none.
 
     Raises:
         RequestError: A file is damaged.
@@ -99,6 +99,6 @@ def load(name: str, results: Path) -> Evidence | None:
 
 
 def seconds(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Seconds of a run until its last evaluation, and the part of them spent on compilation."""
+    """Return the duration of a run until its last evaluation, and the part of it spent on compilation, s."""
     last = max(rows, key=lambda row: row["time/wall_s"])
     return last["time/wall_s"], last["time/compile_s"]

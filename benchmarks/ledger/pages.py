@@ -1,4 +1,4 @@
-"""Pages with tables that are written from records: one writer per table and its markers."""
+"""Pages with tables written from records: one writer per table and its markers."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,7 +22,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 
 Writer = Callable[[Path], str | None]
-"""Function from the folder of records to a table in Markdown; None leaves the page's table as it is."""
+"""Function from the folder of records to a table in Markdown, or to None to leave the page's table unchanged."""
 
 
 def renderer_parity(results: Path) -> str:
@@ -33,7 +33,7 @@ def renderer_parity(results: Path) -> str:
 
 
 def soak(results: Path) -> str | None:
-    """Write the table of docs/reliability.md from the pieces of a soak in ``soak``; None without pieces."""
+    """Write the table of docs/reliability.md from the records in ``soak``, added up; None without records."""
     from benchmarks.soak.record import Record, added
 
     pieces = sorted((results / "soak").glob("*.json"))
@@ -59,11 +59,11 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},
 }
-"""Writers of a page's tables by the name in their markers; those of the learning studies: `benchmarks.claims.pages`."""
+"""Writers of each page's tables by the name in their markers, except the learning studies' (`benchmarks.claims.pages`)."""
 
 
 def writers(results: Path) -> dict[str, dict[str, Writer]]:
-    """Return the writers of `PAGES`, and those of the learning studies where ``results`` is this checkout's."""
+    """Return the writers of `PAGES`, and those of the learning studies if ``results`` is this checkout's."""
     merged = {page: dict(of_page) for page, of_page in PAGES.items()}
     for page, texts in claims.tables().items() if results.resolve() == RESULTS else ():
         merged.setdefault(page, {}).update({name: lambda _, text=text: text for name, text in texts.items()})
@@ -84,10 +84,10 @@ def filled(text: str, of_page: dict[str, Writer], results: Path = RESULTS) -> st
 
 
 def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[tuple[Path, bool]]:
-    """Write the tables of every page; yield the page, and True if that changed it.
+    """Write the tables of every page; yield the page, and True if it changed.
 
     Raises:
-        RequestError: See `filled`; or a page is missing.
+        RequestError: As in `filled`; or a page is missing.
     """
     for name, of_page in writers(results).items():
         page = checkout / name

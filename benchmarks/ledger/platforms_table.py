@@ -18,7 +18,7 @@ EXPECTED = (
     ("TPU", "Training, MJX, and images by the plain renderer; the kernels for NVIDIA GPUs are left aside by themselves."),
     ("AMD GPU (ROCm)", "As on a TPU, with AMD's jaxlib; the kernels are for NVIDIA GPUs alone."),
 )
-"""Platforms that nothing was run on, and what is expected."""
+"""Untested platforms, and what is expected to work."""
 
 
 def platforms_table(results: Path) -> str | None:
@@ -32,7 +32,7 @@ def platforms_table(results: Path) -> str | None:
 
 
 def not_run_table(_: Path) -> str:
-    """Write the platforms that nothing was run on, as Markdown."""
+    """Write the untested platforms, as Markdown."""
     return "\n".join(["| not run | expected |", "|---|---|", *(f"| {name} | {text} |" for name, text in EXPECTED)])
 
 
@@ -55,7 +55,7 @@ def _row(record: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _benchmarked(results: Path) -> list[tuple[str, ...]]:
-    """Return a row for each device, Python and JAX that benchmarks have run on, with the date of the newest."""
+    """Return a row for each device, Python and JAX that benchmarks were run on, with the newest date."""
     found: dict[tuple[str, str, str], tuple[str, set[str]]] = {}
     for path, record in read_all(results):
         name = record["name"].partition("/")[0]

@@ -9,7 +9,7 @@ from jaxrl_vis.errors import RequestError
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
-"""Folder of the records that README and docs quote; its git history has the older ones."""
+"""Folder of the records that README and docs quote; its git history has older ones."""
 
 
 def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
@@ -23,7 +23,7 @@ def read_all(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     for path in sorted(folder.rglob("*.json")):
         contents = read_json(path)
         for record in contents if isinstance(contents, list) else [contents]:
-            # The configuration of a run has a schema as well, but neither name nor value.
+            # The configuration of a run also has a schema, but neither name nor value.
             if isinstance(record, dict) and record.get("schema") == SCHEMA and "name" in record:
                 yield path, record
 

@@ -1,4 +1,4 @@
-"""Tables of docs/lab/renderer_speed.md, written from the records of other renderers beside ours on the same poses."""
+"""Tables of docs/lab/renderer_speed.md, written from the records of our and other renderers on the same poses."""
 
 from pathlib import Path
 from typing import Any
@@ -9,12 +9,12 @@ from jaxrl_vis.bench.record import load
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"
 _OURS = "render/scene"
 _ORDER = ("finger", "fetch_reach", "primitives")
-_TEXTURED = ("finger", "primitives")  # fetch_reach has no texture to leave out
+_TEXTURED = ("finger", "primitives")  # fetch_reach has no textures to omit
 _OUTPUTS = {"rgbd": "RGB-D", "depth": "depth"}
 
 
 def _label(config: dict[str, Any]) -> str:
-    """Describe scene, poses and the parts left out."""
+    """Describe scene, poses and omitted features."""
     names = ("textures", "highlights") if config["scene"] in _TEXTURED else ()
     without = " and ".join(name for name in names if not config[name])
     poses = f"{config['poses']} poses" if config["scene"] == "primitives" else ""
@@ -27,7 +27,7 @@ def _rank(record: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _rows(file: Path, peer: str) -> list[tuple[dict[str, Any], dict[str, Any] | None]]:
-    """Our records with the peer's on the same poses, or None for an output that the peer does not have."""
+    """Pair our records with the peer's on the same poses; None for an output that the peer lacks."""
     records = load(file)
     peers = {str({**record["config"], "images": 0}): record for record in records if record["name"] == peer}
     ours = [record for record in records if record["name"] == _OURS and record["config"]["pixels"] in _OUTPUTS]
@@ -49,10 +49,10 @@ def _table(file: Path, peer: str, title: str, with_depth: bool) -> str:
 
 
 def warp_table(results: Path) -> str:
-    """Write the table of MuJoCo Warp's renderer beside ours, as Markdown; images per second."""
+    """Write the comparison of MuJoCo Warp's renderer with ours, in images per second, as Markdown."""
     return _table(results / _WARP_RECORDS, "render/peer_warp", "MuJoCo Warp 4.0.0", with_depth=False)
 
 
 def mujoco_table(results: Path) -> str:
-    """Write the table of MuJoCo's own renderer beside ours, as Markdown; images per second."""
+    """Write the comparison of MuJoCo's own renderer with ours, in images per second, as Markdown."""
     return _table(results / _MUJOCO_RECORDS, "render/peer_mujoco", "`mujoco.Renderer`", with_depth=True)

@@ -1,4 +1,4 @@
-"""Rows of the tables of docs/lab/results.md: the records that they show and their wording. `result_tables` writes them."""
+"""Rows of the tables of docs/lab/results.md: records and wording. `result_tables` writes them."""
 
 import dataclasses
 from typing import Any
@@ -6,20 +6,20 @@ from typing import Any
 from jaxrl_vis.config import Config, preset
 
 DEVICES = {"H100": "NVIDIA H100 80GB HBM3 x1", "H200": "NVIDIA H200 x1", "2 CPU cores": "AMD EPYC, 2 cores"}
-"""Columns of the speed table, and the devices of their records."""
+"""Columns of the speed table: title -> device of the records."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """A figure of the speed table: one record, in words.
+    """Figure of the speed table: selection and wording of one record.
 
-    Among several matching records, the one with the largest value counts: the batch size that suits the device.
+    Among several matching records, such as batch sizes, the one with the largest value counts.
 
     Attributes:
         name: Name of the record.
-        config: Entries that the record's configuration must have; other entries are free.
-        text: Format string of the record's configuration and details, and of ``value``, which is shortened.
-        least: Detail whose minimum selects the record instead: the record that is hardest for us.
+        config: Required entries of the record's configuration.
+        text: Format string for the record's configuration and details, and for ``value``, which is shortened.
+        least: Detail whose minimum selects the record instead, the one least favourable to us.
     """
 
     name: str
@@ -30,11 +30,11 @@ class Figure:
 
 @dataclasses.dataclass(frozen=True)
 class Speed:
-    """A row of the speed table.
+    """Row of the speed table.
 
     Attributes:
         label: Text of the first column.
-        figures: Figures by column (a name in `DEVICES`). The cells of other columns are empty.
+        figures: Figures by column (a name in `DEVICES`); other cells are empty.
     """
 
     label: str
@@ -43,15 +43,15 @@ class Speed:
 
 @dataclasses.dataclass(frozen=True)
 class Learning:
-    """A row of the results table: runs with stored evidence.
+    """Row of the results table: runs with stored evidence.
 
     Attributes:
         label: Text of the first column.
-        runs: Required configuration by name of the evidence. All seeds count together.
-        metric: Quoted column of the metrics.
+        runs: Required configuration by name of the evidence; all seeds are pooled.
+        metric: Column of the metrics.
         word: Name of the metric in the table, as a format string: ``success {}``.
-        targets: Values whose first steps are quoted ("X by N steps").
-        steps: Environment steps whose values are quoted.
+        targets: Values for which the first steps that reach them are quoted ("X by N steps").
+        steps: Environment steps at which values are quoted.
         least: True if lower is better.
         command: Command, if it differs from the training command of the configuration.
     """

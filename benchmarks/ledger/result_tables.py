@@ -1,6 +1,6 @@
-"""Tables of docs/lab/results.md, written from the records: the rows are declared in `result_rows`, the figures are not.
+"""Tables of docs/lab/results.md: rows from `result_rows`, figures from the records.
 
-A figure without a record reads `MISSING`, and `make stale` lists it.
+A figure without a record is written as `MISSING`, and `make stale` lists it.
 """
 
 import statistics
@@ -49,7 +49,7 @@ def find(figure: Figure, device: str, records: list[dict[str, Any]]) -> dict[str
 
 
 def _words(record: dict[str, Any]) -> dict[str, Any]:
-    """Fields for the format string of a figure."""
+    """Return the fields for the format string of a figure."""
     config = record["config"]
     words = {**record["details"], **config, "value": short(record["value"])}
     if "mbyte" in words.get("roofline", {}):
@@ -78,7 +78,7 @@ def speed_table(results: Path) -> str:
     return "\n".join(lines)
 
 
-# Fields without an effect on learning: files on the disk, and the method of the same gradients.
+# Fields without an effect on learning: files on the disk, and the method of computing the same gradients.
 _NEUTRAL = ("checkpoint_interval", "full_checkpoint_interval")
 _LOGARITHMIC = ("actor_log",)
 
@@ -108,7 +108,7 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
 
 
 def learning_text(row: Learning, runs: list[Evidence]) -> str:
-    """Describe the learning of the runs of a row."""
+    """Format the learning results of the runs of a row."""
     rows = [line for run in runs for line in run.rows]
     points = curve(rows, row.metric)
     parts = []
@@ -131,7 +131,7 @@ def learning_text(row: Learning, runs: list[Evidence]) -> str:
 
 
 def minutes(seconds: float) -> str:
-    """Format seconds: 43 s, or 1 min 37 s."""
+    """Format a duration in seconds: 43 s, or 1 min 37 s."""
     whole = round(seconds)
     return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"
 

@@ -12,9 +12,9 @@ KINDS = {
     ("strong", 2048): "one learner, strong scaling",
     ("strong", 512): "",
 }
-"""Label of the first row by kind and, for each device at weak scaling, the batch."""
+"""Label of the first row by kind and batch size (per device for weak scaling)."""
 _RECORD = "scaling-nvidia-h200-x4.json"
-_GOOD = 0.95  # efficiency from which a speed-up is set in bold
+_GOOD = 0.95  # minimum efficiency of a speed-up set in bold
 
 
 def _kind(record: dict[str, Any]) -> tuple[str, int]:
@@ -23,7 +23,7 @@ def _kind(record: dict[str, Any]) -> tuple[str, int]:
 
 
 def devices_table(results: Path) -> str:
-    """Write the table of N devices beside one, as Markdown. Times are milliseconds of an iteration."""
+    """Write the comparison of N devices with one, as Markdown; times are milliseconds per iteration."""
     records = [record for record in load(results / _RECORD) if record["details"].get("one_device_ms")]
     lines = [
         "| | devices | batch | environments | one device | all | speed-up | efficiency |",
@@ -49,7 +49,7 @@ def devices_table(results: Path) -> str:
 
 
 def processes_table(results: Path) -> str:
-    """Write the table of two processes beside one, as Markdown. Times are milliseconds of an iteration."""
+    """Write the comparison of two processes with one, as Markdown; times are milliseconds per iteration."""
     lines = ["| two processes of two devices each | one process of four | two processes | efficiency |", "|---|---|---|---|"]
     for record in load(results / _RECORD):
         kind, details = record["name"].removeprefix("scaling/processes_"), record["details"]

@@ -1,9 +1,9 @@
-"""Stale records: those that are older than the code they measured.
+"""Stale records: those older than the code that they measured.
 
 Every benchmark lists the files that it measures. A record is stale if one of them has a definition (a function, a class or
 another top-level statement; the whole contents of a file that is not Python) that did not exist anywhere at the record's
-revision. Moved and renamed files, comments, docstrings, annotations, imports and texts of errors therefore do not count. A
-renamed variable does: only a new measurement can tell that it changed no figure.
+revision. Moved and renamed files, comments, docstrings, annotations, imports and error messages therefore do not count. A
+renamed variable does: only a new measurement can show that it changed no figure.
 """
 
 import ast
@@ -55,11 +55,11 @@ MEASURED: dict[str, tuple[str, ...]] = {
     "adapters/success": (*_PHYSICS, *_TASK, f"{_ENVS}/adapters", f"{_PEERS}/agents.py"),
     "learning": (*_PHYSICS, *_IMAGES, *_TASK, *_LEARNER),
 }
-"""Files and folders by name of the record that measures them; ``{task}`` stands for the file of the record's environment."""
+"""Measured files and folders by name of the record; ``{task}`` stands for the file of the record's environment."""
 
-# MuJoCo's own renderer, which only tests and videos use.
+# MuJoCo's own renderer, used only by tests and videos.
 _NEVER = (f"{_ENVS}/render/reference.py",)
-# Prefixes of the code of the other kind of device.
+# Prefixes of code for the other kind of device.
 _ON_CPU = (f"{_ENVS}/render/cpu",)
 _ON_GPU = (f"{_ENVS}/render/gpu", "jaxrl_vis/learner/networks/kernels")
 # Folders of the definitions at a revision.
@@ -69,14 +69,14 @@ _SHOWN = 4  # number of changed files in a message
 
 @dataclasses.dataclass(frozen=True)
 class Stale:
-    """Records of one file, name and revision that are older than their code.
+    """Stale records of one file, name and revision.
 
     Attributes:
         file: File of records.
         name: Name of the records.
         revision: Revision of the records.
         count: Number of records.
-        reason: Changes since then, in words.
+        reason: Changes since then, as text.
     """
 
     file: str
@@ -91,7 +91,7 @@ class Stale:
 
 
 def stale_records(folder: Path, checkout: Path = CHECKOUT) -> list[Stale]:
-    """Find the records in ``folder`` whose measured code has changed since, grouped.
+    """Find the stale records in ``folder``, grouped by file, name and revision.
 
     Args:
         folder: Folder of records, see `records.read_all`.
@@ -112,7 +112,7 @@ def staleness_reason(name: str, env: str | None, on_cpu: bool, revision: str, ch
 
     Args:
         name: Name of the record.
-        env: Environment of the record, if it has one.
+        env: Environment of the record; None if it has none.
         on_cpu: True if a CPU was measured.
         revision: Revision of the record.
         checkout: Git checkout of the revision.
@@ -136,7 +136,7 @@ def staleness_reason(name: str, env: str | None, on_cpu: bool, revision: str, ch
 
 
 def measured_files(name: str, env: str | None, on_cpu: bool, checkout: Path) -> Iterator[Path]:
-    """Yield the files of `MEASURED` that the device of a record runs.
+    """Yield the files of `MEASURED` that are used on the device of a record.
 
     Raises:
         FileNotFoundError: A listed file does not exist.
@@ -158,7 +158,7 @@ def measured_files(name: str, env: str | None, on_cpu: bool, checkout: Path) -> 
 
 
 def task_module(env: str) -> str | None:
-    """Name of the module in `tasks` of an environment, such as fetch_reach for ``VisualFetchReach``; None if not built in."""
+    """Return the module in `tasks` of an environment, such as fetch_reach for ``VisualFetchReach``; None if not built in."""
     from jaxrl_vis_envs import registry
 
     if not registry.is_built_in(env):
@@ -168,7 +168,7 @@ def task_module(env: str) -> str | None:
 
 @functools.cache
 def definitions_at(revision: str, checkout: Path) -> frozenset[str] | None:
-    """Digests of all definitions at a revision; None if the repository does not have it."""
+    """Return the digests of all definitions at a revision; None if the repository does not have it."""
     listing = provenance.git("ls-tree", "-r", revision, "--", *_SOURCES, folder=checkout)
     if listing is None:
         return None
@@ -196,7 +196,7 @@ def _read_blobs(blobs: Iterable[str], checkout: Path) -> Iterator[tuple[str, byt
 
 @functools.cache  # revisions share most of their files
 def definitions(suffix: str, contents: bytes) -> tuple[tuple[str, str], ...]:
-    """Digest and name ("" for none) of every top-level statement of a Python file, or of another file as a whole."""
+    """Return digest and name ("" for none) of every top-level statement of a Python file, or of any other file as a whole."""
     if suffix != ".py":
         return ((hashlib.sha256(contents).hexdigest(), ""),)
     statements = []
@@ -221,7 +221,7 @@ def _is_text(statement: ast.AST) -> bool:
 
 
 class _Plain(ast.NodeTransformer):
-    """Remover of everything without effect on a figure: docstrings, imports, annotations of functions, texts of errors."""
+    """Remover of code without effect on a figure: docstrings, imports, function annotations, error messages."""
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         super().generic_visit(node)

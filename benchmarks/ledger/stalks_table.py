@@ -1,4 +1,4 @@
-"""Tables of docs/phenotyping.md: lenses, by `benchmarks.stalks.lenses`, and intervals of widths, by `phenotype eval --json`."""
+"""Tables of docs/phenotyping.md: lenses (`benchmarks.stalks.lenses`), and intervals of widths (`phenotype eval --json`)."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ def lens_table(results: Path = RESULTS) -> str | None:
 
 
 def lens_rows(lenses: dict[str, Any]) -> str:
-    """Write a table of lenses from their figures by factor of the focal length; see `benchmarks.stalks.lenses.look`."""
+    """Format a table of lenses from results by focal length factor; see `benchmarks.stalks.lenses.look`."""
     usual = lenses.get("1", {"errors_mm": {}})["errors_mm"]
     lines = [
         "| focal length | pixels per m | view, m | counted | found | false finds | ground seen | widths | error, mm "
@@ -48,7 +48,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
 
 
 def coverage_table(results: Path = RESULTS) -> str | None:
-    """Write the table of intervals of 95 % from the records of `phenotype eval` of each family; None without both."""
+    """Write the table of 95 % intervals from the records of `phenotype eval` for each family; None without both."""
     lines = [
         "| family | seeds | widths | within the interval | mean absolute error, mm | mean standard error, mm |",
         "|---|---|---|---|---|---|",

@@ -1,5 +1,5 @@
-"""Tables of docs/weighting.md: our weightings beside TorchJD's, from the records of `benchmarks.peers.torchjd`, and all of them
-on supervised data, from that of `benchmarks.weighted_digits`."""
+"""Tables of docs/weighting.md: our weightings compared with TorchJD's, from the records of `benchmarks.peers.torchjd`, and all
+of ours on supervised data, from the record of `benchmarks.weighted_digits`."""
 
 import json
 import math
@@ -29,7 +29,7 @@ def torchjd_table(results: Path) -> str | None:
 
 
 def cost_table(results: Path) -> str | None:
-    """Write the time of a step of both libraries, and of the weighting alone, as Markdown; None without a record of a GPU."""
+    """Write the time of a step and of the weighting alone for both libraries, as Markdown; None without a GPU record."""
     paths = sorted(results.glob("weighting_cost-nvidia-*.json"))
     if not paths:
         return None
@@ -64,10 +64,10 @@ def _pair(seconds: float, peer: float | None) -> str:
 
 
 def digits_table(results: Path) -> str | None:
-    """Write the test accuracies of all weightings on supervised data, and what they gain over the sum, as Markdown.
+    """Write the test accuracies of all weightings on supervised data, and their differences from the sum, as Markdown.
 
-    A gain is told as such where the exact paired permutation test over seeds says so at 5 % after Holm's correction for the
-    number of methods in the column. None without a record.
+    Differences that are significant at 5 % by the exact paired permutation test over seeds, with Holm's correction for the
+    number of methods in the column, are bold. None without a record.
     """
     path = results / "weighted_digits.json"
     if not path.exists():
@@ -104,7 +104,7 @@ def _of_problem(rows: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def _p_value(differences: np.ndarray) -> float:
-    """Return the p-value of a mean of differences [S] by all changes of their signs."""
+    """Return the p-value of the mean of differences [S] under all sign flips."""
     signs = 1 - 2 * (np.arange(2 ** len(differences))[:, None] >> np.arange(len(differences)) & 1)
     means = np.abs(signs @ differences)
     return float(np.mean(means >= np.abs(differences.sum()) - 1e-9))

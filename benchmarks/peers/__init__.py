@@ -2,10 +2,10 @@
 
     python -m benchmarks.peers.mujoco       MuJoCo's own renderer (OpenGL) on the poses of `bench render --scene`
     python -m benchmarks.peers.warp         MuJoCo Warp's renderer on the same poses
-    python -m benchmarks.peers.playground   FingerTurn of MuJoCo Playground beside ours
+    python -m benchmarks.peers.playground   FingerTurn of MuJoCo Playground compared with ours
     python -m benchmarks.peers.torch        the same gradient steps in PyTorch
-    python -m benchmarks.peers.torchjd      weightings of losses beside TorchJD's: equality and cost
+    python -m benchmarks.peers.torchjd      loss weightings compared with TorchJD's: equality and cost
     python -m benchmarks.peers.agents       agents of Stable-Baselines3 and brax on our tasks, through the adapters
 
-Each of the first four checks that the peer computes the same as ours, and stores both records as `jaxrl-vis bench` does.
+Each of the first four checks that the peer computes the same as ours, and stores both records like `jaxrl-vis bench`.
 """

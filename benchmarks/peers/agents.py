@@ -3,8 +3,8 @@
     python -m benchmarks.peers.agents sb3 [--env FetchReach] [--steps 20000]     Stable-Baselines3: DDPG with HER, sparse reward
     python -m benchmarks.peers.agents brax [--env FetchReach] [--steps 180000]   brax: PPO, dense reward
 
-The first needs ``pip install '.[gymnasium]' stable-baselines3``. Success is the share of 256 episodes within the threshold at
-their last step, without exploration. Exit status: 0 the agent learned; 1 it did not.
+The first needs ``pip install '.[gymnasium]' stable-baselines3``. Success is the fraction of 256 episodes within the threshold
+at their last step, without exploration. Exit status: 0 if success rose; 1 if not.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 # brax compiles without the options of `compilation.jit`. JAX reads this variable at its first import: a script may set it,
-# a library may not. JAX 0.11 does not know the option, and would end the process.
+# a library may not. JAX 0.11 does not support the option, and would end the process.
 if version("jaxlib").startswith("0.10.") and "fusion_emitters" not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
 
@@ -117,7 +117,7 @@ def train_brax(env: str, steps: int, seed: int) -> Measurement:
         "num_updates_per_batch": 8,
         "num_resets_per_eval": 3,
         "learning_rate": 5e-4,
-        "max_grad_norm": 0.5,  # without it, success went from 1.0 back to .23 after 250,000 steps
+        "max_grad_norm": 0.5,  # without it, success fell from 1.0 to .23 after 250,000 steps
         "discounting": 0.95,
         "reward_scaling": 10.0,
         "entropy_cost": 1e-3,
@@ -160,7 +160,7 @@ TRAINERS = {"brax": (train_brax, "FetchReach", 180_000), "sb3": (train_sb3, "Fet
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Train an agent, print and store the record; return 1 if success did not rise."""
+    """Train an agent, print and store the record; return 1 if success did not rise, else 0."""
     parser = argparse.ArgumentParser(description="Trains other libraries' agents through the adapters.")
     parser.add_argument("agent", choices=sorted(TRAINERS))
     parser.add_argument("--env", help="a state environment; default: one that the agent is known to learn")

@@ -1,4 +1,4 @@
-"""Command line of a peer: the options that it reads, checked as `jaxrl-vis bench` checks its own."""
+"""Command line of a peer: its options, with the checks of `jaxrl-vis bench`."""
 
 import argparse
 import sys
@@ -42,7 +42,7 @@ def run(
         arguments: Command line; None for that of the process.
 
     Returns:
-        Exit status: 0, or 2 for a wrong request, which is reported in one line.
+        Exit status: 0, or 2 for an invalid request, which is reported in one line.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in options:

@@ -1,4 +1,4 @@
-"""Agreement of another renderer's images with ours: a comparison of speed is meaningless if the images differ."""
+"""Agreement of a peer renderer's images with ours: a comparison of speed is meaningless if the images differ."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -19,9 +19,9 @@ from jaxrl_vis_envs.render import Scene, render_planes
 
 CPU_SCENES = ("finger", "fetch_reach")
 COMPARED = 32
-"""Number of compared images of a batch."""
+"""Number of compared images per batch."""
 
-# Renderers that draw the same scene differ by rounding and on silhouettes. On a CPU, in all scenes and
+# Renderings of the same scene differ by rounding and on silhouettes. On a CPU, in all scenes and
 # sizes, depths agree in at least 99.92 % of the pixels (mujoco.Renderer) and 99.99 % (Warp), and colours without a texture
 # differ by at most 1.0 (mujoco.Renderer) and 0.6 grey levels (Warp).
 MIN_DEPTH_AGREEMENT = 0.995
@@ -30,13 +30,13 @@ MAX_DIFFERENCE = 1.5  # grey levels of 255, the mean over pixels and channels
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Input of a peer, and our images of it. K is at most `COMPARED`.
+    """Input of a peer, and our images for comparison. K is at most `COMPARED`.
 
     Attributes:
         config: Entries of the record.
-        mj_model: Model, seen by its first camera.
+        mj_model: Model, rendered by its first camera.
         scene: Our scene of the model.
-        batches: Poses, see `models.random_poses`; the first ``config["images"]`` of each are drawn.
+        batches: Poses, see `models.random_poses`; the first ``config["images"]`` of each are rendered.
         repeats: Maximum number of timed repeats.
         rate: Our images per second.
         colours: Our images of the first poses of the first batch, [K, H, W, 3] uint8.
@@ -57,20 +57,20 @@ class Comparison:
     def agreement(
         self, colours: np.ndarray, depth: np.ndarray, max_textured_difference: float = MAX_DIFFERENCE
     ) -> dict[str, float]:
-        """Compare a peer's images with ours. Images that only one of the two has are left out.
+        """Compare a peer's images with ours. Surplus images of either are ignored.
 
         Args:
             colours: Images of the peer, [K, H, W, 3] uint8.
             depth: Depth in metres, inf for the sky, [K, H, W] float32.
-            max_textured_difference: Bound of the mean difference over pixels that show a texture, in grey levels of 255.
+            max_textured_difference: Bound on the mean difference over textured pixels, grey levels of 255.
 
         Returns:
             Entries of the record: ``depth_agreement`` (see `depth_agreement`), ``colour_difference`` and
             ``textured_difference``: the mean absolute difference over channels and over pixels without and with a texture, in
-            grey levels of 255. A difference over no pixels is left out.
+            grey levels of 255. A difference over no pixels is omitted.
 
         Raises:
-            AssertionError: The peer draws something else.
+            AssertionError: The peer's images differ from ours.
         """
         count = min(len(depth), len(self.depth))
         differences = np.abs(self.colours[:count].astype(np.float32) - colours[:count].astype(np.float32)).mean(-1)
@@ -93,7 +93,7 @@ class Comparison:
 
 
 def compare(case: images.Case, repeats: int, rate: float) -> Comparison:
-    """Draw our images for a `Comparison`.
+    """Render our images for a `Comparison`.
 
     Args:
         case: Scene, poses and sizes.
@@ -110,7 +110,7 @@ def compare(case: images.Case, repeats: int, rate: float) -> Comparison:
 
     compared = {name: jnp.asarray(rows[:COMPARED]) for name, rows in case.batches[0].items()}
     colours, depth, segmentation = (np.asarray(plane) for plane in jaxrl_vis_envs.jit(jax.vmap(draw))(compared))
-    textured = np.append(textured_geoms(mj_model), scene.sky == "texture")  # the sky is -1, the last
+    textured = np.append(textured_geoms(mj_model), scene.sky == "texture")  # index -1, the last, is the sky
     return Comparison(
         config=config,
         mj_model=mj_model,
@@ -131,12 +131,12 @@ def measure_beside_ours(
 
     Args:
         check: Raises RequestError if the peer is missing.
-        measure_peer: Measurement of the peer; raises AssertionError if its images differ from ours.
+        measure_peer: Measures the peer; raises AssertionError if its images differ from ours.
         min_poses: Minimum number of poses that the peer needs.
     """
 
     def measure(settings: Settings) -> Iterator[Measurement]:
-        check()  # first: the peer is the part that may be missing
+        check()  # first, because the peer may be missing
         scenes = models.SCENES if settings.on_accelerator else CPU_SCENES
         for scene in (settings.scene,) if settings.scene else scenes:
             for case in images.cases(scene, settings, image_sizes(settings), min_poses):
@@ -152,7 +152,7 @@ def measure_beside_ours(
 
 
 def textured_geoms(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Mask of the geoms with a texture, [ngeom] bool."""
+    """Return the mask of geoms with a texture, [ngeom] bool."""
     if not mj_model.nmat:
         return np.zeros(mj_model.ngeom, bool)
     textures = mj_model.mat_texid[mj_model.geom_matid, mujoco.mjtTextureRole.mjTEXROLE_RGB]
@@ -160,9 +160,9 @@ def textured_geoms(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def depth_agreement(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Share of pixels in which two depths [N, H, W] in metres, inf for the sky, agree within 1 cm or 1 %.
+    """Return the fraction of pixels in which two depths [N, H, W] (m, inf for the sky) agree within 1 cm or 1 %.
 
-    Silhouettes count: two renderers of the same scene agree on most pixels, not on all.
+    Silhouettes are included, so that renderers of the same scene agree on most pixels, but not on all.
     """
     sky = np.isinf(ours) & np.isinf(theirs)
     with np.errstate(invalid="ignore"):

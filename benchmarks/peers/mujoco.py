@@ -1,4 +1,4 @@
-"""MuJoCo's own renderer on the poses of our scenes, in the same call as ours. Needs OpenGL.
+"""Speed of MuJoCo's own renderer on the poses of our scenes, in the same call as ours. Needs OpenGL.
 
 MUJOCO_GL=egl python -m benchmarks.peers.mujoco [--scene fetch_reach] [--image-size 64]
 """
@@ -19,11 +19,11 @@ from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.errors import RequestError
 
 POSES = 64
-"""Number of images drawn, one at a time."""
+"""Number of images rendered, one at a time."""
 
 
 def check() -> None:
-    """Draw one empty image.
+    """Render one empty image.
 
     Raises:
         RequestError: OpenGL is missing.
@@ -32,7 +32,7 @@ def check() -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the error below names what is missing
             mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), height=8, width=8).close()
-    except Exception as error:  # every OpenGL binding fails in its own way
+    except Exception as error:  # each OpenGL binding raises its own exceptions
         raise RequestError(
             "the peer mujoco needs OpenGL: install EGL or OSMesa (Debian: libegl1 or libosmesa6) and set MUJOCO_GL=egl or "
             f"MUJOCO_GL=osmesa ({type(error).__name__}: {' '.join(str(error).split())[:120]})"
@@ -88,7 +88,7 @@ def measure(comparison: Comparison) -> Measurement:
 
 
 def _set_poses(mj_data: mujoco.MjData, poses: dict[str, np.ndarray], index: int) -> None:
-    """Copy one row of `models.random_poses` into MjData, so that it can be drawn."""
+    """Copy one row of `models.random_poses` into ``mj_data`` for rendering."""
     for name in models.POSES:
         getattr(mj_data, name)[:] = poses[name][index]
 

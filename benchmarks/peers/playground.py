@@ -1,4 +1,4 @@
-"""FingerTurn of MuJoCo Playground beside ours, in the same call: states only, random actions, equal simulated time per action.
+"""FingerTurn of MuJoCo Playground compared with ours: states only, random actions, equal simulated time per action.
 
     python -m benchmarks.peers.playground [--envs 4096]
 
@@ -22,7 +22,7 @@ from jaxrl_vis.bench.timing import measure as measure_time
 from jaxrl_vis.bench.variation import assert_varied
 from jaxrl_vis.errors import RequestError
 
-_TIMESTEPS = (0.005, 0.01)  # s; its own, and ours
+_TIMESTEPS = (0.005, 0.01)  # Playground's, and ours, s
 
 
 def load() -> Any:

@@ -1,10 +1,10 @@
-"""MuJoCo Warp's renderer on the poses of our scenes, in the same call as ours. Needs an NVIDIA GPU and mujoco-warp 4.0.0.
+"""Speed of MuJoCo Warp's renderer on the poses of our scenes, in the same call as ours. Needs an NVIDIA GPU, mujoco-warp 4.0.0.
 
     python -m benchmarks.peers.warp [--scene primitives] [--envs 8192] [--image-size 64]
 
-The timed work is that of a simulation of many environments: refit the bounding volumes, then draw, captured in one CUDA graph.
-Poses are input in world coordinates, so its own kinematics never run. Two graphs read two sets of poses, so that every launch
-draws new images and nothing is copied in between. It gets the options that the scene needs and no others.
+The timed work is that of a simulation of many environments: refit the bounding volumes, then render, captured in one CUDA
+graph. Poses are input in world coordinates, so its own kinematics never run. Two graphs read two sets of poses, so that every
+launch renders new images without copies in between. Only the options that the scene needs are enabled.
 
 JAX takes most of a GPU's memory when it starts; if Warp then runs out, set XLA_PYTHON_CLIENT_MEM_FRACTION=.5.
 """
@@ -29,7 +29,7 @@ from jaxrl_vis_envs.render import Scene
 
 VERSION = "4.0.0"
 
-# Warp reads the nearest texel of the finest level, while OpenGL and we filter, and multiplies by the texture before it clamps
+# Warp reads the nearest texel of the finest level, while OpenGL and we filter, and multiplies by the texture before clamping
 # the light to 1, while OpenGL and we do so afterwards. Observed: 8 grey levels in `finger`, 20 in `primitives`.
 MAX_TEXTURED_DIFFERENCE = 25.0
 
@@ -109,14 +109,14 @@ def images(rgb: np.ndarray, depth: np.ndarray, size: int) -> tuple[np.ndarray, n
 
 
 def render_options(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[str, np.ndarray]]) -> dict[str, bool]:
-    """Select the optional terms of Warp that a scene needs: any other costs time and changes no pixel.
+    """Select the optional features of Warp that a scene needs; others would cost time without changing a pixel.
 
-    Our renderer omits by itself what a scene does not have, so our scene decides here as well.
+    The choice follows our scene, because our renderer omits unused features automatically.
 
     Args:
         scene: Our scene.
         mj_model: Model.
-        batches: Poses to draw.
+        batches: Poses to render.
     """
     drawn, lights = np.array(scene.object_ids, int), np.asarray(scene.light_ambient)
     per_light_ambient = bool(np.any(lights > 0))
@@ -134,9 +134,9 @@ def render_options(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[st
 
 
 def may_show_backs(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[str, np.ndarray]]) -> bool:
-    """Return True if a camera may see a surface from inside: it is in a geom's bounding sphere, or there are triangles.
+    """Return True if a camera may see a surface from inside: it is within a geom's bounding sphere, or there are triangles.
 
-    Planes do not count: both sides of them are drawn by our renderer, and by Warp without culling.
+    Planes do not count: our renderer renders both sides of them, as does Warp without culling.
     """
     if {mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF} & set(scene.object_types):
         return True
@@ -149,7 +149,7 @@ def may_show_backs(scene: Scene, mj_model: mujoco.MjModel, batches: list[dict[st
 
 
 def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list[Callable[[], None]]]:
-    """Build the render context, and a call per batch that draws it.
+    """Build the render context, and a function per batch that renders it.
 
     Args:
         comparison: Scene and poses.
@@ -157,7 +157,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
 
     Returns:
         Warp's render context, whose ``rgb_data`` [images, H * W] (packed uint32) and ``depth_data`` [images, H * W] (float32)
-        every call overwrites, and the calls. On Warp's CPU device, which has no graphs, they run the kernels in turn.
+        every call overwrites, and the functions. On Warp's CPU device, which has no graphs, they launch the kernels directly.
     """
     import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
     import warp as wp  # pyright: ignore[reportMissingImports]
@@ -174,7 +174,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
         cam_active=[0],
         **options,
     )
-    # Buffers of one environment suffice, because only poses are read; thousands of free bodies would fill the memory.
+    # Buffers of one environment suffice, because only poses are read; those of thousands of free bodies would fill the memory.
     blank = mjw.make_data(mj_model, nworld=1)
     datas = [_with_poses(blank, {name: rows[:count] for name, rows in batch.items()}) for batch in comparison.batches]
 
@@ -189,7 +189,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
         return context, [lambda data=data: launch(data) for data in datas]
 
     def replay(graph: Any, *_referenced: Any) -> Callable[[], None]:
-        # A graph does not keep its inputs and outputs alive.
+        # A graph does not keep references to its inputs and outputs.
         return lambda: wp.capture_launch(graph) if _referenced else None
 
     draws = []

@@ -1,9 +1,9 @@
-"""Measures images of MuJoCo Playground's dm_control suite: parity with `mujoco.Renderer`, and steps per second.
+"""Measure images of MuJoCo Playground's dm_control suite: parity with `mujoco.Renderer`, and steps per second.
 
     MUJOCO_GL=egl python -m benchmarks.pixels [TASK ...] [--only parity|speed] [--envs N] [--gallery FILE]
 
 All 25 tasks are measured if none is named, each with the first camera of its model. Parity needs a GL library and has the
-bounds of `benchmarks.render_parity`; the exit status is 1 if one does not hold. Needs MuJoCo Playground (pip install
+bounds of `benchmarks.render_parity`; the exit status is 1 if one is violated. Needs MuJoCo Playground (pip install
 playground). Records: pixels_parity.json, pixels-DEVICE.json.
 """
 
@@ -71,7 +71,7 @@ def measure_speed(tasks: Sequence[str], results: pathlib.Path, envs: int | None,
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the tasks that were named, or all."""
+    """Measure the named tasks, or all; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", metavar="TASK")
     parser.add_argument("--only", choices=("parity", "speed"), help="leave the other out")

@@ -5,7 +5,7 @@ import pathlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-COLUMNS, GAP, TITLE = 3, 4, 16  # pairs in a row, so many that titles are legible on a page of text; pixels
+COLUMNS, GAP, TITLE = 3, 4, 16  # pairs per row, few enough for legible titles on a page of text; pixels
 
 
 def save(pairs: dict[str, tuple[np.ndarray, np.ndarray]], path: pathlib.Path) -> None:

@@ -1,4 +1,4 @@
-"""Images of a wrapped task beside `mujoco.Renderer`'s: at its start, and after random actions."""
+"""Comparison of images of a wrapped task with `mujoco.Renderer`'s: at its start, and after random actions."""
 
 import dataclasses
 from typing import Any
@@ -63,7 +63,7 @@ def compare(task: str, size: int) -> Comparison:
 
 
 def _run(env: pixels.PixelEnv) -> tuple[Any, Any]:
-    """Return poses and images of the starts, and of the states after random actions, which alone need no images."""
+    """Return poses and images of the starts, and of the states after random actions; steps in between render no images."""
 
     def run(key: jax.Array) -> list[tuple[Any, Any]]:
         start_key, action_key = jax.random.split(key)
@@ -94,7 +94,7 @@ def _mj_data(mj_model: mujoco.MjModel, poses: dict[str, np.ndarray], index: int)
 
 
 def _finely_drawn(mj_model: mujoco.MjModel, size: int) -> mujoco.MjModel:
-    """Set what MuJoCo's renderer reads, in place: fine polygons, no multisampling, and a buffer that is large enough."""
+    """Set options of MuJoCo's renderer, in place: fine polygons, no multisampling, and a large enough buffer."""
     quality, buffer = mj_model.vis.quality, mj_model.vis.global_
     quality.numslices, quality.numstacks, quality.numquads = render_models.SLICES, render_models.STACKS, render_models.QUADS
     quality.offsamples = 0

@@ -6,16 +6,16 @@ from typing import Any
 from jaxrl_vis.errors import RequestError
 
 SITE_GROUPS = (0, 1, 2)
-"""Sites that `mujoco.Renderer` shows by default: in FingerTurn's tasks one of them is the target."""
+"""Groups of sites that `mujoco.Renderer` shows by default: in FingerTurn's tasks one of the sites is the target."""
 
 
 def suite() -> Any:
-    """Import Playground's dm_control suite, which needs no download: its models come with the package.
+    """Import Playground's dm_control suite, whose models come with the package (no download).
 
     Raises:
         RequestError: Playground is not installed.
     """
-    # Without MuJoCo Warp, which this does not use, the import logs that it is missing.
+    # The import logs a warning if MuJoCo Warp, which is not used here, is missing.
     logging.disable(logging.WARNING)
     try:
         from mujoco_playground import dm_control_suite  # pyright: ignore[reportMissingImports]
@@ -49,7 +49,7 @@ def load(task: str, **changes: Any) -> Any:
     if task not in module.ALL_ENVS:
         raise RequestError(f"there is no task {task!r}; there are {', '.join(module.ALL_ENVS)}")
     config = module.get_default_config(task)
-    # The default is MuJoCo Warp, which needs a GPU of NVIDIA's.
+    # The default is MuJoCo Warp, which needs an NVIDIA GPU.
     config.impl = "jax"
     config.update(changes)
     return module.load(task, config=config)

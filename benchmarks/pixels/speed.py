@@ -1,4 +1,4 @@
-"""Environment steps per second of a task on the present device, with and without images, under random actions."""
+"""Environment steps per second of a task on the default device, with and without images, under random actions."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -36,7 +36,7 @@ def measure(task: str, count: int, steps: int, size: int, repeats: int) -> Itera
 
 
 def _time(env: Any, config: dict[str, Any], name: str, repeats: int) -> tuple[float, Measurement]:
-    """Return the seconds of one call, and the measurement."""
+    """Return the time of one call (s), and the measurement."""
     count, steps = config["envs"], config["steps"]
     states = jaxrl_vis_envs.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(1), count))
 

@@ -1,11 +1,11 @@
-"""Trains brax's PPO from images that `jaxrl_vis_envs.pixels.wrap` gives to a task, and records the time to a target.
+"""Train brax's PPO from images added to a task by `jaxrl_vis_envs.pixels.wrap`, and record the time to a target.
 
     python -m benchmarks.pixels.train [--seed N]                on a GPU: CartpoleBalance, to 900 of 1,000
     python -m benchmarks.pixels.train --task FetchReach         the gripper at the goal in 80 % of the steps
-    python -m benchmarks.pixels.train --smoke [--task TASK]     the same program on any machine, as small as it goes
+    python -m benchmarks.pixels.train --smoke [--task TASK]     the same program on any machine, with minimum sizes
 
-The trainer and the networks are brax's, the tasks and their settings in `training_tasks`. Evaluations are of the deterministic
-policy; times are from the first call of the trainer on, with compilation and evaluations, and without either. Record:
+The trainer and the networks are brax's; the tasks and their settings are in `training_tasks`. Evaluations use the deterministic
+policy; times are measured from the first call of the trainer, both with and without compilation and evaluations. Record:
 pixels-DEVICE.json.
 """
 
@@ -41,10 +41,10 @@ def train(task: Task, settings: dict[str, Any], seed: int) -> list[dict[str, flo
         seed: Random seed.
 
     Returns:
-        Evaluations in order: ``env_steps``, the task's ``measure``, seconds since the call of the trainer (``wall_s``), and
-        those of training alone (``training_s``).
+        Evaluations in order: ``env_steps``, the task's ``measure``, time since the call of the trainer (``wall_s``, s), and
+        time of training alone (``training_s``, s).
     """
-    # Of any type: brax's protocols know their own environments and networks alone.
+    # Typed Any, because brax's protocols accept only its own environments and networks.
     env: Any = task.make()
     from brax.training.agents.ppo import networks_vision
     from brax.training.agents.ppo import train as ppo
@@ -91,7 +91,7 @@ def measurements(name: str, evaluations: list[dict[str, float]], settings: dict[
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Train, and store the record; a smoke run stores none."""
+    """Train, and store the record (not for a smoke run); return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=TASKS, default="CartpoleBalance")
     parser.add_argument("--smoke", action="store_true", help="a few steps of a few environments, without a record")

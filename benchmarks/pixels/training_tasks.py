@@ -1,9 +1,9 @@
 """Tasks that `benchmarks.pixels.train` trains from images, with the settings of each.
 
-CartpoleBalance   MuJoCo Playground's, with the settings and the networks that it has for images (its release 0.2.0). Rewards
-                  are those of its state task, with 1,000 steps of 0.04 s in an episode, so that a return is "of 1,000"; in
-                  training, as in its image task, an episode ends when the pole hangs down, in evaluations it does not. An
-                  observation is the last three RGB images, where theirs is in grey.
+CartpoleBalance   MuJoCo Playground's, with its settings and networks for images (release 0.2.0). Rewards are those of its state
+                  task, with 1,000 steps of 0.04 s per episode, so that the maximum return is 1,000; an episode ends when the
+                  pole hangs down in training, as in its image task, but not in evaluations. An observation is the last three
+                  images, in RGB instead of grey.
 FetchReach        a manipulation task of this project, through its adapter to brax: move the gripper of a Fetch robot to the
                   goal in an image. Observations are an RGB-D image and one of the goal, the reward the negative distance.
 """
@@ -26,19 +26,19 @@ IMAGE_SIZE = 64
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """A task that can be trained.
+    """Trainable task.
 
     Attributes:
-        make: Makes the environment, with images alone as its observation.
-        wrapper: Returns the function that wraps it for brax's trainers.
+        make: Creates the environment, with images as its only observation.
+        wrapper: Returns the function that wraps the environment for brax's trainers.
         settings: Arguments of brax's trainer.
         networks: Arguments of brax's networks.
-        measure: Name of what an evaluation measures, of `score`.
-        score: Returns it, from the metrics of an evaluation by brax.
-        unit: Its unit.
-        target: The value that a run is timed to.
-        inputs: What an observation consists of, for the records.
-        make_evaluated: Makes the environment of evaluations. None: that of training.
+        measure: Name of the score.
+        score: Computes the score from the metrics of brax's evaluation.
+        unit: Unit of the score.
+        target: Score up to which a run is timed.
+        inputs: Description of an observation, for the records.
+        make_evaluated: Creates the environment of evaluations; None for that of training.
     """
 
     make: Callable[[], pixels.PixelEnv]
@@ -55,7 +55,7 @@ class Task:
 
 _FRAMES = 3
 _CARTPOLE_STEP = 0.04
-"""Seconds: in three images of 0.01 s a pole that falls moves by less than a pixel."""
+"""Control period, s: over three images 0.01 s apart, a falling pole moves by less than a pixel."""
 _COMMON: dict[str, Any] = {
     "num_eval_envs": 128,
     "num_minibatches": 8,
@@ -70,9 +70,9 @@ _HIDDEN_LAYERS = {"policy_hidden_layer_sizes": (256, 256), "value_hidden_layer_s
 
 
 class _UntilFallen:
-    """CartpoleBalance whose episodes end when the pole hangs down.
+    """CartpoleBalance with episodes that end when the pole hangs down.
 
-    Else a random policy sees the pole upright in the first second of each episode alone.
+    Otherwise a random policy would see an upright pole only in the first second of each episode.
     """
 
     def __init__(self, env: Any) -> None:
@@ -164,8 +164,7 @@ TASKS = {
             **_COMMON,
             "num_timesteps": 3_000_000,
             "num_evals": 11,
-            # Environments start anew, with other goals, so many times between two evaluations: brax's own restarts repeat the
-            # first episode.
+            # Number of resets with new goals between two evaluations: brax's automatic resets repeat the first episode.
             "num_resets_per_eval": 3,
             "episode_length": 50,
             "num_envs": 2048,
@@ -174,7 +173,7 @@ TASKS = {
             "discounting": 0.95,
             "reward_scaling": 10.0,
         },
-        # Where the gripper is in the image is lost in brax's default, the mean over the image.
+        # Brax's default, the mean over the image, would lose the gripper's position.
         {**_HIDDEN_LAYERS, "cnn_global_pool": "none"},
         "success",
         lambda metrics: round(float(metrics["eval/episode_success"] / metrics["eval/avg_episode_length"]), 3),
@@ -195,4 +194,4 @@ SMOKE: dict[str, Any] = {
     "num_updates_per_batch": 1,
     "unroll_length": 4,
 }
-"""Settings with which a run is as short as it gets."""
+"""Settings of the shortest possible run."""

@@ -3,8 +3,8 @@
     python -m benchmarks.profiling.kernels [TASK] [--preset P] [--parts update rollout insert] [--set FIELD VALUE ...]
         [--rows 20] [--in-order]
 
-Every part is a separate program with a replay full of noise, as in `jaxrl-vis bench update`. Printed are its time, the time of
-its kernels together, which is longer if they overlap, and the kernels that take most of it.
+Every part is a separate program with a replay full of noise, as in `jaxrl-vis bench update`. The output is its time, the total
+time of its kernels, which is longer if they overlap, and the slowest kernels.
 """
 
 import argparse
@@ -32,7 +32,7 @@ PARTS = ("update", "rollout", "insert")
 
 
 def traced(call: Callable[[], Any]) -> list[tuple[float, float, str]]:
-    """Start and duration in nanoseconds and name of each kernel of a call, which must wait for its results, in order."""
+    """Profile a call, which must wait for its results; return start and duration (ns) and name of each kernel, in order."""
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             call()
@@ -42,12 +42,12 @@ def traced(call: Callable[[], Any]) -> list[tuple[float, float, str]]:
 
 
 def kernels(call: Callable[[], Any]) -> tuple[collections.Counter, collections.Counter]:
-    """Nanoseconds and launches of each kernel of a call, by name; `traced`."""
+    """Return the total time (ns) and the number of launches of each kernel of a call, by name; see `traced`."""
     return counted(traced(call))
 
 
 def counted(events: list[tuple[float, float, str]]) -> tuple[collections.Counter, collections.Counter]:
-    """Nanoseconds and launches of each kernel, by name."""
+    """Sum up events of `traced`: total time (ns) and number of launches of each kernel, by name."""
     spent, launches = collections.Counter(), collections.Counter()
     for _, duration, name in events:
         spent[name] += duration
@@ -56,7 +56,7 @@ def counted(events: list[tuple[float, float, str]]) -> tuple[collections.Counter
 
 
 def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: bool) -> None:
-    """Print where a call spends its time, per one of its ``turns``, and the kernels of one of them ``in_order``."""
+    """Print the time of a call and of its kernels, per one of its ``turns``; ``in_order``: also the kernels of one turn."""
     call()
     seconds = []
     for _ in range(3):
@@ -98,7 +98,7 @@ def measure(program: TrainStep, asked: argparse.Namespace) -> None:
             compiled[part] = function.lower(*inputs).compile()
 
     def call(part: str) -> None:
-        # What is donated comes back, so that the next call has it.
+        # Donated arguments are returned, so that the next call can use them.
         nonlocal train, replay
         if part == "update":
             train, done = compiled[part](train, replay, keys, iteration)
@@ -117,7 +117,7 @@ def measure(program: TrainStep, asked: argparse.Namespace) -> None:
 
 
 def parse_config(options: argparse.Namespace) -> Config:
-    """The configuration that the options ask for.
+    """Return the requested configuration.
 
     Raises:
         RequestError: A name is not a field, or a value does not suit it.
@@ -133,7 +133,7 @@ def parse_config(options: argparse.Namespace) -> Config:
 
 
 def main() -> int:
-    """Read the command line and print the tables."""
+    """Print the tables; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("task", nargs="?", default="VisualFetchReach", help="the environment")
     parser.add_argument("--preset", default="fast", help="of the run")

@@ -1,9 +1,10 @@
-"""Physics alone on a GPU: environment steps a second, kernels of a physics step, and how far it is from a CPU's.
+"""Physics alone on a GPU: environment steps per second, kernels of a physics step, and deviation from a CPU's results.
 
     python -m benchmarks.profiling.rollouts [TASK ...] [--counts 500 8192]
 
-The deviation is that of one control step from the same 64 states, five control steps into an episode, with the same actions, on
-the GPU and on the CPU backend of the same process: of ``qpos``, and of ``qvel`` relative to the state's largest velocity.
+The deviation is measured over one control step from the same 64 states, five control steps into an episode, with the same
+actions, on the GPU and on the CPU backend of the same process: in ``qpos``, and in ``qvel`` relative to the state's largest
+velocity.
 """
 
 import argparse
@@ -22,7 +23,7 @@ STEPS, COMPARED, SHOWN = 10, 64, 6
 
 
 def rollout(env: Any, count: int, steps: int) -> Any:
-    """(states, key) -> states after so many control steps with random actions."""
+    """Return the function (states, key) -> states after ``steps`` control steps with random actions."""
 
     def run(states: Any, key: jax.Array) -> Any:
         def step(states: Any, key: jax.Array) -> tuple[Any, None]:
@@ -35,12 +36,12 @@ def rollout(env: Any, count: int, steps: int) -> Any:
 
 
 def reset(env: Any, count: int) -> Any:
-    """Start states of so many environments."""
+    """Return the initial states of ``count`` environments."""
     return jaxrl_vis_envs.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), count))
 
 
 def report_speed(name: str, env: Any, count: int) -> None:
-    """Print the speed of ``count`` environments side by side, and the kernels that take most of the time."""
+    """Print the speed of ``count`` parallel environments, and the kernels that take most of the time."""
     states, key = jax.block_until_ready(reset(env, count)), jax.random.key(1)
     began = time.perf_counter()
     program = jaxrl_vis_envs.jit(rollout(env, count, STEPS)).lower(states, key).compile()
@@ -69,7 +70,7 @@ def report_speed(name: str, env: Any, count: int) -> None:
 
 
 def report_deviation(name: str, env: Any) -> None:
-    """Print how far a control step on the GPU is from one on a CPU."""
+    """Print the deviation of a control step on the GPU from one on a CPU."""
     data = jaxrl_vis_envs.jit(rollout(env, COMPARED, 5))(reset(env, COMPARED), jax.random.key(3)).data
     actions = jax.random.uniform(jax.random.key(4), (COMPARED, env.action_size), minval=-1.0, maxval=1.0)
     here = jaxrl_vis_envs.jit(jax.vmap(env.act))(data, actions)
@@ -86,7 +87,7 @@ def report_deviation(name: str, env: Any) -> None:
 
 
 def main() -> int:
-    """Read the command line and do what it asks for."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", default=["FingerTurn", "HandReach", "FetchReach"])
     parser.add_argument("--counts", nargs="+", type=int, default=[500, 8192], help="environments side by side")

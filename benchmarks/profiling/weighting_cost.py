@@ -2,10 +2,10 @@
 
     python -m benchmarks.profiling.weighting_cost [--losses 5 10] [--ways latents] [--image-size 64] [--batch-size 512]
 
-An encoder of the preset `paper` reads RGB-D images before and after an action. The main loss is a value of three hidden layers;
-every auxiliary loss is a linear head on both latents with its own targets. For every number of auxiliary losses and every
-method of their gradients, gradient steps are timed with fixed weights and with OL-AUX-5. The difference is the cost of the
-weighting itself.
+An encoder of the preset `paper` reads RGB-D images before and after an action. The main loss is that of a value head with three
+hidden layers; every auxiliary loss is that of a linear head on both latents with its own targets. For every number of auxiliary
+losses and every method of computing their gradients, gradient steps are timed with fixed weights and with OL-AUX-5. The
+difference is the cost of the weighting itself.
 """
 
 import argparse
@@ -29,9 +29,9 @@ from jaxrl_vis.weighting import MAIN, Weighting, make_weighting, weighted_grad
 from jaxrl_vis.weighting.gradients import Way
 
 STEPS = 40
-"""Gradient steps of a timed call."""
+"""Gradient steps per timed call."""
 TARGETS = 64
-"""Numbers that each auxiliary loss predicts."""
+"""Output size of each auxiliary head."""
 LEARNING_RATE = 1e-4
 
 
@@ -40,9 +40,9 @@ class Problem:
     """Losses that share an encoder.
 
     Attributes:
-        networks: What the parameters mean.
-        size: Images in a batch.
-        names: Of the auxiliary losses.
+        networks: Networks of the critic.
+        size: Batch size.
+        names: Names of the auxiliary losses.
     """
 
     networks: Networks
@@ -50,7 +50,7 @@ class Problem:
     names: tuple[str, ...]
 
     def params(self, key: jax.Array) -> dict[str, Any]:
-        """The critic's, and a linear head for each auxiliary loss."""
+        """Initialise the critic's parameters, and a linear head for each auxiliary loss."""
         critic_key, *keys = jax.random.split(key, 1 + len(self.names))
         width = 2 * self.networks.config.network.latent_size
         heads = {
@@ -59,7 +59,7 @@ class Problem:
         return {"critic": self.networks.init_critic(critic_key), "heads": heads}
 
     def batches(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
-        """Random images [count, 2, B, C, H, W], actions, values and targets."""
+        """Draw ``count`` batches of images [count, 2, B, C, H, W] uint8, actions, values and targets."""
         image_key, action_key, value_key, target_key = jax.random.split(key, 4)
         shape = self.networks.observation_spec.shape
         draw = functools.partial(jax.random.normal, shape=(count, self.size))
@@ -71,14 +71,14 @@ class Problem:
         }
 
     def encode(self, encoder: Any, batch: dict[str, jax.Array]) -> jax.Array:
-        """Latents [2, B, latent]."""
+        """Encode the images before and after the action to latents [2, B, latent]."""
         mean, scale = (jnp.full(self.networks.observation_spec.shape, value) for value in (127.5, 1 / 74.0))
         images = batch["images"].reshape(2 * self.size, *self.networks.observation_spec.shape)
         inputs = self.networks.prepare(Scaling(mean, scale), images)
         return self.networks.encode({"encoder": encoder}, inputs).reshape(2, self.size, -1)
 
     def losses(self, params: Any, latents: jax.Array, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """The main loss, and one for each name."""
+        """Compute the main loss and each auxiliary loss, by name."""
         value = self.networks.value(params["critic"], latents, batch["action"])
         both = jnp.concatenate([latents[0], latents[1]], axis=-1).astype(jnp.bfloat16)
         losses = {MAIN: jnp.mean(jnp.square(value - batch["value"]))}
@@ -88,7 +88,7 @@ class Problem:
         return losses
 
     def make_steps(self, weighting: Weighting, way: Any) -> Any:
-        """(params, weighting's state, batches) -> the first two after `STEPS` gradient steps, and their weights."""
+        """Return the jitted function (params, weighting's state, batches) -> both after `STEPS` updates, and the weights."""
         find = weighted_grad(
             self.losses,
             weighting,
@@ -112,10 +112,10 @@ class Problem:
 
 
 def time_step(problem: Problem, weighting: Weighting, way: str) -> float:
-    """Seconds of a gradient step.
+    """Return the time of a gradient step, s.
 
     Raises:
-        AssertionError: Nothing was learned, or learned weights did not move.
+        AssertionError: Nothing was learned, or learned weights did not change.
     """
     params, batches = problem.params(jax.random.key(0)), problem.batches(jax.random.key(1), 4)
     state = weighting.init((MAIN, *problem.names), params["critic"]["encoder"])
@@ -128,7 +128,7 @@ def time_step(problem: Problem, weighting: Weighting, way: str) -> float:
 
 
 def main() -> int:
-    """Read the command line and print a table."""
+    """Print the table; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--losses", type=int, nargs="+", default=[5, 10], help="numbers of auxiliary losses")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Makes the images of docs/renderer.md: ours, MuJoCo's own, and the difference. Needs a GL library.
+"""Create the images of docs/renderer.md: ours, MuJoCo's own, and the difference. Needs a GL library.
 
     MUJOCO_GL=egl python -m benchmarks.rendering.comparison_images [SHEET ...]
 
@@ -27,12 +27,12 @@ from jaxrl_vis_envs.render.reference import ReferenceRenderer  # noqa: E402
 
 FOLDER = ROOT / "docs" / "renderer"
 SIZE, GAP, TITLE = 144, 4, 18  # pixels
-GAIN = 8  # what the difference is multiplied with
+GAIN = 8  # amplification of the difference
 MISSING = (255, 225, 225)
 
 
 def sheets() -> dict[str, list[str]]:
-    """Models of each sheet: one sheet for each group of features, one for ours and the public models."""
+    """Return the models by sheet: one sheet per group of features, one of limits, one of our and public models."""
     groups: dict[str, list[str]] = {}
     for name in FEATURES:
         groups.setdefault(FEATURES[name].sheet, []).append(name)
@@ -42,7 +42,7 @@ def sheets() -> dict[str, list[str]]:
 
 
 def panel(name: str) -> tuple[str, Image.Image]:
-    """Title, and the three images of one model side by side."""
+    """Return the title and the three images of one model, side by side."""
     if name in render_limits.LIMITS:
         return limit_panel(name)
     entry = render_models.MODELS[name]
@@ -62,7 +62,7 @@ def panel(name: str) -> tuple[str, Image.Image]:
 
 
 def limit_panel(name: str) -> tuple[str, Image.Image]:
-    """The same of a scene of `render_limits`, which MuJoCo draws as it does by default, but for its edges."""
+    """Return the panel of a scene of `render_limits`, with MuJoCo's default rendering except multisampling."""
     title, xml, effects = render_limits.LIMITS[name]
     mj_model = mujoco.MjModel.from_xml_string(xml)
     mj_model.vis.quality.offsamples = 0
@@ -76,12 +76,12 @@ def limit_panel(name: str) -> tuple[str, Image.Image]:
 
 
 def difference(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Difference of two images [H, W, 3] uint8, times `GAIN`."""
+    """Return the absolute difference of two images [H, W, 3] uint8, times `GAIN`, clipped."""
     return np.minimum(GAIN * np.abs(ours.astype(int) - theirs), 255).astype(np.uint8)
 
 
 def side_by_side(*images: np.ndarray) -> Image.Image:
-    """Images [SIZE, SIZE, 3] uint8, with gaps between them."""
+    """Join images [SIZE, SIZE, 3] uint8 into a row, with gaps."""
     row = np.full((SIZE, len(images) * (SIZE + GAP) - GAP, 3), 255, np.uint8)
     for number, image in enumerate(images):
         row[:, number * (SIZE + GAP) : number * (SIZE + GAP) + SIZE] = image
@@ -89,7 +89,7 @@ def side_by_side(*images: np.ndarray) -> Image.Image:
 
 
 def sheet(names: list[str], columns: int = 2) -> Image.Image:
-    """All models of a sheet, ``columns`` side by side."""
+    """Draw the panels of all models of a sheet, in ``columns`` columns."""
     panels = [panel(name) for name in names]
     width, height = panels[0][1].size
     rows = -(-len(panels) // columns)
@@ -103,7 +103,7 @@ def sheet(names: list[str], columns: int = 2) -> Image.Image:
 
 
 def main() -> None:
-    """Make the sheets that were named, or all."""
+    """Create the named sheets, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sheets", nargs="*", metavar="SHEET", help=f"all if none is named: {', '.join(sheets())}")
     FOLDER.mkdir(parents=True, exist_ok=True)

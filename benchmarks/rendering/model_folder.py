@@ -1,11 +1,11 @@
-"""Compares our renderer with MuJoCo's own on every model of a folder that nobody here has seen before; see `render_parity`.
+"""Compare our renderer with MuJoCo's own on every model in a folder of third-party models; see `render_parity`.
 
-Each MJCF or URDF file is drawn at its start and in a scattered pose: by its camera `cam`, or else by the free camera and all of
-its own. Sites are drawn in a row of their own where there are any, and so is haze. Where a camera or a light moves, the poses
-come from `mjx.kinematics`, as in a task. Shadows, reflections, skins, flexes and multisampling are off.
+Each MJCF or URDF file is rendered in its initial and in a random pose: by its camera `cam`, or else by the free camera and all
+of its own cameras. Sites and haze have rows of their own, if the model has them. If a camera or a light moves, the poses come
+from `mjx.kinematics`, as in a task. Shadows, reflections, skins, flexes and multisampling are off.
 
-What counts as a pass is in `Measures.failures`. A model that does not load, one of which next to nothing is seen, and one where
-MuJoCo's own image is not to be trusted have a verdict of their own, and fail nothing.
+The pass criterion is in `Measures.failures`. Models that do not load, that are hardly visible, or of which MuJoCo's own image
+is unreliable have verdicts of their own, which do not count as failures.
 """
 
 import dataclasses
@@ -30,27 +30,27 @@ from jaxrl_vis_envs.render.camera import camera_pose, pixel_rays, ray_parts
 from jaxrl_vis_envs.render.reference import ReferenceRenderer
 
 SUFFIXES = (".xml", ".mjcf", ".urdf")
-VOID = 0.002  # share of a picture; where less of it shows an object, there is nothing to compare
-SEEN_PIXELS = 12  # an object with so many pixels away from edges must not be missing
+VOID = 0.002  # fraction of an image; if less of it shows an object, there is nothing to compare
+SEEN_PIXELS = 12  # minimum number of pixels, away from edges, of an object that must not be missing
 LOUD = 16  # grey levels
-SHIFT = 2e-6  # of the model's extent: a camera that is moved by so little should see the same
-SKY = 0.69  # of zfar: the sky hides the colours of what is further, see docs/renderer.md
-FINE = 1e-3  # m, cells of a plane's grid; MuJoCo makes at most some 200 in a row
+SHIFT = 2e-6  # camera displacement relative to the model's extent that should not change the image
+SKY = 0.69  # fraction of zfar beyond which the sky occludes colours, see docs/renderer.md
+FINE = 1e-3  # cell size of a plane's grid, m; MuJoCo makes at most some 200 cells per row
 DEFORMABLES = ("skin", "flex")
 
 
 @dataclasses.dataclass(frozen=True)
 class Measures:
-    """Differences of two images, away from edges; the worst over the poses of a row.
+    """Differences between two images, away from edges; the worst over the poses of a row.
 
     Attributes:
-        segmentation: Share of pixels that show the same object.
-        depth: Share of pixels that show an object, with the same depth: within 1 mm or a thousandth.
-        rgb: Mean difference of 255.
-        most: Largest difference of 255.
-        loud: Share of pixels with a channel that differs by more than 16.
-        matched: `render_comparison.matched_shares`, the least.
-        missing: Labels that are seen in MuJoCo's image and not at all in ours.
+        segmentation: Fraction of pixels that show the same object.
+        depth: Fraction of object pixels with the same depth, within 1 mm or a thousandth.
+        rgb: Mean absolute difference, grey levels of 255.
+        most: Maximum absolute difference, grey levels of 255.
+        loud: Fraction of pixels with a channel that differs by more than 16 grey levels.
+        matched: Minimum of `render_comparison.matched_shares`.
+        missing: Labels that are visible in MuJoCo's image and absent from ours.
     """
 
     segmentation: float = 1.0
@@ -62,7 +62,7 @@ class Measures:
     missing: tuple[int, ...] = ()
 
     def failures(self) -> list[str]:
-        """Parts of the pass criterion that do not hold."""
+        """List the violated parts of the pass criterion."""
         held = {
             "seg": self.segmentation >= 0.99,
             "depth": self.depth >= 0.995,
@@ -74,7 +74,7 @@ class Measures:
         return [name for name, holds in held.items() if not holds]
 
     def worse(self, other: "Measures") -> "Measures":
-        """The worse of each."""
+        """Return the elementwise worse of two measures."""
         least, most = ("segmentation", "depth", "matched"), ("rgb", "most", "loud")
         values: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in least}
         values |= {name: max(getattr(self, name), getattr(other, name)) for name in most}
@@ -82,12 +82,12 @@ class Measures:
 
 
 def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
-    """Compare two images of NumPy arrays; where ``hidden`` [H, W] is true, colours do not count."""
+    """Compare two frames of NumPy arrays, ignoring colours where ``hidden`` [H, W] is True."""
     inside = ~(near_edges(ours.segmentation) | near_edges(theirs.segmentation))
     solid = inside & ((ours.segmentation >= 0) | (theirs.segmentation >= 0))
     difference = np.max(np.abs(ours.rgb.astype(np.int16) - theirs.rgb), axis=-1)
     coloured = inside & ~hidden
-    # Of two surfaces that coincide MuJoCo labels one by chance, and so do we: where depth and colour agree, either will do.
+    # The labels of coincident surfaces are arbitrary in both renderers: either is accepted if depth and colour agree.
     either = (np.abs(ours.depth - theirs.depth) <= 1e-4 * np.maximum(1.0, theirs.depth)) & (difference <= 4)
     near = np.abs(ours.depth - theirs.depth) <= np.maximum(1e-3, 1e-3 * theirs.depth)
     labels, counts = np.unique(theirs.segmentation[inside & ~either], return_counts=True)
@@ -114,20 +114,20 @@ def _share(part: np.ndarray, whole: np.ndarray) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """One row: a camera (None: the free one) and what is drawn beside geoms."""
+    """Row of the table: a camera (None: the free one), and whether sites and haze are rendered."""
 
     camera: int | None
     sites: bool = False
     haze: bool = False
 
     def title(self, mj_model: mujoco.MjModel) -> str:
-        """Short, for the table."""
+        """Return a short title for the table."""
         name = "free" if self.camera is None else mj_model.camera(self.camera).name or str(self.camera)
         return name + " + sites" * self.sites + " + haze" * self.haze
 
 
 def views(mj_model: mujoco.MjModel) -> list[View]:
-    """The rows of a model."""
+    """List the views of a model, one per row of the table."""
     named = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, "cam")
     cameras = [named] if named >= 0 else [None, *range(mj_model.ncam)]
     rows = [View(camera) for camera in cameras]
@@ -140,17 +140,23 @@ def views(mj_model: mujoco.MjModel) -> list[View]:
 
 
 class Comparison:
-    """A model that was read from a file, its poses, and the comparison of its views."""
+    """Model from a file, its poses, and the comparison of its views.
+
+    Attributes:
+        mj_model: The model.
+        size: Length of the longer side of an image, pixels.
+        data: The poses.
+    """
 
     def __init__(self, path: pathlib.Path, size: int) -> None:
-        """Read the model; raise a ValueError where MuJoCo cannot."""
+        """Read the model; raise a ValueError if MuJoCo cannot."""
         self.mj_model = mujoco.MjModel.from_xml_path(str(path))
         quality = self.mj_model.vis.quality
         quality.offsamples = 0
         quality.numslices, quality.numstacks, quality.numquads = (
             render_models.SLICES, render_models.STACKS, render_models.QUADS,
         )  # fmt: skip
-        # MuJoCo lights the corners of a grid, and a spot light's edge is lost between two of them: as fine a grid as there is.
+        # MuJoCo lights only the grid's vertices, and loses a spot light's edge between them: use the finest grid.
         self.mj_model.geom_size[self.mj_model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 2] = FINE
         buffer = self.mj_model.vis.global_
         buffer.offwidth, buffer.offheight = max(buffer.offwidth, size), max(buffer.offheight, size)
@@ -158,7 +164,7 @@ class Comparison:
         self.data = list(self._poses())
 
     def _poses(self) -> Iterator[mujoco.MjData]:
-        """The start, and a scattered pose if there are joints."""
+        """Yield the initial pose, and a random one if there are joints."""
         start = mujoco.MjData(self.mj_model)
         forward(self.mj_model, start)
         yield start
@@ -169,27 +175,27 @@ class Comparison:
             yield scattered
 
     def our_poses(self) -> list[dict[str, np.ndarray]]:
-        """Poses that we draw from: where something that sees or lights moves, from MJX's kinematics alone."""
+        """Return the poses for our renderer: from MJX's kinematics if a camera or light moves and MJX supports the model."""
         moving = np.any(self.mj_model.cam_bodyid > 0) or np.any(self.mj_model.light_bodyid > 0)
         moving |= np.any(self.mj_model.cam_targetbodyid >= 0) or np.any(self.mj_model.light_targetbodyid >= 0)
-        if moving and not self.mj_model.nmocap:  # MJX leaves what hangs on a mocap body behind
+        if moving and not self.mj_model.nmocap:  # MJX does not move children of mocap bodies
             try:
                 model = mjx.put_model(self.mj_model)
                 empty = mjx.make_data(self.mj_model)
                 move = jax.jit(lambda qpos: mjx.kinematics(model, empty.replace(qpos=qpos)))
                 return [render_models.poses_of(move(jnp.asarray(data.qpos))) for data in self.data]
-            except (NotImplementedError, ValueError):  # MJX has no such joint, geom or solver
+            except (NotImplementedError, ValueError):  # MJX does not support a joint, geom or solver
                 pass
         return [render_models.poses_of(data) for data in self.data]
 
     def lens(self, view: View) -> tuple[int, int]:
-        """Height and width, of the proportions that the camera's resolution has."""
+        """Return height and width, in the aspect ratio of the camera's resolution."""
         wide, high = (1, 1) if view.camera is None else self.mj_model.cam_resolution[view.camera]
         scale = self.size / max(wide, high)
         return max(1, round(high * scale)), max(1, round(wide * scale))
 
     def compare(self, view: View, pictures: pathlib.Path | None = None) -> tuple[Measures | None, str]:
-        """Measures and verdict of a view."""
+        """Compare a view; return its measures (None if our renderer refuses the model) and the verdict."""
         height, width = self.lens(view)
         groups = (0, 1, 2) if view.sites else ()
         options: dict[str, Any] = dict(site_groups=groups, haze=view.haze, lights="mujoco")
@@ -229,7 +235,7 @@ class Comparison:
         return total, f"no verdict: {doubt}" if doubt else "**FAIL**: " + ", ".join(failures) + remark
 
     def reference(self, view: View, shift: np.ndarray | float = 0.0) -> list[Frame]:
-        """MuJoCo's images of all poses, the camera moved by ``shift`` [3] (m)."""
+        """Render all poses by MuJoCo, with the camera moved by ``shift`` [3] (m)."""
         height, width = self.lens(view)
         frames = []
         groups = (0, 1, 2) if view.sites else ()
@@ -248,7 +254,7 @@ class Comparison:
         return frames
 
     def doubt(self, view: View, scene: Scene, ours: list[Frame], theirs: list[Frame]) -> str:
-        """Why MuJoCo's images are no reference, "" where they are."""
+        """Return why MuJoCo's images are not a valid reference; an empty string if they are."""
         nowhere = np.zeros(theirs[0].segmentation.shape, bool)
         for direction in ([0.3, 0.5, 0.8], [-0.7, 0.2, 0.1]):
             moved = self.reference(view, SHIFT * self.mj_model.stat.extent * np.array(direction))
@@ -265,10 +271,10 @@ class Comparison:
         return ""
 
     def limits(self, scene: Scene, frame: Frame, data: mujoco.MjData) -> dict[str, np.ndarray]:
-        """[H, W] bool: where colours differ as docs/renderer.md says, each with what was there before it.
+        """Return cumulative masks [H, W] bool of known colour differences (docs/renderer.md), by name.
 
-        MuJoCo draws its sky on a cylinder around the camera, which hides what is beyond; and it lights the corners of a grid,
-        between which the edge of a spot light lies somewhere.
+        MuJoCo renders its sky on a cylinder around the camera, which occludes everything beyond; and it lights only a grid's
+        vertices, so the edge of a spot light lies anywhere between them.
         """
         position, away = seen_points(scene, frame, data)
         hidden = np.zeros(frame.depth.shape, bool)
@@ -286,7 +292,7 @@ class Comparison:
 
 
 def seen_points(scene: Scene, frame: Frame, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Position of the camera [3] (m), and points seen by each pixel from there, [3, H, W] (m); in the world's frame."""
+    """Return the camera's position [3] (m), and the visible point of each pixel relative to it [3, H, W] (m), in world axes."""
     position, rotation, _ = camera_pose(scene, data)
     start, direction, _ = ray_parts(scene, pixel_rays(scene, *np.indices(frame.depth.shape)))
     points = [np.asarray(s + frame.depth * d) * np.ones(frame.depth.shape) for s, d in zip(start, direction, strict=True)]
@@ -294,14 +300,14 @@ def seen_points(scene: Scene, frame: Frame, data: mujoco.MjData) -> tuple[np.nda
 
 
 def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> int:
-    """Print the table of a folder; the exit status is 1 where a row fails."""
+    """Print the table of a folder; return 1 if a row fails, else 0."""
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
     print("| model | view | seg | depth | rgb | max | > 16 | match | s | verdict |\n" + "| --- " * 10 + "|", flush=True)
     rows = failed = 0
     for path in paths:
         name = str(path.relative_to(folder))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what MuJoCo says about other people's models
+            warnings.simplefilter("ignore")  # MuJoCo's warnings about third-party models
             for title, measures, verdict, seconds in folder_rows(path, name, size, pictures):
                 rows, failed = rows + 1, failed + ("FAIL" in verdict)
                 figures = (
@@ -320,7 +326,7 @@ def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> in
 def folder_rows(
     path: pathlib.Path, name: str, size: int, pictures: pathlib.Path | None
 ) -> Iterator[tuple[str, Measures | None, str, float]]:
-    """View, measures, verdict and seconds of each row of a file."""
+    """Yield view, measures, verdict and time (s) of each row of a file."""
     start = time.perf_counter()
     try:
         comparison = Comparison(path, size)

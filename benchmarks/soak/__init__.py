@@ -1,1 +1,1 @@
-"""Random faults over small real runs; see `__main__`."""
+"""Random faults injected into small real runs; see `__main__`."""

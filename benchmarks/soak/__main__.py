@@ -1,25 +1,25 @@
-"""Random faults over small real runs, each then resumed; and one long run that is killed once a minute.
+"""Random faults injected into small real runs, each then resumed; and one long run that is killed once a minute.
 
     python -m benchmarks.soak [--minutes 9] [--workers 2] [--seed 0] [--faults 10000] [--json FILE]
     python -m benchmarks.soak --sigkill-every 60 [--preset cpu] [--minutes 60] [--env VisualFetchReach] [--json FILE]
 
-**Faults.** Each run is `jaxrl-vis train Reacher` with small settings, a process of its own that is struck by a fault and
+**Faults.** Each run is `jaxrl-vis train Reacher` with small settings, in a process of its own, interrupted by faults and
 resumed until it is finished. After every fault it is checked that
 
-* nothing from before the last good checkpoint is lost: not a row of metrics.jsonl, and no newer checkpoint;
-* there is no traceback, and the exit status is the one that the fault deserves;
+* nothing from before the last intact checkpoint is lost: no row of metrics.jsonl, and no newer checkpoint;
+* there is no traceback, and the exit status is the one expected of the fault;
 
-and at the end of a run that it has every row exactly once, and, unless a replay was lost, which is counted, that it wrote the
-metrics.jsonl of an undisturbed run, bit for bit (times apart). Faults with folders of their own (`benchmarks.soak.alone`) come
-in between. Full and frozen disks need root, to mount small ones; without, the limit on a file's size and SIGSTOP stand in.
-What does not hold is printed, kept in the record, and makes the exit status 1; its folder stays.
+and at the end of a run that it has every row exactly once and, unless a replay was lost, which is counted, that its
+metrics.jsonl equals that of an undisturbed run, bit for bit (except times). Faults with folders of their own
+(`benchmarks.soak.alone`) are interleaved. Full and frozen disks need root, to mount small ones; otherwise a limit on file
+sizes and SIGSTOP replace them. A violation is printed and recorded, its folder is kept, and the exit status is 1.
 
-No fault begins in the last 45 s of --minutes, so that runs come to their end. Pieces with different seeds on one commit, each
-with its --json in benchmarks/results/soak, are added by `make tables`.
+No fault begins in the last 45 s of --minutes, so that runs can finish. Soaks with different seeds on one commit, each with its
+--json in benchmarks/results/soak, are added up by `make tables`.
 
-**Goodput.** Task and preset are trained with their default intervals, killed every so many seconds, and in the end evaluated;
-then as many steps are trained undisturbed. With --folder, a second call goes on with the same run, so that an hour can be had
-in pieces: --no-reference leaves out the undisturbed run until the last one.
+**Goodput.** A run with the default intervals is killed at regular intervals and finally evaluated; then as many steps are
+trained undisturbed. With --folder, a second call continues the same run, so that an hour can be split over several calls:
+--no-reference skips the undisturbed run until the last one.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def _goodput(options: argparse.Namespace, folder: Path) -> int:
 
 
 def main() -> int:
-    """Read the command line and do what it asks for."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=10_000, help="at most so many")
     parser.add_argument("--seed", type=int, default=0)

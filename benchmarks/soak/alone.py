@@ -1,6 +1,6 @@
-"""Faults with a run, a study or plots of their own: a number that is not finite, and workers of pools that are killed.
+"""Faults with a run, a study or plots of their own: a non-finite number, and killed workers of pools.
 
-Each is a function of an empty folder, dice and what undisturbed commands have left; it raises `Broken`.
+Each is a function of an empty folder, a random generator and the results of undisturbed commands; it raises `Broken`.
 """
 
 import dataclasses
@@ -76,7 +76,7 @@ def _finished(part: Part, *statuses: int) -> Part:
 
 
 def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
-    """Make a reward NaN on one of two seeds: the run stops, names the seed, and goes on from its last good checkpoint."""
+    """Make a reward NaN on one of two seeds: the run stops, names the seed, and resumes from its last intact checkpoint."""
     folder.mkdir()
     (folder / "broken_task.py").write_text(TASK)
     run, steps = folder / "run", 4 * 50
@@ -92,7 +92,7 @@ def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
         raise Broken(f"nothing was dumped: {line}")
     saved = list_checkpoints(run)
     if not saved:
-        return  # in the very first iterations: there is nothing to go on from, and the line says so
+        return  # in the very first iterations there is nothing to resume from, which the line reports
     rows = read_rows(run)
     again = _finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
     if not again.count("resumed at iteration"):
@@ -102,7 +102,7 @@ def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
 
 
 def _children(process: int) -> list[int]:
-    """All processes below one."""
+    """List all descendants of a process."""
     processes = []
     for task in Path(f"/proc/{process}/task").glob("*/children"):
         try:
@@ -121,7 +121,7 @@ def _is(process: int, words: str) -> bool:
 
 
 def _kill_a_worker(part: Part, words: str, dice: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
-    """Kill a process below a part that was started with these words, a while after there are any; whether there was one."""
+    """Kill a descendant of a part whose command line contains ``words``, after a random delay; return True if there was one."""
 
     def workers() -> list[int]:
         return [process for process in _children(part.process.pid) if _is(process, words)]
@@ -144,7 +144,7 @@ def _of_one_line(part: Part, words: str) -> None:
 
 
 def worker_of_a_study(folder: Path, dice: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
-    """Two cells; one is killed, the other goes on, and the next start finishes both: with the rows of undisturbed ones."""
+    """Kill one of two cells: the other continues, and the next start finishes both, with the rows of undisturbed ones."""
     words = _sweep(folder, executor)
     part = _command(words, folder)
     with killed_afterwards(part):
@@ -175,7 +175,7 @@ def _cell_rows(folder: Path) -> dict[str, list]:
 
 
 def job_of_a_study(folder: Path, dice: random.Random, references: "References") -> None:
-    """Kill a run of a sweep whose runs are jobs of submitit; then the sweep finishes."""
+    """Kill a run of a sweep whose runs are submitit jobs; the next start finishes the sweep."""
     worker_of_a_study(folder, dice, references, ("--executor", "local"))
 
 
@@ -188,7 +188,7 @@ def _tables(out: Path) -> dict[str, bytes]:
 
 
 def worker_of_phenotyping(folder: Path, dice: random.Random, references: "References") -> None:
-    """Kill a worker of ``phenotype run``; then the same tables are written."""
+    """Kill a worker of ``phenotype run``; the next start writes the same tables."""
     plots, tables = references.phenotyping()
     _pool(_phenotype(folder, plots), folder, dice)
     if _tables(folder / "out") != tables:
@@ -201,7 +201,7 @@ def _grasp(folder: Path, spec: Path) -> list[str]:
 
 
 def _figures(file: Path) -> list[dict[str, Any]]:
-    """Results of each run, without durations."""
+    """Read the results of each run, without durations."""
     runs = json.loads(file.read_text())["each"]
     for record in runs:
         del record["score"]["seconds"]
@@ -209,7 +209,7 @@ def _figures(file: Path) -> list[dict[str, Any]]:
 
 
 def worker_of_grasping(folder: Path, dice: random.Random, references: "References") -> None:
-    """Kill a worker of ``grasp eval``; then the same figures are found."""
+    """Kill a worker of ``grasp eval``; the next start gives the same figures."""
     spec, figures = references.grasping()
     _pool(_grasp(folder, spec), folder, dice)
     if _figures(folder / "eval.json") != figures:
@@ -217,11 +217,11 @@ def worker_of_grasping(folder: Path, dice: random.Random, references: "Reference
 
 
 class NotStruck(Exception):
-    """It was over before the fault came."""
+    """The command finished before the fault."""
 
 
 def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
-    """Kill a worker of a pool; then the same command finishes."""
+    """Kill a worker of a pool, and check that the same command finishes when started again."""
     folder.mkdir(exist_ok=True)
     part = _command(words, folder)
     with killed_afterwards(part):
@@ -229,7 +229,7 @@ def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
         part.end()
     part.check_words()
     if struck and part.process.returncode == 0:
-        raise NotStruck  # the worker had done all it had to
+        raise NotStruck  # the worker had finished its work
     if struck:
         if part.process.returncode not in (1, 2):
             raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
@@ -240,10 +240,10 @@ def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
 
 
 class References:
-    """Results of undisturbed commands, made when first asked for.
+    """Results of undisturbed commands, computed on first use.
 
     Args:
-        folder: Where it lies.
+        folder: Folder of the results.
     """
 
     def __init__(self, folder: Path):
@@ -258,7 +258,7 @@ class References:
             return self._made[name]
 
     def study(self) -> dict[str, list]:
-        """Rows by the names of cells."""
+        """Return rows by name of the cell."""
 
         def make(folder: Path) -> dict[str, list]:
             _finished(_command(_sweep(folder), folder), 0)
@@ -267,7 +267,7 @@ class References:
         return self._once("study", make)
 
     def phenotyping(self) -> tuple[Path, dict[str, bytes]]:
-        """Plots, and tables of them."""
+        """Return the folder of plots, and their tables."""
 
         def make(folder: Path) -> tuple[Path, dict[str, bytes]]:
             (folder / "few.json").write_text(json.dumps(FEW_STALKS))
@@ -279,7 +279,7 @@ class References:
         return self._once("phenotyping", make)
 
     def grasping(self) -> tuple[Path, list]:
-        """The file of a family, and figures of its runs."""
+        """Return the file of a family, and the figures of its runs."""
 
         def make(folder: Path) -> tuple[Path, list]:
             spec = folder / "few.json"
@@ -292,7 +292,7 @@ class References:
 
 @dataclasses.dataclass(frozen=True)
 class Alone:
-    """A kind of fault with a folder of its own; see the module."""
+    """Fault with a folder of its own; see the module."""
 
     strike: Callable[[Path, random.Random, References], None]
     promise: str
@@ -310,7 +310,7 @@ ALONE: dict[str, Alone] = {
 
 
 def strike_alone(name: str, folder: Path, dice: random.Random, references: References) -> bool:
-    """Let a fault of `ALONE` happen in a new folder; whether it did."""
+    """Inject a fault of `ALONE` in a new folder; return False if the command finished first."""
     try:
         ALONE[name].strike(folder, dice, references)
     except NotStruck:

@@ -1,4 +1,4 @@
-"""Disks that are nearly full, and disks that stand still: small file systems, which only root can mount."""
+"""Nearly full and frozen disks: small file systems, which only root can mount."""
 
 import contextlib
 import shutil
@@ -16,7 +16,7 @@ def _run(*command: str) -> bool:
 
 @contextlib.contextmanager
 def _moved_to(folder: Path, disk: Path, mounted: bool) -> Iterator[Path]:
-    """The run folder on another disk, put back and unmounted afterwards; ``folder`` itself where nothing is mounted."""
+    """Copy the run folder to another disk, then back, and unmount; yield ``folder`` itself if nothing is mounted."""
     there = disk / "run"
     try:
         if not mounted:
@@ -37,10 +37,10 @@ def _moved_to(folder: Path, disk: Path, mounted: bool) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def small_disk(folder: Path) -> Iterator[tuple[Path, Callable[[], bool]]]:
-    """A small disk.
+    """Mount a small disk.
 
     Yields:
-        The run folder on it, and what fills all that is left: it says whether that can be done here.
+        The run folder on it, and a function that fills the remaining space; it returns False if no disk could be mounted.
     """
     used = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     disk = folder.with_name(f"{folder.name}-disk")
@@ -63,10 +63,10 @@ def small_disk(folder: Path) -> Iterator[tuple[Path, Callable[[], bool]]]:
 
 @contextlib.contextmanager
 def freezing_disk(folder: Path) -> Iterator[tuple[Path, Callable[[bool], bool]]]:
-    """A file system that can stand still.
+    """Mount a file system that can be frozen.
 
     Yields:
-        The run folder on it, and what lets it stand still (True) or go on (False): it says whether that can be done here.
+        The run folder on it, and a function that freezes (True) or thaws (False) it; it returns False if that is impossible.
     """
     disk, image = folder.with_name(f"{folder.name}-ice"), folder.with_name(f"{folder.name}-ice.img")
     disk.mkdir()

@@ -1,8 +1,8 @@
-"""Faults that strike a run, and what must hold then. `FAULTS` has them all.
+"""Faults injected into a training run, and their expected outcomes, listed in `FAULTS`.
 
-A strike lets its fault happen at a random moment of training and returns the exit status that the process ended with, or None
-where the run was over before. It raises `Broken` where what the fault itself promises was not kept; what all must keep
-(`Soak`) is looked at afterwards.
+A strike injects its fault at a random moment of training and returns the exit status of the process, or None if the run
+finished first. It raises `Broken` if the fault's own guarantee is violated; guarantees common to all faults are checked
+afterwards by `Soak`.
 """
 
 import contextlib
@@ -31,11 +31,11 @@ class Fault:
     """One kind of fault.
 
     Attributes:
-        strike: Of a run folder and dice.
-        promise: What must hold, for the table.
-        statuses: What the process may end with.
-        spoils: Whether a row of metrics.jsonl, or the run itself, may be gone afterwards.
-        goes_back: Whether a run may go on from an older checkpoint than the newest; `strike` looks whether it is the right one.
+        strike: Function of the run folder and a random generator that injects the fault.
+        promise: Guaranteed outcome, for the table.
+        statuses: Permitted exit statuses of the process.
+        spoils: True if a row of metrics.jsonl, or the run itself, may be lost.
+        goes_back: True if the run may resume from an older checkpoint than the newest; `strike` checks which one.
     """
 
     strike: Strike
@@ -46,10 +46,10 @@ class Fault:
 
 
 def _started(folder: Path, dice: random.Random, variables: dict[str, str] | None = None, file_bytes: int | None = None) -> Part:
-    """A part that is in the middle of training, or was over before.
+    """Start a process and return it at a random moment of training, or after its end if it finished first.
 
     Raises:
-        Broken: It did not come so far.
+        Broken: Training did not begin.
     """
     part = Part.start(folder, variables, file_bytes=file_bytes)
     if not part.wait_for(part.is_training) and (part.runs() or part.end() != 0):
@@ -104,7 +104,7 @@ def _second_process(folder: Path, dice: random.Random) -> int | None:
 
 
 def _full_disk(folder: Path, dice: random.Random) -> int | None:
-    """Somebody fills the disk, and all that is given back on it; where none can be mounted, no file may be large."""
+    """Fill the disk, including any space freed on it; if no disk can be mounted, limit the size of files instead."""
     with small_disk(folder) as (place, fill):
         limit = None if fill() and (place.parent / "other").unlink() is None else 100_000
         with killed_afterwards(_started(place, dice, file_bytes=limit)) as part:
@@ -130,7 +130,7 @@ def _stalled_disk(folder: Path, dice: random.Random) -> int | None:
 
 
 def _with_site(**variables: str) -> dict[str, str]:
-    """Variables of a process that imports `site/sitecustomize.py` as it starts."""
+    """Return ``variables``, extended by the path from which Python imports `site/sitecustomize.py` at startup."""
     return {**variables, "PYTHONPATH": os.pathsep.join((str(SITE), environment()["PYTHONPATH"]))}
 
 
@@ -154,14 +154,14 @@ def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
 
 
 def _killed(folder: Path, dice: random.Random) -> bool:
-    """SIGKILL in the middle of training; whether the run was still on, and has something saved."""
+    """Send SIGKILL during training; return True if the run had not finished and has a checkpoint."""
     with killed_afterwards(_started(folder, dice)) as part:
         part.wait_for(lambda: len(list_checkpoints(folder)) > 1, 20.0)
         return part.send(signal.SIGKILL) != 0 and bool(list_checkpoints(folder))
 
 
 def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
-    """Resume, and stop again in the middle of training; the exit status."""
+    """Resume, and stop again during training; return the exit status and the process."""
     with killed_afterwards(_started(folder, dice, variables)) as part:
         status = part.stop()
         part.check_words()
@@ -171,13 +171,13 @@ def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None
 
 
 def _check_went_back(folder: Path, before: list[dict[str, Any]], all_before: list[Checkpoint], good: list[Checkpoint]) -> None:
-    """Look whether a run that may have gone back before a damaged checkpoint went on from the newest good one.
+    """Check that a run with a damaged checkpoint resumed from the newest intact one.
 
     Args:
         folder: The run, resumed and stopped again.
-        before: Its rows before that.
-        all_before: Its checkpoints before that.
-        good: Those of them that were not damaged.
+        before: Its rows before it was resumed.
+        all_before: Its checkpoints before it was resumed.
+        good: The undamaged ones among ``all_before``.
     """
     newest, newest_good, last = (
         max((iteration for iteration, *_ in checkpoints), default=0)
@@ -212,7 +212,7 @@ def _damaged(folder: Path, dice: random.Random) -> int | None:
 
 
 def flip_a_bit(file: Path, dice: random.Random) -> int:
-    """Flips one bit of a file; which byte it is in."""
+    """Flip a random bit of a file; return the index of its byte."""
     contents = bytearray(file.read_bytes())
     place = dice.randrange(len(contents))
     contents[place] ^= 1 << dice.randrange(8)
@@ -229,7 +229,7 @@ def _bit_in_a_checkpoint(folder: Path, dice: random.Random) -> int | None:
     if tier == "recent":
         files += list(path.parent.glob("*.rollout"))
     flip_a_bit(dice.choices(files, [file.stat().st_size for file in files])[0], dice)
-    # Either it is found, or it says nothing about what the run goes on from: rows are compared at the end.
+    # The bit is either detected or does not affect the state that the run resumes from: rows are compared at the end.
     status = _resumed(folder, dice)[0]
     good = [entry for entry in there if entry[2] != path and not tier == entry[1] == "recent"]  # recent ones share rollouts
     _check_went_back(folder, rows, there, good)
@@ -245,7 +245,7 @@ def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
     row = file.read_bytes().splitlines()[number] if number < len(file.read_bytes().splitlines()) else b""
     done = max((iteration for iteration, *_ in list_checkpoints(folder)), default=0)
     status, part = _resumed(folder, dice)
-    # What was in the same line, and the one after it where the line's end was hit, may be gone; all others stay.
+    # The row of that line may be lost, and the next one if the line break was hit; all others are kept.
     others = [old for i, old in enumerate(before) if i not in (number, number + 1) and old["iteration"] <= done]
     if missing := [old["iteration"] for old in others if old not in read_rows(folder)]:
         raise Broken(f"rows {missing} were lost with row {number}: {part.lines}")
@@ -258,7 +258,7 @@ def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
 
 
 def _taken_away(is_kept: bool) -> Strike:
-    """Move the folder, and back when the process has ended; or delete it."""
+    """Return a strike that moves the folder, and back after the process has ended; or that deletes it."""
 
     def strike(folder: Path, dice: random.Random) -> int | None:
         there = folder.with_name(f"{folder.name}-{'moved' if is_kept else 'trash'}")
@@ -285,7 +285,7 @@ def _taken_away(is_kept: bool) -> Strike:
 
 
 def _lock_of_the_dead(folder: Path, dice: random.Random) -> int | None:
-    """Leave a dead process's lock. Where there are no locks a lease must run out, which takes a minute: seldom."""
+    """Leave the lock of a dead process. Without file locks a lease must expire, which takes a minute: rarely tried."""
     no_locks = dice.random() < 0.15
     variables = _with_site(SOAK_NO_LOCKS="1") if no_locks else _with_site()
     with killed_afterwards(_started(folder, dice, variables)) as part:
@@ -310,7 +310,7 @@ FAULTS: dict[str, Fault] = {
     "two signals": Fault(
         _signalled(signal.SIGTERM, signal.SIGTERM),
         "status 143 at once; the networks are saved",
-        (143, -signal.SIGTERM),  # the second may find the run saved, and its handler gone
+        (143, -signal.SIGTERM),  # the second one may arrive when the run is saved and its handler removed
     ),
     "second process": Fault(_second_process, "status 2 and one line; the first process goes on undisturbed", (143,)),
     "SIGKILL": Fault(_signalled(signal.SIGKILL), f"loses an iteration or two, {EXACT}", (-signal.SIGKILL,)),
@@ -337,4 +337,4 @@ FAULTS: dict[str, Fault] = {
     "lock of a dead process elsewhere": Fault(_lock_of_the_dead, "is taken over", (143,)),
     "clock jumps by up to a month": Fault(_jumping_clock, f"no duration follows it; {EXACT}", (143,)),
 }
-"""Those of a training run."""
+"""Faults of a training run by name."""

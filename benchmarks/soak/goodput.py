@@ -1,4 +1,4 @@
-"""A long run that is killed once a minute, and one that is left alone for the same number of steps."""
+"""Goodput of a long run that is killed at regular intervals, and an undisturbed run of as many steps."""
 
 import json
 import shutil
@@ -20,15 +20,15 @@ def _success(folder: Path) -> list[float]:
 
 
 def killed_every(folder: Path, every: float, minutes: float, options: Sequence[str]) -> dict[str, Any]:
-    """Train for so many minutes, killed every so many seconds; then what is there is evaluated.
+    """Train for some time, killing the process at regular intervals; then evaluate the result.
 
-    Where the folder holds such a run already, it goes on: so an hour can be had in pieces, whose kills and minutes are added.
+    A run that the folder already holds is continued, so that an hour can be split over several calls; kills and minutes add up.
 
     Args:
-        folder: The run's.
-        every: Seconds of a process.
-        minutes: In all.
-        options: Of ``train``: task and preset.
+        folder: The run folder.
+        every: Time between kills, s.
+        minutes: Duration of this call, minutes.
+        options: Options of ``train``: task and preset.
 
     Returns:
         ``env_steps`` of its networks, per seed; ``kills``; ``minutes``; ``goodput``, gradient steps in its networks over
@@ -55,7 +55,7 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
             break
     wall = earlier["minutes"] + (time.monotonic() - started) / 60.0
     notes.write_text(json.dumps({"kills": kills, "minutes": wall}))
-    # A copy is evaluated: the run itself has not ended, and may go on with its replay.
+    # Evaluate a copy: the run itself has not ended, and may be resumed with its replay.
     copy = folder.with_name(f"{folder.name}-evaluated")
     shutil.rmtree(copy, ignore_errors=True)
     shutil.copytree(folder, copy)
@@ -73,7 +73,7 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
 
 
 def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[float]:
-    """Success at the end of a run that is left alone, per seed; one that is there already is not trained again."""
+    """Return the final success of an undisturbed run, per seed; an existing run is not trained again."""
     with killed_afterwards(Part.start(folder, options=[*options, "--env-steps", str(env_steps)])) as part:
         if part.end(86400.0) != 0:
             raise Broken(f"the undisturbed run ended early: {part.lines[-3:]}")
@@ -81,7 +81,7 @@ def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[fl
 
 
 def report(killed: dict[str, Any], every: float, reference: Sequence[float] | None) -> dict[str, Any]:
-    """Print what was found, and return it for a file."""
+    """Print the results, and return them for a file."""
     beside = "" if reference is None else f", undisturbed {' '.join(f'{value:.3f}' for value in reference)}"
     print(
         "goodput {goodput:.4f} over {env_steps:,} environment steps and {minutes:g} minutes, killed {kills} times, every "

@@ -1,4 +1,4 @@
-"""One process of a run, and what its folder holds."""
+"""One process of a run, and the contents of its folder."""
 
 import contextlib
 import dataclasses
@@ -22,19 +22,19 @@ OPTIONS = [
 
 
 PRECEDENCE = ("light", "recent", "full")
-"""Tiers of checkpoints; of those of the same iteration, a run goes on from the last."""
+"""Tiers of checkpoints; among those of the same iteration, a run resumes from the last in this order."""
 
 
 class Broken(AssertionError):
-    """A promise was not kept."""
+    """Violation of a guarantee."""
 
 
 LAST = threading.local()
-"""Output of the last process that ended in this thread: ``lines``."""
+"""Thread-local output of the last process that ended, as ``lines``."""
 
 
 def environment() -> dict[str, str]:
-    """Variables for a run of the checkout, on the CPU; programs that were traced once are kept, as for any user."""
+    """Return the environment variables of a run of the checkout on the CPU; traced programs are cached, as for any user."""
     root = Path(__file__).parents[2]
     paths = os.pathsep.join(filter(None, (str(root), str(root / "envs"), os.environ.get("PYTHONPATH"))))
     variables = {name: value for name, value in os.environ.items() if name != "JAXRL_VIS_KEEP_PROGRAMS"}
@@ -42,7 +42,7 @@ def environment() -> dict[str, str]:
 
 
 def read_rows(folder: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]:
-    """Rows of a run's metrics without their times and the run's id; a line that is not one is left out."""
+    """Read the rows of a run's metrics, without times and the run's id; invalid lines are omitted."""
     rows = []
     file = folder / name
     for line in file.read_bytes().splitlines() if file.exists() else []:
@@ -56,7 +56,7 @@ def read_rows(folder: Path, name: str = "metrics.jsonl") -> list[dict[str, Any]]
 
 
 def list_checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
-    """Finished checkpoints, iteration, tier, file or folder; the last one is what a run goes on from, if it is good."""
+    """List the complete checkpoints (iteration, tier, file or folder); a run resumes from the last one, if it is intact."""
     places = [path for path in folder.glob("checkpoints/*/*") if path.parent.name in PRECEDENCE]
     names = [(path.name.removesuffix(".state"), path) for path in places]
     there = [(int(name), path.parent.name, path) for name, path in names if name.isdigit()]
@@ -70,7 +70,7 @@ class Part:
     Attributes:
         folder: The run folder.
         process: The process.
-        lines: What it has said so far, stdout and stderr.
+        lines: Lines printed so far, stdout and stderr.
     """
 
     folder: Path
@@ -85,7 +85,7 @@ class Part:
         options: Sequence[str] = OPTIONS,
         file_bytes: int | None = None,
     ) -> "Part":
-        """Start or resume the run in ``folder``; no file may become larger than ``file_bytes``."""
+        """Start or resume the run in ``folder``; ``file_bytes`` limits the size of each file."""
         goes_on = ["--resume"] if folder.exists() else []
         command = [sys.executable, "-m", "jaxrl_vis", "train", *options, "--run-dir", str(folder), *goes_on]
         return cls.command(command, folder, variables, file_bytes)
@@ -94,7 +94,7 @@ class Part:
     def command(
         cls, command: Sequence[str], folder: Path, variables: dict[str, str] | None = None, file_bytes: int | None = None
     ) -> "Part":
-        """Start any command, which works beside ``folder``."""
+        """Start any command in the parent of ``folder``."""
 
         def prepare() -> None:
             for number in (signal.SIGINT, signal.SIGHUP):  # ignored if the soak was started in the background
@@ -119,10 +119,10 @@ class Part:
             self.lines.append(line.rstrip())
 
     def end(self, seconds: float = 240.0) -> int:
-        """Wait for the process and its last line; its exit status.
+        """Wait for the process and its last line; return its exit status.
 
         Raises:
-            Broken: It does not end.
+            Broken: The process does not end in time; it is killed.
         """
         try:
             status = self.process.wait(seconds)
@@ -135,20 +135,20 @@ class Part:
         return status
 
     def send(self, number: int) -> int:
-        """Send a signal and wait for the end; the exit status."""
+        """Send a signal and wait for the end; return the exit status."""
         self.process.send_signal(number)
         return self.end()
 
     def stop(self) -> int:
-        """SIGTERM, where the process still runs, and its end."""
+        """Send SIGTERM if the process still runs, and wait for its end; return the exit status."""
         return self.send(signal.SIGTERM) if self.runs() else self.end()
 
     def runs(self) -> bool:
-        """Return whether the process has not ended yet."""
+        """Return True if the process has not ended yet."""
         return self.process.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
-        """Wait until something is so, and say whether it is; not longer than the process runs."""
+        """Wait for a condition, at most until the process ends; return True if it holds."""
         deadline = time.monotonic() + seconds
         while self.runs() and time.monotonic() < deadline:
             if condition():
@@ -157,23 +157,23 @@ class Part:
         return condition()
 
     def is_compiling(self) -> bool:
-        """Return whether compilation has begun."""
+        """Return True if compilation has begun."""
         return any(line.startswith("compiling") for line in self.lines)
 
     def is_training(self) -> bool:
-        """Return whether compilation is over."""
+        """Return True if compilation is over."""
         return any(line.startswith("compiled in") for line in self.lines)
 
     def is_saving(self) -> bool:
-        """Return whether a checkpoint is half written."""
+        """Return True if a checkpoint is being written."""
         return any("tmp" in path.name for path in self.folder.glob("checkpoints/*/*"))
 
     def count(self, words: str) -> int:
-        """In how many lines these words were said."""
+        """Count the printed lines that contain ``words``."""
         return sum(words in line for line in self.lines)
 
     def check_words(self) -> None:
-        """Raise `Broken` where there was a traceback, or Python's own words for a crash."""
+        """Raise `Broken` if a traceback or a fatal error of Python was printed."""
         said = "\n".join(self.lines)
         if "Traceback" in said or "Fatal Python error" in said:
             raise Broken(f"a traceback\n{said}")
@@ -181,7 +181,7 @@ class Part:
 
 @contextlib.contextmanager
 def killed_afterwards(part: Part) -> Iterator[Part]:
-    """Leaves no process behind, whatever happens."""
+    """Kill the process and its group on exit, if it still runs."""
     try:
         yield part
     finally:

@@ -1,4 +1,4 @@
-"""Record of a soak as a file, and several of them as one table."""
+"""Record of a soak in a file, and the table of several records."""
 
 import dataclasses
 import json
@@ -31,14 +31,14 @@ class Record:
 
     Attributes:
         machine: Commit, versions, cores.
-        seed: Of what happened when.
-        minutes: How long it took.
-        faults: How often each kind struck.
-        runs: Training runs that came to their end.
-        exact: Those of them whose metrics.jsonl was that of an undisturbed run, bit for bit.
-        done, begun: Iterations in their networks, and those begun by all their processes.
-        resumes, replays_lost: How often they were resumed, and how often without their replay.
-        broken: What did not hold, in words.
+        seed: Seed of the order and times of the faults.
+        minutes: Duration, minutes.
+        faults: Number of faults of each kind.
+        runs: Number of completed training runs.
+        exact: Number of completed runs whose metrics.jsonl equals that of an undisturbed run, bit for bit.
+        done, begun: Iterations contained in their networks, and iterations begun by all their processes.
+        resumes, replays_lost: Number of resumptions, and of resumptions without the replay.
+        broken: Violated guarantees, as text.
     """
 
     machine: dict[str, Any] = dataclasses.field(default_factory=_machine)
@@ -55,11 +55,11 @@ class Record:
 
     @property
     def total(self) -> int:
-        """All faults."""
+        """Total number of faults."""
         return sum(self.faults.values())
 
     def write(self, path: Path) -> None:
-        """Write it, so that whoever is killed leaves a record, too."""
+        """Write the record atomically, so that a killed soak leaves one, too."""
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".tmp")
         temporary.write_text(json.dumps(dataclasses.asdict(self), indent=1) + "\n")
@@ -67,11 +67,11 @@ class Record:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The inverse of `write`."""
+        """Read a record written by `write`."""
         return cls(**json.loads(path.read_text()))
 
     def table(self) -> str:
-        """Table of all faults, as Markdown."""
+        """Format the table of all faults as Markdown."""
         lines = ["| fault | times | what must hold |", "|---|---|---|"]
         lines += [f"| {name} | {self.faults.get(name, 0)} | {promise} |" for name, promise in PROMISES.items()]
         share = self.done / self.begun if self.begun else 1.0
@@ -85,10 +85,10 @@ class Record:
 
 
 def added(records: Sequence[Record]) -> Record:
-    """Several soaks of one commit as one.
+    """Add up several soaks of one commit.
 
     Raises:
-        ValueError: They are of different commits.
+        ValueError: They are of different commits, or two have the same seed.
     """
     if len(commits := {record.machine["commit"] for record in records}) > 1:
         raise ValueError(f"records of different commits: {', '.join(sorted(map(str, commits)))}")

@@ -1,4 +1,4 @@
-"""Runs, each struck by several faults, resumed after each, and compared with an undisturbed one."""
+"""Runs with several faults each, resumed after each fault, and compared with an undisturbed run."""
 
 import itertools
 import random
@@ -20,15 +20,15 @@ FAULTS_PER_RUN = 8
 
 
 class Soak:
-    """All faults; several runs go on at the same time.
+    """Injection of all faults into several concurrent runs.
 
     Args:
-        folder: Where runs lie.
-        faults: How many there are to be at most.
-        seed: Of what happens when.
-        seconds: After so long no fault begins any more.
+        folder: Folder of the runs.
+        faults: Maximum number of faults.
+        seed: Seed of the order and times of the faults.
+        seconds: Time after which no further fault begins, s.
         note: Called with the record after each fault.
-        alone: Whether there are faults with folders of their own, too, which take longer.
+        alone: Include faults with folders of their own (`benchmarks.soak.alone`), which take longer.
     """
 
     def __init__(
@@ -45,14 +45,14 @@ class Soak:
         self.reference: list[dict[str, Any]] = []
 
     def undisturbed(self) -> None:
-        """The run that others are compared with."""
+        """Train the run that others are compared with."""
         with killed_afterwards(Part.start(self._folder / "reference")) as part:
             if part.end() != 0:
                 raise Broken("\n".join(part.lines))
         self.reference = read_rows(part.folder)
 
     def _next(self, kinds: dict[str, Any]) -> str | None:
-        """The next fault of these kinds, each as often as the others; None where it is time to end."""
+        """Draw the next fault of these kinds, all equally often; None if it is time to end."""
         with self._lock:
             if self._left <= 0 or time.monotonic() > self._deadline:
                 return None
@@ -63,7 +63,7 @@ class Soak:
             return deck.pop()
 
     def _again(self, kinds: dict[str, Any], fault: str) -> None:
-        """Put back a fault that has found nothing to strike any more."""
+        """Return a fault to the deck, because the run had finished before it."""
         with self._lock:
             self._left += 1
             self._decks[next(iter(kinds))].insert(0, fault)
@@ -83,18 +83,18 @@ class Soak:
             self._note(self.record)
 
     def work(self, worker: int) -> None:
-        """A run, then a fault with a folder of its own, and so on until it is time to end."""
+        """Alternate between a run and a fault with a folder of its own, until it is time to end."""
         for turn in itertools.count():
             number = 1000 * worker + turn
             dice, place = random.Random(f"{self._seed} {number}"), self._folder / f"run{number}"
             faults: list[str] = []
             try:
-                # Workers begin with different things, for all kinds are to be met in a short soak, too.
+                # Workers begin with different kinds, so that a short soak covers both.
                 if self._alone and (turn + worker) % 2:
                     going = self._one_alone(place, dice, faults)
                 else:
                     going = self._one_run(place, dice, faults)
-            except Exception as error:  # the others go on; the folder stays as it is
+            except Exception as error:  # the others continue; the folder is kept for inspection
                 self._broke(place, faults, error)
                 going = True
             if not going:
@@ -112,7 +112,7 @@ class Soak:
         return True
 
     def _one_run(self, folder: Path, dice: random.Random, faults: list[str]) -> bool:
-        """One run to its end; False where no fault is left for it."""
+        """Train one run to its end, with faults; return False if none is left for it."""
         spoilt, fault = False, None
         while len(faults) < FAULTS_PER_RUN:
             fault = self._next(FAULTS)
@@ -121,7 +121,7 @@ class Soak:
             faults.append(fault)
             before, good = read_rows(folder), list_checkpoints(folder)
             status = FAULTS[fault].strike(folder, dice)
-            if status is None:  # the run was over before
+            if status is None:  # the run finished before the fault
                 self._again(FAULTS, faults.pop())
                 break
             if status not in FAULTS[fault].statuses:
@@ -130,7 +130,7 @@ class Soak:
             if folder.exists() and not (FAULTS[fault].spoils or FAULTS[fault].goes_back):
                 self._check_kept(folder, before, good[-1][0] if good else 0)
             self._struck(folder.name, fault, f"status {status}")
-        if not faults:  # there was nothing to strike, or it is time to end
+        if not faults:  # the run finished before the first fault, or it is time to end
             shutil.rmtree(folder, ignore_errors=True)
             return fault is not None
         with killed_afterwards(Part.start(folder)) as part:
@@ -141,18 +141,18 @@ class Soak:
         return True
 
     def _check_kept(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
-        """Look whether something is lost.
+        """Check that no rows and no checkpoints were lost.
 
         Args:
             folder: The run.
-            before: The rows that there were when its last part began.
-            checkpointed: The iteration of the newest checkpoint at that time.
+            before: The rows when its last process began.
+            checkpointed: Iteration of the newest checkpoint at that time.
         """
         old = [row for row in before if row["iteration"] <= checkpointed]
         if read_rows(folder)[: len(old)] != old:
             raise Broken(f"rows from before iteration {checkpointed} were lost")
         newest = max((iteration for iteration, *_ in list_checkpoints(folder)), default=0)
-        # A recent state may have been given up for want of room, and a damaged one is put aside.
+        # A recent state may have been dropped for lack of space, and a damaged one is set aside.
         if newest < checkpointed - 1:
             raise Broken(f"the newest checkpoint was of iteration {checkpointed}, and is of {newest}")
 

@@ -1,9 +1,9 @@
-"""Fits the gate of a file of weights, and measures it: `python -m benchmarks.stalks.gate FOLDER --weights WEIGHTS`.
+"""Fit the gate of a weights file, and measure it: `python -m benchmarks.stalks.gate FOLDER --weights WEIGHTS`.
 
-Images of several families are drawn into FOLDER, and not again if they are there. The gate is fitted on those of the first
-seeds, its threshold too, and written beside the weights; what is printed comes from other seeds. A control sees nothing of an
-image but its mean brightness and its sharpness. Real images have no part in any of it: `--photographs MODULE:FUNCTION` names a
-function that yields (image, number of stalks, number that the boxes [N, 4] find), and these are only measured.
+Images of several families are rendered into FOLDER unless they exist. The gate and its threshold are fitted on the images of
+the first seeds, and written beside the weights; the printed figures come from other seeds. A control uses only mean brightness
+and sharpness of an image. Real images are never fitted on: `--photographs MODULE:FUNCTION` names a function that yields (image,
+number of stalks, function from boxes [N, 4] to the number of stalks that they detect), and these are only evaluated.
 """
 
 import argparse
@@ -32,11 +32,11 @@ from jaxrl_vis_envs.plants.pairs import Sequence
 FAMILIES = Path(__file__).with_name("families")
 SPECS = ("daylight_all", "daylight_near", "maize_by_day", "thin_wet")
 PLOTS = {"training": 28, "shifted": 28, "daylight_all": 36, "daylight_near": 20, "maize_by_day": 8, "thin_wet": 8}
-"""Plots of each family that the gate is fitted on; as many are tried."""
+"""Number of plots of each family for fitting, and for testing."""
 FIRST_SEEDS = {"fit": 20_000, "test": 30_000}
 WIDTH, FRAMES = 844, 2
 RIGHT = 0.8
-"""F1 of an image's finds from which on it is read rightly."""
+"""Minimum F1 of the detections of an image that counts as correct."""
 MOST_FLAGGED = 0.04
 AXES = 8
 Photograph = tuple[np.ndarray, int, Callable[[np.ndarray], int]]
@@ -44,7 +44,7 @@ Photograph = tuple[np.ndarray, int, Callable[[np.ndarray], int]]
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What is known of an image: its family, pooled features, scores, F1 of its finds, mean brightness and sharpness."""
+    """Family, pooled features, scores, F1 of the detections, and (mean brightness, sharpness) of an image."""
 
     family: str
     pooled: np.ndarray
@@ -54,7 +54,7 @@ class Seen:
 
 
 def draw(folder: Path, part: str, family: str, number: int) -> Path:
-    """Draw images of one plot with their stalks into a file, unless it is there; return the file."""
+    """Render images of one plot with their stalks into a file, unless it exists; return the file."""
     path = folder / f"{part}_{family}_{number}.npz"
     if path.exists():
         return path
@@ -74,13 +74,13 @@ def draw(folder: Path, part: str, family: str, number: int) -> Path:
 
 
 def plain_measures(image: np.ndarray) -> tuple[float, float]:
-    """Return mean brightness and the logarithm of the variance of the Laplacian of an image [H, W, 3] uint8."""
+    """Return mean brightness, and sharpness (logarithm of the Laplacian's variance), of an image [H, W, 3] uint8."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64)
     return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
 
 
 def see(finder: Finder, image: np.ndarray, density: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return finds [N, 6] of an image in its own coordinates, their scores, and the pooled features."""
+    """Detect stalks in an image: return detections [N, 6] in its own coordinates, their scores, and the pooled features."""
     frame = find_frame(image)
     stalks, scores, pooled = finder.look(fill_borders(image, frame), density)
     over, down = frame.columns[0], frame.lines[0]
@@ -88,12 +88,12 @@ def see(finder: Finder, image: np.ndarray, density: float | None) -> tuple[np.nd
 
 
 def f1_of(hits: int, finds: int, stalks: int) -> float:
-    """Return F1, 1 where there is nothing and nothing is found."""
+    """Return the F1 score; 1 if there is nothing and nothing is detected."""
     return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
 
 
 def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
-    """Look at the images of a file of `draw`, or read what networks of this name saw in them before."""
+    """Evaluate the images of a file of `draw`, or read the cached results of the detector of this name."""
     kept = path.with_suffix(f".{name.split()[-1]}.npz")
     if not kept.exists():
         arrays = {}
@@ -122,7 +122,7 @@ def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
 
 
 def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
-    """Look at photographs, of whose cameras nothing is known."""
+    """Evaluate photographs, whose cameras are unknown."""
     for image, count, found in photographs:
         stalks, scores, pooled = see(finder, image, None)
         boxes = stalks[scores >= LEAST_SCORE][:, :4]
@@ -130,13 +130,13 @@ def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> It
 
 
 def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
-    """Return the chance that a wrong one has a higher value than a right one."""
+    """Return the probability that a wrong image has a higher value than a correct one; NaN without such pairs."""
     above = values[wrong][:, None] - values[~wrong][None, :]
     return float(np.mean((above > 0) + 0.5 * (above == 0))) if above.size else float("nan")
 
 
 def control(fitted: list[Seen], tried: list[Seen]) -> np.ndarray:
-    """Return doubts [N] of a regression on brightness and sharpness, their squares and product."""
+    """Return the doubts [N] by a logistic regression on brightness and sharpness, their squares and product."""
 
     def inputs(images: list[Seen]) -> np.ndarray:
         plain = (np.array([image.plain for image in images]) - [100.0, 6.0]) / [50.0, 2.0]
@@ -167,7 +167,7 @@ def _made(folder: Path, tasks: list[tuple[str, str, int]], place: int) -> dict[s
 
 
 def main() -> None:
-    """Draw, fit, write and measure."""
+    """Render, fit, write and measure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--weights", type=Path, default=SHIPPED)
@@ -175,7 +175,7 @@ def main() -> None:
     parser.add_argument("--photographs", help="module:function")
     parser.add_argument("--drawn", action="store_true", help="use the images that are there, and draw none")
     options = parser.parse_args()
-    # By number first, so that what was drawn when one stopped is a little of everything.
+    # Ordered by number first, so that an interrupted rendering covers all families.
     tasks = [
         (part, family, number)
         for number in range(max(PLOTS.values()))

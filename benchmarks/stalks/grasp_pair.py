@@ -1,9 +1,9 @@
-"""Time of one pair of 1,024 x 1,024 images up to its grasp points, from arrays in memory.
+"""Time from one pair of 1,024 x 1,024 images, as arrays in memory, to its grasp points.
 
     python -m benchmarks.stalks.grasp_pair [--workers 1 8 15]
 
-Matching, masks, clouds, stitches and grasp points of runs of five pairs of the shifted family; drawing them is left out.
-``--workers`` gives the time of a pair with so many processes, as with `grasp eval --workers`.
+Covers matching, masks, point clouds, stitching and grasp points of runs of five pairs of the shifted family, without rendering.
+``--workers`` gives the time per pair with that number of processes, as with `grasp eval --workers`.
 """
 
 import functools
@@ -24,12 +24,12 @@ from jaxrl_vis_envs.plants.grasping import GRASPING_FAMILIES
 
 
 def look(scene: Scene, painter: Painter) -> Perception:
-    """All that a run's pairs say."""
+    """Compute the perception of all pairs of a run."""
     return perceive(scene.views, lambda image, _: painter(image), scene.drive.stated, scene.mount)
 
 
 def make(path: Path) -> tuple[Once, int]:
-    """Make the work of a process on the runs in a file."""
+    """Return the job of a process on the runs in a file, and their number; see `print_rate`."""
     scenes = pickle.loads(path.read_bytes())
     params, settings, _ = read_weights(SHIPPED)
     painter = Painter(params, settings)

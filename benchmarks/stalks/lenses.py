@@ -1,8 +1,8 @@
 """Counts and widths of one synthetic row through lenses of other focal lengths: `python -m benchmarks.stalks.lenses FOLDER`.
 
-The pairs of each lens are drawn into FOLDER, which takes minutes on a GPU and much longer without, and not again if they are
-there. Nothing is refused here: what `phenotype run` refuses follows from this table. With `--results benchmarks/results` the
-figures go into the record that docs/phenotyping.md quotes, each lens in place of what the record had of it.
+The pairs of each lens are rendered into FOLDER unless they exist, which takes minutes on a GPU and much longer without. Nothing
+is refused here: the limits of `phenotype run` follow from this table. With `--results benchmarks/results` the figures go into
+the record that docs/phenotyping.md quotes, replacing the earlier ones of the same lens.
 """
 
 import argparse
@@ -39,7 +39,7 @@ SEED, WIDTH, PAIRS = 5, 1055, 12
 
 
 def draw(folder: Path, factor: float) -> Path:
-    """Draw the row through a lens of a ``factor`` of the usual focal length, unless it is there; return its folder."""
+    """Render the row through a lens of ``factor`` times the usual focal length, unless it exists; return its folder."""
     out = folder / f"{factor:g}"
     spec = folder / f"{factor:g}.toml"
     folder.mkdir(parents=True, exist_ok=True)
@@ -51,11 +51,11 @@ def draw(folder: Path, factor: float) -> Path:
 
 
 def look(plot: Path, finder: Finder) -> dict[str, Any]:
-    """Find, measure and count the stalks of a drawn row; return figures, and the width of each stalk by its index.
+    """Detect, measure and count the stalks of a rendered row.
 
     Returns:
-        Pixels per metre and height of the view in m; numbers of stalks, true and counted, of clear sightings, found ones and
-        false finds; share of pairs in which the ground is seen; errors of widths in mm by the index of the stalk.
+        Pixels per metre, and height of the view in m; numbers of true and counted stalks, clear sightings, correct detections
+        and false ones; fraction of pairs in which the ground was found; errors of widths in mm, by index of the stalk.
     """
     truth, calibration = read_json(plot / "plot.json"), read_calibration(plot / "calibration.yaml")
     with (plot / "odometry.csv").open(newline="", encoding="utf-8") as file:
@@ -98,7 +98,7 @@ def look(plot: Path, finder: Finder) -> dict[str, Any]:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Draw, measure, print the table, and keep the record where it is asked for."""
+    """Render, measure, print the table, and update the record if requested; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folder", type=Path, help="where the pairs are drawn")
     parser.add_argument("--factors", type=float, nargs="+", default=FACTORS)

@@ -1,4 +1,4 @@
-"""Draws the short row that ships with the package: `python -m benchmarks.stalks.make_sample_row`.
+"""Render the short row that ships with the package: `python -m benchmarks.stalks.make_sample_row`.
 
 Synthetic, three pairs of 1055 x 845 pixels as JPEG, with calibration and odometry, and the true diameters in plot.json.
 """

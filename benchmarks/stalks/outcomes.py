@@ -1,8 +1,8 @@
-"""Outcome of each case of files from elsewhere, as a table: `python -m benchmarks.stalks.outcomes FOLDER`.
+"""Table of the outcomes of third-party input files: `python -m benchmarks.stalks.outcomes FOLDER`.
 
 FOLDER holds folders of cases: calib (a calibration each), ann (a folder of annotated images each), files (a folder of plots
-each) and odo (a plot with its odometry each). A line says what was read, or the one line of the error; anything else is a
-fault, and the exit status is 1.
+each) and odo (a plot with its odometry each). A line shows what was read, or the error in one line; anything else is a fault,
+and the exit status is 1.
 """
 
 import argparse
@@ -58,7 +58,7 @@ KINDS: dict[str, Callable[[Path], str]] = {"calib": calibration, "ann": annotati
 
 
 def outcomes(folder: Path) -> list[tuple[str, str, str]]:
-    """Kind, name and outcome of each case; an outcome that begins with FAULT is neither a value nor one line."""
+    """Return kind, name and outcome of each case; FAULT marks unexpected exceptions and outcomes of more than one line."""
     rows = []
     for kind, read in KINDS.items():
         for case in sorted((folder / kind).iterdir()) if (folder / kind).is_dir() else ():
@@ -66,14 +66,14 @@ def outcomes(folder: Path) -> list[tuple[str, str, str]]:
                 outcome = read(case)
             except RequestError as error:
                 outcome = f"refused: {error}".replace(f"{case}/", "").replace(str(case), case.name)
-            except Exception as error:  # what a case must not end with
+            except Exception as error:  # the fault that this is to detect
                 outcome = f"FAULT {type(error).__name__}: {error}"
             rows.append((kind, case.name, outcome if len(outcome.splitlines()) == 1 else f"FAULT {outcome!r}"))
     return rows
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Print the table of a folder of cases; return 1 if any is a fault."""
+    """Print the table of a folder of cases; return 1 if any is a fault, else 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("folder", type=Path)
     rows = outcomes(parser.parse_args(words).folder)

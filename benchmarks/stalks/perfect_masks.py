@@ -1,7 +1,7 @@
 """Error of widths with perfect detection and masks: `python -m benchmarks.stalks.perfect_masks`.
 
-Synthetic pairs; true masks of the band around 12 inches; our own disparity and our own widths against the diameter that faces
-the cameras at the height that was measured, sheaths included. What detection and segmentation add comes on top.
+Synthetic pairs with true masks of the band around 12 inches. Our disparities and widths are compared with the diameter that
+faces the cameras at the measured height, sheaths included. Errors of detection and segmentation come on top.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from jaxrl_vis_envs.plants.truth import outline, stalks_in_view
 
 
 def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]]:
-    """Measurements of one pair beside the truth, mm; stalks of which less than 0.3 is seen are left out."""
+    """Measure one pair: return visibility, confidence and error (mm) by method, for stalks that are at least 0.3 visible."""
     sequence = Sequence.of(draw(family, seed))
     pair, drive = sequence[frame], sequence.drive
     instance, left, right = np.asarray(pair.instance), grey(np.asarray(pair.left)), grey(np.asarray(pair.right))
@@ -36,7 +36,7 @@ def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]
             heights = np.linspace(0.0, 0.6, 1201)
             lines = outline(stalk, pair.pose, drive.true, heights)[:, :, 1].mean(axis=1)
             height = float(heights[np.argmin(np.abs(lines - got.line))])
-            # At a node, the stalk above and below it is meant.
+            # Near a node, the true diameter is the mean of those above and below it.
             beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
             true = 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
             row |= {method: got.diameter_mm - true, "confidence": got.confidence}

@@ -1,8 +1,8 @@
-"""Time and memory for one pair of 9 megapixels, from arrays in memory: `python -m benchmarks.stalks.phenotype_pair`.
+"""Time and memory for one pair of 9-megapixel images, as arrays in memory: `python -m benchmarks.stalks.phenotype_pair`.
 
-Finding, outlining, disparity, ground and widths; a synthetic pair of the shifted family; decoding of files is not in it. Parts
-are timed one after the other in repeats of their own; in the whole, the ground is found while the networks compute.
-``--workers 1 8 14`` says how long a pair takes where so many processes look at pairs, as with `phenotype run --workers`.
+Covers detection, segmentation, disparity, ground and widths of a synthetic pair of the shifted family, without decoding of
+files. Parts are timed separately; in the whole, the ground is found while the networks compute. ``--workers 1 8 14`` gives the
+time per pair with each of these numbers of processes, as with `phenotype run --workers`.
 """
 
 import functools
@@ -29,7 +29,7 @@ from jaxrl_vis_envs.plants.truth import stalks_in_view
 
 
 def make(path: Path, stated: Calibration) -> tuple[Once, int]:
-    """Make the work of a process on the pairs in a file."""
+    """Return the job of a process on the pairs in a file, and their number; see `print_rate`."""
     images = list(np.load(path).values())
     pairs = list(zip(images[::2], images[1::2]))
     params, settings, _ = read_weights(SHIPPED)
@@ -53,7 +53,7 @@ if __name__ == "__main__":
     finder = Finder(params, settings)
 
     def once() -> tuple[Any, Any, list[Any]]:
-        """Process one pair: finds, ground and sightings."""
+        """Process one pair: detections, ground and sightings."""
         detections, ground = find_with_ground(finder, left, right, stated)
         return detections, ground, measure_pair(detections, left, right, stated, ground=ground)
 

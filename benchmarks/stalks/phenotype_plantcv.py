@@ -1,12 +1,12 @@
-"""Widths of the same masks by PlantCV's `morphology.segment_width` and by ours, on synthetic plots with exact truth.
+"""Comparison of widths of the same masks by PlantCV's `morphology.segment_width` and by ours, on synthetic plots.
 
-PlantCV is no dependency, and brings its own versions of much. So this goes in two steps, which may run on two machines:
+PlantCV is not a dependency, and pins versions of many packages. So there are two steps, which may run on two machines:
 
-    python benchmarks/stalks/phenotype_plantcv.py masks.npz --plots 10     # here: draws plots, finds stalks, keeps their masks
-    python benchmarks/stalks/phenotype_plantcv.py masks.npz                # with PlantCV installed; needs only NumPy besides
+    python benchmarks/stalks/phenotype_plantcv.py masks.npz --plots 10    # here: render plots, detect stalks, store their masks
+    python benchmarks/stalks/phenotype_plantcv.py masks.npz               # with PlantCV installed; needs only NumPy besides
 
-PlantCV measures pixels. Ours are turned to millimetres by stereo, its own by the same factor for the same mask, so that what is
-compared is the width of a mask alone. PlantCV's way is that of its documentation: skeletonize, prune, segment_width.
+PlantCV measures pixels. Our widths are converted to millimetres by stereo, and PlantCV's by the same factor for the same mask,
+so that only the widths of masks are compared. PlantCV is used as documented: skeletonize, prune, segment_width.
 """
 
 import argparse
@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 
 PRUNED = 50
-"""Pixels: barbs of a skeleton that PlantCV cuts off, about as long as its examples say."""
+"""Length of the skeleton's barbs that PlantCV prunes, pixels; about that of its examples."""
 
 Masks = tuple[list[np.ndarray], list[tuple[float, ...]]]
-"""Masks, packed, and of each: seed, stalk, its shape, mm per pixel, our width and the true one in mm, lean in degrees."""
+"""Packed masks, and for each: seed, stalk, height, width, mm per pixel, our width and the true one in mm, lean in degrees."""
 
 
 def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
-    """Draw a plot: its seed, and the masks of what is measured at 12 inches with our width and the truth."""
+    """Render a plot; return its seed, and the masks that are measured at 12 inches with our width and the truth."""
     import dataclasses
 
     from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
@@ -67,7 +67,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
 
 
 def keep_masks(options: argparse.Namespace) -> None:
-    """Draw plots, and write their masks."""
+    """Render plots, and write their masks."""
     from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 
     if options.workers > 1:
@@ -93,7 +93,7 @@ def _masks_are(options: argparse.Namespace) -> str:
 
 
 def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
-    """Mean width of a mask [H, W] bool in pixels; not a number where PlantCV finds none."""
+    """Return PlantCV's mean width of a mask [H, W] bool, in pixels; NaN if it finds none."""
     padded = np.pad(mask.astype(np.uint8) * 255, 3)
     skeleton = pcv.morphology.skeletonize(mask=padded)
     skeleton, segmented, _ = pcv.morphology.prune(skel_img=skeleton, size=PRUNED)
@@ -105,7 +105,7 @@ def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
 
 
 def compare(file: Path) -> None:
-    """Print errors of both, mm."""
+    """Print the errors of both, mm."""
     try:
         from plantcv import plantcv as pcv  # pyright: ignore[reportMissingImports]
     except ImportError:

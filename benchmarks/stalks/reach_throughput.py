@@ -1,9 +1,9 @@
-"""Arms that reach at once: reaches a second.
+"""Throughput of simulated reaches, in reaches per second.
 
     python -m benchmarks.stalks.reach_throughput [--arms 1000] [--wind 10] [--json FILE]
 
-Each arm goes to a stalk of a plot of its own place, truth as its target, among 6 stalks in wind. The first call compiles; the
-median of the following three is what counts, from arrays on the host to arrays on the host.
+Each arm reaches for a stalk among 6 stalks in wind, with the true position as its target. The first call compiles; the result
+is the median of the following three, from arrays on the host to arrays on the host.
 """
 
 import argparse
@@ -28,7 +28,7 @@ _PLOTS = 16
 
 
 def scenes(arms: int, seed: int = 0) -> tuple[Any, np.ndarray]:
-    """Stands and targets [arms, 3] (m): stalks of a few plots at heights of 0.5 to 0.9 m, masts within 0.1 m of them."""
+    """Draw stands and targets [arms, 3] (m): stalks of a few plots at heights of 0.5 to 0.9 m, masts within 0.1 m of them."""
     rng = np.random.default_rng(seed)
     plots = [draw(TRAINING, seed * _PLOTS + index) for index in range(_PLOTS)]
     chosen = [plots[rng.integers(_PLOTS)] for _ in range(arms)]
@@ -37,7 +37,7 @@ def scenes(arms: int, seed: int = 0) -> tuple[Any, np.ndarray]:
 
 
 def main() -> int:
-    """Print the figure, and write it where it is asked to."""
+    """Print the result, and write it to a file if requested; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, default=1000)
     parser.add_argument("--wind", type=float, default=10.0, help="mm")

@@ -1,7 +1,8 @@
-"""Error of every estimator of width on ideal strips: `python -m benchmarks.stalks.strip_widths`.
+"""Error of every width estimator on ideal strips: `python -m benchmarks.stalks.strip_widths`.
 
-A strip is a rectangle of known width, drawn leaning at many sub-pixel places, as pixels whose middle it covers (hard) and as
-the share of each pixel that it covers (soft). The figure is the largest mean error over widths, the mean being over places.
+A strip is a tilted rectangle of known width, rasterised at many sub-pixel positions: as the pixels whose centre it covers
+(hard), or as the covered fraction of each pixel (soft). The result is the mean error over positions, at the width where it is
+largest.
 """
 
 import argparse
@@ -15,14 +16,14 @@ LEANS = (0.0, 2.0, 8.0, 14.0, 20.0)
 
 
 def ideal_strip(width: float, ratio: float, lean: float, place: tuple[float, float], soft: bool) -> np.ndarray:
-    """A strip's mask [H, W]: float32 shares of pixels, or bool.
+    """Rasterise the mask of a strip [H, W]: covered fraction of each pixel, float32, or bool.
 
     Args:
-        width: Across the axis, pixels.
-        ratio: Length over width.
-        lean: Degrees.
-        place: Of its middle, from the middle of a pixel, in pixels.
-        soft: Whether a pixel has the share of it that is covered.
+        width: Width across the axis, pixels.
+        ratio: Ratio of length to width.
+        lean: Tilt, degrees.
+        place: Offset (x, y) of its centre from a pixel's centre, pixels.
+        soft: Return fractions instead of bool.
     """
     fine = 8 if soft else 1
     half = int(0.5 * width * np.hypot(ratio, 1.0)) + 4
@@ -38,7 +39,7 @@ def ideal_strip(width: float, ratio: float, lean: float, place: tuple[float, flo
 
 
 def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, widths: tuple[float, ...]) -> np.ndarray:
-    """Mean error of an estimator for each width, of 1."""
+    """Return the mean relative error of an estimator for each width."""
     rng = np.random.default_rng(0)
     errors = []
     for width in widths:
@@ -48,13 +49,13 @@ def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, wi
 
 
 def strip(mask: np.ndarray) -> float | None:
-    """Width by `strip_width`, in the middle."""
+    """Return the width by `strip_width`; None if it finds none."""
     strip = strip_width(mask)
     return None if strip is None else strip.width()
 
 
 def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
-    """Lines of a Markdown table."""
+    """Return the lines of a Markdown table."""
     estimators = {"strip": strip} | {f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
     lines = [
         "| estimator | mask | lean | " + " | ".join(f"L/W {ratio:g}" for ratio in RATIOS) + " |",

@@ -1,4 +1,4 @@
-"""Rate of a job that several processes do at the same time; for the other scripts of this folder."""
+"""Rate of a job run by several processes in parallel; for the other scripts of this folder."""
 
 import argparse
 import functools
@@ -10,11 +10,11 @@ from pathlib import Path
 from jaxrl_vis.host.worker_pool import share_accelerator, worker_pool
 
 Once = Callable[[int], list[float]]
-"""Does it once, with the input of that number, and says something of what came out."""
+"""Function that runs the job once on the input of that index, and returns numbers that characterise the result."""
 
 
 def timed(run: Callable[[], object], repeats: int) -> list[float]:
-    """Seconds of each repeat, after one that compiles."""
+    """Return the time of each repeat, s, after a first call that compiles."""
     run()
     times = []
     for _ in range(repeats):
@@ -25,7 +25,7 @@ def timed(run: Callable[[], object], repeats: int) -> list[float]:
 
 
 def options() -> argparse.Namespace:
-    """Parse the options of the scripts; several processes share the GPU."""
+    """Parse the options of the scripts; with workers, let processes share the GPU."""
     parser = argparse.ArgumentParser(description="Time and memory for one synthetic pair.")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument(
@@ -40,13 +40,13 @@ def options() -> argparse.Namespace:
 
 
 def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, each_is: float = 1.0) -> None:
-    """Print how long a pair takes where so many processes look at pairs, each at one of its own.
+    """Print the time per pair with several parallel processes, each working on its own pairs.
 
     Args:
-        make: Called in each process: what it does, and for how many inputs; these are done once before time is taken.
-        workers: How many processes.
-        seconds: How long they go on, once all are ready.
-        each_is: How many pairs are looked at each time.
+        make: Called in each process; returns the job and the number of inputs, all of which are processed once before timing.
+        workers: Number of processes.
+        seconds: Duration of the timing, once all are ready, s.
+        each_is: Number of pairs per call of the job.
     """
     with tempfile.TemporaryDirectory() as folder:
         with worker_pool(workers) as pool:
@@ -56,7 +56,7 @@ def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: floa
 
 
 def _work(make: Callable[[], tuple[Once, int]], folder: Path, workers: int, seconds: float, index: int) -> int:
-    """Do the work of one process, and count how often it finished."""
+    """Run the job in one process, and return the number of completed calls."""
     once, inputs = make()
     results = {tuple(once(number)) for number in range(inputs)}
     assert len(results) > 1 or inputs < 2, "all pairs gave the same"

@@ -1,7 +1,7 @@
-"""Behaviour cloning with relabelled goals as an algorithm: ``--algorithm benchmarks.tasks.behaviour_cloning:make``.
+"""Behaviour cloning with relabelled goals as a custom algorithm: ``--algorithm benchmarks.tasks.behaviour_cloning:make``.
 
-The actor of the shared networks learns the action that was taken on the way to the goal that its episode has reached; the
-simplest learner from recordings, and one file against the same interface as the built-in algorithms.
+The actor of the shared networks imitates the action taken on the way to a goal that the episode reached later: the simplest
+offline learner, in one file with the interface of the built-in algorithms.
 """
 
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ class Cloned(NamedTuple):
 
 
 def make(setup: Setup) -> Algorithm:
-    """Build behaviour cloning."""
+    """Build the behaviour cloning algorithm."""
     config = setup.config.replace(encoders="separate")  # the actor has an encoder of its own: there is no critic
     networks = Networks(config, setup.observation_spec, setup.action_size, 0.0)
     policy = make_policy(networks)

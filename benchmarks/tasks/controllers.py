@@ -1,8 +1,8 @@
-"""Scripted controllers that see the true state: every goal can be reached, or else the task is wrong.
+"""Scripted controllers with access to the true state, which verify that every goal can be reached.
 
     python -m benchmarks.tasks.controllers [ENV ...] [--episodes 1000]
 
-Prints the share of episodes that end within the threshold, at the last step. Exit status: 0 all at least .95, else 1.
+Prints the fraction of episodes that end within the threshold, at the last step. Exit status: 0 if all are at least .95, else 1.
 """
 
 import argparse
@@ -23,11 +23,11 @@ from jaxrl_vis_envs.tasks import stalk_arm
 
 LEAST_SUCCESS = 0.95
 Policy = Callable[[Any, Any, Any], tuple[jax.Array, Any]]
-"""(state, configuration of the goal, memory) -> (action [A], memory)."""
+"""Function (state, configuration of the goal, memory) -> (action [A], memory)."""
 
 
 def fetch_reach(env: Any) -> tuple[Policy, Any]:
-    """Proportional."""
+    """Return a proportional controller of the gripper's position."""
 
     def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
         return jnp.append(20.0 * (state.goal_state - state.achieved_state), 0.0), memory
@@ -36,7 +36,7 @@ def fetch_reach(env: Any) -> tuple[Policy, Any]:
 
 
 def fetch_push(env: Any) -> tuple[Policy, Any]:
-    """Over the box, down behind it, and along the table towards the goal; up again where it has lost the box."""
+    """Return a pusher: above the box, down behind it, and along the table towards the goal; up again if it loses the box."""
     behind, high, low, lost = 0.06, 0.49, 0.425, 0.02  # m
 
     def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
@@ -58,7 +58,7 @@ def fetch_push(env: Any) -> tuple[Policy, Any]:
 
 
 def sawyer_reach(env: Any) -> tuple[Policy, Any]:
-    """Straight to the goal, as fast as it goes."""
+    """Return a controller that moves straight to the goal at full speed."""
 
     def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
         return (state.goal_state - state.data.mocap_pos[0]) / env.config.action_scale, memory
@@ -67,7 +67,7 @@ def sawyer_reach(env: Any) -> tuple[Policy, Any]:
 
 
 def stalk_reach(env: Any) -> tuple[Policy, Any]:
-    """In the direction and at the height of the stalk first, as it is now, then straight out of the shoulder."""
+    """Return a controller that aligns direction and height with the stalk's current pose, then extends from the shoulder."""
     shoulder = jnp.asarray(stalk_arm.SHOULDER)
 
     def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
@@ -85,9 +85,9 @@ def stalk_reach(env: Any) -> tuple[Policy, Any]:
 
 
 def reacher(env: Any) -> tuple[Policy, Any]:
-    """Velocity control: each joint straight to its angle at the goal, the elbow bent to the left."""
+    """Return a velocity controller that moves each joint to its angle at the goal, with the elbow bent to the left."""
     upper, fore = 0.1, 0.11  # m
-    unit_turn = 0.95  # rad that an action of 1 turns a joint by
+    unit_turn = 0.95  # rotation of a joint by an action of 1, rad
 
     def act(state: Any, goal: Any, memory: Any) -> tuple[jax.Array, Any]:
         x, y = state.goal_state
@@ -102,7 +102,7 @@ def reacher(env: Any) -> tuple[Policy, Any]:
 
 
 def hand_reach(env: Any) -> tuple[Policy, Any]:
-    """Integral control of the actuated joints towards their angles at the goal."""
+    """Return an integral controller of the actuated joints towards their angles at the goal."""
     joints = env.mj_model.actuator_trnid[:, 0]
     low, high = env.mj_model.actuator_ctrlrange.T
     centre, half_range = 0.5 * (low + high), 0.5 * (high - low)
@@ -125,7 +125,7 @@ POLICIES: dict[str, Callable[[Any], tuple[Policy, Any]]] = {
 
 
 def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> float:
-    """Share of the episodes of the task ``name`` (with ``overrides`` of its settings) that its controller ends in success."""
+    """Return the success rate of the controller of task ``name``, with ``overrides`` of the task's settings."""
     env = environments.make(name, **overrides)
     state, goals = environments.reset(env, jax.random.split(jax.random.key(seed), episodes))
     if name == "FingerTurn":
@@ -140,7 +140,7 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
 
 
 def turn_the_finger(env: Any, state: Any, generator: np.random.Generator) -> float:
-    """FingerTurn by random shooting: of many short plans, tried in C MuJoCo, the first action of the best."""
+    """Return the success rate on FingerTurn of random shooting: the first action of the best of many plans in C MuJoCo."""
     threads = [mujoco.MjData(env.mj_model) for _ in range(os.cpu_count() or 1)]
     plans = np.zeros((len(state.reward), _PLAN_STEPS, 2))
     with mujoco.rollout.Rollout(nthread=len(threads)) as pool:
@@ -170,9 +170,9 @@ def _plan(
     substeps: int,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Actions [E, _PLAN_STEPS, 2] that bring the spinner nearest to ``goal_angle`` [E] (rad), or rest where it is near enough.
+    """Return the actions [E, _PLAN_STEPS, 2] that bring the spinner nearest to ``goal_angle`` [E] (rad), or 0 if that suffices.
 
-    ``start`` is [E, 7]: time, positions, velocities. ``try_out`` gives such rows for the ends of many motions.
+    ``start`` is [E, 7]: time, positions, velocities. ``try_out`` returns such rows for the final states of many motions.
     """
     episodes = np.arange(len(start))
     plans = generator.uniform(-1.0, 1.0, (len(start), _PLANS, _PLAN_STEPS, 2))
@@ -182,7 +182,7 @@ def _plan(
     ends = try_out(np.repeat(start, _PLANS, axis=0), controls).reshape(len(start), _PLANS, -1)[:, :, 1:4]
     # The spinner's axis points to -y: a positive angle turns its tip from +z towards -x.
     error = np.abs((-ends[..., 2] - goal_angle[:, None] + np.pi) % (2 * np.pi) - np.pi)
-    # Far from the spinner nothing happens, so a plan is also better the nearer it ends to it.
+    # Far from the spinner no plan has an effect, so the final distance to it is penalised, too.
     upper, fore = ends[..., 0], ends[..., 0] + ends[..., 1]
     x, z = 0.18 * np.cos(upper) + 0.16 * np.cos(fore), 0.18 * np.sin(upper) + 0.16 * np.sin(fore)
     distance = np.hypot(x - 0.4, z)  # m, from fingertip to the spinner's hinge
@@ -191,7 +191,7 @@ def _plan(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the success of each controller; 1 where one is below its bound."""
+    """Print the success rate of each controller; return 1 if one is below the bound, else 0."""
     parser = argparse.ArgumentParser(description="Success of scripted controllers that see the true state.")
     names = sorted([*POLICIES, "FingerTurn"])
     parser.add_argument("env", nargs="*", default=names, help=f"any of {', '.join(names)}; default: all")

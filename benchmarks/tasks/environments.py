@@ -1,8 +1,7 @@
-"""Tasks played from the host, by two compiled programs each that serve any number of episodes.
+"""Tasks stepped from the host, with two compiled programs each that serve any number of episodes.
 
-The physics of a task takes much longer to compile than to play for a few episodes. Whoever plays it for different purposes
-(a controller, a recording, a test) shares these programs: they take `LANES` episodes at a time, and the last few are filled up
-with copies.
+The physics of a task takes much longer to compile than to run for a few episodes. All users in a process (controllers,
+recordings, tests) share these programs: they process `LANES` episodes at a time, and the last batch is padded with copies.
 """
 
 import copy
@@ -24,7 +23,7 @@ LANES = 16
 
 
 def make(name: str, **overrides: Any) -> Any:
-    """`jaxrl_vis_envs.make`, but the same environment for the same settings, so that its programs are compiled once."""
+    """Make or reuse the environment of these settings (`jaxrl_vis_envs.make`), so that its programs are compiled once."""
     return _make(name, registry.config_class(name)(**overrides))
 
 
@@ -34,34 +33,34 @@ def _make(name: str, config: Any) -> Any:
 
 
 def reset(env: Any, keys: jax.Array) -> tuple[State, Any]:
-    """Episodes at their start, and the configurations (`mjx.Data`) that their goals show; keys [N]."""
+    """Reset N episodes with typed keys [N]; return their states, and the configurations (`mjx.Data`) of their goals."""
     return _in_lanes(_reset_program(env), keys)
 
 
 def advance(env: Any, state: State, actions: Any) -> State:
-    """N episodes one control step later; actions [N, A]."""
-    # Observations are nothing to physics, and with or without them would be two programs.
+    """Advance N episodes by one control step with actions [N, A]; observations are left unchanged (and thus stale)."""
+    # Physics does not need observations; states with and without them would need separate programs.
     moved = _in_lanes(_advance_program(env), state.replace(obs=None), np.asarray(actions, np.float32))
     return moved.replace(obs=state.obs)
 
 
 def start_at(env: Any, qpos: Any, qvel: Any) -> State:
-    """Episodes that start with joint positions [N, nq] and velocities [N, nv]; their goals are nonsense.
+    """Return states with joint positions [N, nq] and velocities [N, nv]; their goals are meaningless.
 
-    Poses, and what is derived from them, are right from the first `advance` on.
+    Poses and derived quantities are valid only after the first `advance`.
     """
     still = jax.device_get(mjx_model.still_data(env.mj_model))
     still = jax.tree.map(lambda leaf: np.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), still)
     data = still.replace(qpos=np.asarray(qpos, np.float32), qvel=np.asarray(qvel, np.float32))
     begin = jaxrl_vis_envs.jit(jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data)))))
-    return jax.device_get(begin(data))  # as `_in_lanes` gives states: for what lies on a device, programs are compiled twice
+    return jax.device_get(begin(data))  # on the host, as from `_in_lanes`: device arrays would compile the programs again
 
 
 @functools.cache
 def _reset_program(env: Any) -> Callable:
     def start(key: jax.Array) -> tuple[State, Any]:
         goal = env.sample_goal(key)
-        knowing = copy.copy(env)  # what takes long to trace is traced once
+        knowing = copy.copy(env)  # the goal, which takes long to trace, is traced once
         knowing.sample_goal = lambda _: goal
         return knowing.reset(key), goal
 
@@ -74,7 +73,7 @@ def _advance_program(env: Any) -> Callable:
 
 
 def _in_lanes(program: Callable, *trees: Any) -> Any:
-    """``program`` on [N, ...] leaves, LANES rows at a time; the results are NumPy arrays, of which rows are taken quickly."""
+    """Apply ``program`` to [N, ...] leaves, LANES rows at a time; return NumPy arrays, which are fast to index."""
     count = len(jax.tree.leaves(trees)[0])
     parts = []
     for first in range(0, count, LANES):

@@ -1,14 +1,14 @@
-"""Content of goal images: visibility of the relevant parts, and different goals with the same image.
+"""Content of goal images: visibility of the relevant parts, and distinct goals with identical images.
 
     python -m benchmarks.tasks.goal_images [ENV ...] [--goals 1000] [--image-size 100]
 
-For each visual task, over its goals, as the agent sees them (RGB-D bytes):
+For each visual task, over its goal images as observed by the agent (RGB-D bytes):
 
-    visible      the fewest pixels of each part that must be seen, over all goals, and the share of goals that show none of it
-    identical    pairs of goals further apart than a threshold with the same image; must be 0
-    nearest      the fewest bytes in which two images differ, among pairs 1 to 1.5 thresholds apart
+    visible      minimum and median number of pixels of each required part over all goals, and number of goals that show none
+    identical    number of pairs of goals further apart than a threshold with the same image; must be 0
+    nearest      minimum number of bytes in which two images differ, among pairs 1 to 1.5 thresholds apart
 
-Exit status: 1 where two different goals look the same, or where a goal shows none of the parts that must be seen; else 0.
+Exit status: 1 if two distinct goals look the same, or if a required part is occluded in a goal; else 0.
 """
 
 import argparse
@@ -24,7 +24,7 @@ import numpy as np  # noqa: E402
 import jaxrl_vis_envs  # noqa: E402
 from jaxrl_vis_envs.render import Scene, render_planes  # noqa: E402
 
-# What an agent has to see, by the names of its geoms. Parts in one tuple count together.
+# Parts that must be visible, by the names of their geoms. Geoms in one tuple count together.
 PARTS: dict[str, dict[str, tuple[str, ...]]] = {
     "VisualFetchPush": {"box": ("box",), "gripper": ("palm", "left_finger", "right_finger")},
     "VisualFetchReach": {"gripper": ("palm", "left_finger", "right_finger"), "fingers": ("left_finger", "right_finger")},
@@ -35,7 +35,7 @@ PARTS: dict[str, dict[str, tuple[str, ...]]] = {
     "VisualStalkReach": {"gripper": ("palm", "left_jaw", "right_jaw"), "stalks": tuple(f"upper_{index}" for index in range(4))},
 }
 _NEAR = 1.5  # thresholds
-_BATCH = 25  # goals drawn at once
+_BATCH = 25  # goals rendered at once
 
 
 class Goals(NamedTuple):
@@ -47,7 +47,7 @@ class Goals(NamedTuple):
 
 
 def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
-    """The goals of ``count`` episodes."""
+    """Sample and render the goals of ``count`` episodes."""
     size = env.observation_spec.shape[-1]
     scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
 
@@ -66,7 +66,7 @@ def draw_goals(env: Any, count: int, seed: int = 0) -> Goals:
 
 
 def visible_pixels(env: Any, labels: np.ndarray, geoms: tuple[str, ...]) -> np.ndarray:
-    """[N] pixels that show any of these geoms."""
+    """Count the pixels of each image [N] that show any of these geoms."""
     return np.isin(labels, [env.mj_model.geom(name).id for name in geoms]).sum(axis=(1, 2))
 
 
@@ -74,8 +74,8 @@ def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, i
     """Compare pairs of goals that are more than a threshold apart.
 
     Returns:
-        Pairs with identical images, pairs up to `_NEAR` thresholds apart, the fewest bytes in which these images differ,
-        and the indices of that pair; -1 without such pairs.
+        Number of pairs with identical images, number of pairs up to `_NEAR` thresholds apart, the minimum number of bytes in
+        which the images of the latter differ, and the indices of that pair; -1 without such pairs.
     """
     distance = np.linalg.norm(goals.states[:, None] - goals.states[None], axis=-1)
     flat = goals.images.reshape(len(goals.images), -1)
@@ -91,7 +91,7 @@ def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, i
 
 
 def report(name: str, count: int, size: int) -> bool:
-    """Print a task's figures; whether all is well."""
+    """Print the results of a task; return True if there are no identical images and no occluded parts."""
     env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
     goals = draw_goals(env, count)
     identical, near, least, pair = compare(goals, env.threshold)
@@ -112,7 +112,7 @@ def report(name: str, count: int, size: int) -> bool:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the figures of each task; 1 where one fails."""
+    """Print the results of each task; return 1 if one fails, else 0."""
     parser = argparse.ArgumentParser(description="Whether goal images show and tell apart what matters.")
     parser.add_argument("env", nargs="*", default=sorted(PARTS), help=f"any of {', '.join(sorted(PARTS))}; default: all")
     parser.add_argument("--goals", type=int, default=1000)

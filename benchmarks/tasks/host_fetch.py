@@ -4,9 +4,9 @@
     MUJOCO_GL=egl python -m benchmarks.tasks.host_fetch record [--episodes 1000] [--out recorded.npz]
     MUJOCO_GL=egl python -m benchmarks.tasks.host_fetch recorded [--recordings recorded.npz] [--algorithm ...] [--json F]
 
-The robot is fetch_reach.xml, pulled by its mocap body as in the task; images are 64x64 RGB from MuJoCo's own OpenGL renderer,
-and goal images show the arm after ten actions in proportion to the distance of its grip from the goal. ``record`` has noisy
-behaviour: half of its actions go towards the goal with noise, half are uniform. Success is to be within 5 cm at the last step.
+The robot is fetch_reach.xml, moved by its mocap body as in the task; images are 64x64 RGB from MuJoCo's OpenGL renderer, and
+goal images show the arm after ten actions of a proportional controller. ``record`` uses a noisy policy: half of its actions go
+towards the goal with noise, half are uniform. Success means a distance of at most 5 cm at the last step.
 """
 
 import argparse
@@ -31,14 +31,14 @@ _METHODS = {"exact": {}, "tolerance": {"tolerance": 0.0}, "contrastive": {"algor
 _CLONING = "benchmarks.tasks.behaviour_cloning:make"
 
 Policy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(image, goal image, true displacement [3] to the goal, m) -> action [4]; learners do not read the last."""
+"""Function (image, goal image, true displacement [3] to the goal, m) -> action [4]; learners ignore the displacement."""
 
 
 class HostFetch:
-    """One robot. Close it to free the GL context."""
+    """FetchReach with one robot on the host. Close it to free the GL context."""
 
     def __init__(self, noise: float, seed: int) -> None:
-        """Settle the arm at its start; ``noise`` is the camera's standard deviation, grey levels."""
+        """Settle the arm at its start; ``noise`` is the standard deviation of the camera noise, grey levels."""
         self._model, self._draw, self._noise = load_model("fetch_reach.xml"), np.random.default_rng(seed), noise
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)
@@ -62,7 +62,7 @@ class HostFetch:
         return self._data.site("grip").xpos.copy()
 
     def image(self) -> np.ndarray:
-        """Draw what the camera sees: [64, 64, 3] uint8."""
+        """Render the camera image [64, 64, 3] uint8, with noise."""
         self._renderer.update_scene(self._data, "front")
         image = self._renderer.render().astype(np.float32)
         if self._noise:
@@ -80,7 +80,7 @@ class HostFetch:
         mujoco.mj_forward(self._model, self._data)
 
     def episode(self, policy: Policy) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-        """Play an episode: observations [T+1, ...], actions [T, 4], the goal image, and whether it succeeded."""
+        """Roll out an episode: return observations [T+1, ...], actions [T, 4], the goal image, and True on success."""
         self._begin()
         goal = self.grip + self._draw.uniform(-RANGE, RANGE, 3)
         for _ in range(10):
@@ -101,7 +101,7 @@ class HostFetch:
 
 
 def _evaluate(learner: indicator.Learner, noise: float, episodes: int) -> float:
-    """Measure the share of successes on goals that are the same every time."""
+    """Return the success rate over a fixed set of goals."""
     robot = HostFetch(noise, seed=10_000)
     share = np.mean([robot.episode(lambda image, goal, _: learner.act(image, goal))[3] for _ in range(episodes)])
     robot.close()
@@ -116,7 +116,7 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def live(args: argparse.Namespace) -> dict[str, Any]:
-    """Learn while playing, one gradient step for every environment step."""
+    """Learn online, with one gradient step per environment step; return the results."""
     learner = indicator.Learner((SIZE, SIZE, 3), 4, HORIZON, capacity=args.steps // HORIZON + 1, **_options(args))
     robot, draw = HostFetch(args.noise, args.seed), np.random.default_rng(args.seed)
 
@@ -137,7 +137,7 @@ def live(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def record(args: argparse.Namespace) -> dict[str, Any]:
-    """Record episodes of noisy behaviour, and its own success."""
+    """Record episodes of the noisy policy; return its success rate."""
     robot, draw = HostFetch(args.noise, args.seed), np.random.default_rng(args.seed)
 
     def behave(_: np.ndarray, __: np.ndarray, towards: np.ndarray) -> np.ndarray:
@@ -153,14 +153,14 @@ def record(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def recorded(args: argparse.Namespace) -> dict[str, Any]:
-    """Learn from recordings alone."""
+    """Learn offline, from recordings alone; return the results."""
     began = time.monotonic()
     learner = indicator.learn(args.recordings, updates=args.updates, **_options(args))
     return {"success": _evaluate(learner, args.noise, args.eval_episodes), "seconds": time.monotonic() - began}
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run one of the three, and print its result."""
+    """Run one of the three modes, and print its result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("mode", choices=("live", "record", "recorded"))
     parser.add_argument("--method", choices=tuple(_METHODS), default="exact")

@@ -1,14 +1,14 @@
-"""One physics step of a task's own model by ours and by C MuJoCo, from identical states.
+"""Comparison of one physics step of each task's model with C MuJoCo, from identical states.
 
     python -m benchmarks.tasks.one_step [TASK ...]
 
-Prints a table of the differences of joint velocities, which docs/tasks.md keeps. Two things are measured both with and
-without, because each hides a difference that a task has:
+Prints a table of the differences in joint velocities, for docs/tasks.md. Two factors are varied, because each can mask a
+difference:
 
-    weld term    C MuJoCo 4 adds to the acceleration that a weld asks for how fast its Jacobian turns; MJX lacks the term. Taken
-                 away from C MuJoCo, what is left says whether MJX does what it sets out to do. With it, how far a task is from
-                 C MuJoCo as it is.
-    iterations   of our constraint solver: as few as the task takes, contacts as exact as it asks for; or `MORE_ITERATIONS`, and
+    weld term    C MuJoCo 4 adds the rate of change of a weld's Jacobian to its reference acceleration; MJX lacks the term.
+                 Without it in C MuJoCo, the difference shows whether MJX is implemented correctly; with it, how far a task is
+                 from unmodified C MuJoCo.
+    iterations   iterations of our constraint solver: the task's own, with its contact accuracy; or `MORE_ITERATIONS` with
                  exact contacts. C MuJoCo always takes as many as it needs.
 """
 
@@ -29,16 +29,16 @@ from jaxrl_vis_envs.physics import mjx_model, newton
 from jaxrl_vis_envs.physics.mjx_model import mjx
 
 MORE_ITERATIONS = (8, 12)
-"""Newton iterations, and line search iterations in each, after which more do not help in any task: float32 is at its end."""
+"""Newton iterations, and line search iterations in each, beyond which float32 precision limits every task."""
 Iterations = Literal["task", "more"]
 
 
 class Visited(NamedTuple):
-    """N states of an episode, float32: all that a step depends on."""
+    """N states of episodes, float32: all inputs of a physics step."""
 
     qpos: np.ndarray  # [N, nq]
     qvel: np.ndarray  # [N, nv]
-    qacc_warmstart: np.ndarray  # [N, nv], where the solver starts from
+    qacc_warmstart: np.ndarray  # [N, nv], initial guess of the solver
     ctrl: np.ndarray  # [N, nu]
     mocap_pos: np.ndarray  # [N, nmocap, 3]
     mocap_quat: np.ndarray  # [N, nmocap, 4]
@@ -47,13 +47,13 @@ class Visited(NamedTuple):
 def visited_states(
     mj_model: mujoco.MjModel, starts: np.ndarray, controls: np.ndarray, every: int, mocap: np.ndarray | None = None
 ) -> Visited:
-    """States that C MuJoCo passes through.
+    """Roll out C MuJoCo and return the visited states.
 
     Args:
         mj_model: The model.
         starts: [S, nq] joint positions, at rest.
         controls: [S, T, nu], each held for ``every`` physics steps.
-        every: A state is kept before each control, after so many physics steps.
+        every: Physics steps per control; the state before each control is returned.
         mocap: [S, T, 3], positions of the only mocap body, held as the controls are.
     """
     states = []
@@ -71,7 +71,7 @@ def visited_states(
 
 
 def fetch_states(env: Any) -> Visited:
-    """Half of the targets are in the air, half press the fingers on the table."""
+    """Visit states with half of the targets in the air, and half that press the fingers onto the table."""
     start, rng = env.sample_start(jax.random.key(0)), np.random.default_rng(0)
     targets = np.asarray(start.xpos[env.mj_model.body("gripper").id]) + rng.uniform(-0.15, 0.15, (24, 10, 3))
     targets[12:, :, 2] -= 0.15
@@ -80,7 +80,7 @@ def fetch_states(env: Any) -> Visited:
 
 
 def push_states(env: Any) -> Visited:
-    """The gripper starts beside one of the faces of the box, and pushes or misses it."""
+    """Visit states with the gripper starting beside a face of the box, which it pushes or misses."""
     rng = np.random.default_rng(0)
     start = env.sample_start(jax.random.key(0))
     gripper, grip = np.asarray(start.xpos[env.mj_model.body("gripper").id]), np.asarray(start.site_xpos[0])
@@ -95,14 +95,14 @@ def push_states(env: Any) -> Visited:
 
 
 def finger_states(env: Any) -> Visited:
-    """Random torques, from 24 starts of episodes."""
+    """Visit states under random torques from 24 initial states."""
     starts = environments.reset(env, jax.random.split(jax.random.key(3), 24))[0].data.qpos
     held = np.repeat(np.random.default_rng(0).uniform(-1, 1, (24, 10, 2)), 5, axis=1)
     return visited_states(env.mj_model, np.asarray(starts, np.float64), held, every=7)
 
 
 def hand_states(env: Any) -> Visited:
-    """Every joint is sent to one end of its range or the other."""
+    """Visit states with every joint driven to a random end of its range."""
     low, high = env.mj_model.actuator_ctrlrange.T
     controls = low + (high - low) * np.random.default_rng(0).integers(0, 2, (8, 12, 20))
     start = np.asarray(env.sample_start(jax.random.key(0)).qpos, np.float64)
@@ -110,7 +110,7 @@ def hand_states(env: Any) -> Visited:
 
 
 def reacher_states(env: Any) -> Visited:
-    """Half of the starts are near the limit of the elbow, the only constraint, on either side of it."""
+    """Visit states with half of the starts near the elbow's limit, the only constraint, on either side of it."""
     rng = np.random.default_rng(0)
     near_limit = rng.choice([-1.0, 1.0], 32) * rng.uniform(2.9, 3.1, 32)
     starts = np.stack([rng.uniform(-6, 6, 64), np.concatenate([rng.uniform(-3, 3, 32), near_limit])], axis=1)
@@ -118,7 +118,7 @@ def reacher_states(env: Any) -> Visited:
 
 
 def sawyer_states(env: Any) -> Visited:
-    """Targets all over the box of goals."""
+    """Visit states with targets distributed over the goal box."""
     rng = np.random.default_rng(0)
     targets = np.array(env.config.goal_centre) + np.array(env.config.goal_size) * rng.uniform(-0.5, 0.5, (12, 10, 3))
     starts = np.tile(np.asarray(env.sample_start(jax.random.key(0)).qpos, np.float64), (12, 1))
@@ -136,7 +136,7 @@ STATES: dict[str, Callable[[Any], Visited]] = {
 
 
 def our_step(env: Any, visited: Visited, iterations: Iterations) -> np.ndarray:
-    """Joint velocities [N, nv] after one step of ours, with the solver's iterations and exactness of the task, or with more."""
+    """Return our joint velocities [N, nv] after one step, with the task's solver iterations and contact accuracy, or more."""
     mj_model = env.mj_model
     if iterations == "more":
         mj_model = copy.copy(mj_model)
@@ -154,17 +154,17 @@ class MujocoStep(NamedTuple):
     """Result of C MuJoCo for N states."""
 
     qvel: np.ndarray  # [N, nv], after one step
-    contacts: np.ndarray  # [N], how many there were
+    contacts: np.ndarray  # [N], number of contacts
 
 
 def mujoco_step(mj_model: mujoco.MjModel, visited: Visited, weld_term: bool) -> MujocoStep:
-    """One step of C MuJoCo, with as many iterations as it takes.
+    """Take one step of C MuJoCo, with as many solver iterations as it needs.
 
     Args:
         mj_model: The model.
         visited: The states.
-        weld_term: C MuJoCo as it is. False takes the turning of equalities' Jacobians away; then the integrator has to be
-            Euler's, whose step comes in two halves, or the model without equalities.
+        weld_term: True for unmodified C MuJoCo; False removes the derivative of equality constraints' Jacobians, which
+            requires the Euler integrator (its step can be split in two) or a model without equalities.
     """
     exact = copy.copy(mj_model)
     exact.opt.iterations, exact.opt.ls_iterations = 100, 50
@@ -185,28 +185,28 @@ def mujoco_step(mj_model: mujoco.MjModel, visited: Visited, weld_term: bool) -> 
 
 
 def _take_weld_term_away(data: mujoco.MjData) -> None:
-    """Set the accelerations that equalities ask for to what they are in MJX, without the turning of their Jacobians."""
+    """Set the reference accelerations of equality constraints to MJX's, without the derivative of their Jacobians; in place."""
     rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     stiffness, damping, impedance, _ = data.efc_KBIP[rows].T
     data.efc_aref[rows] = -damping * data.efc_vel[rows] - stiffness * impedance * data.efc_pos[rows]
 
 
 def in_bounds(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """The greatest difference of joint velocities [N, nv] in multiples of the bound that tests set: [N].
+    """Return the maximum difference [N] of joint velocities [N, nv], in multiples of the bound of the tests.
 
-    The bound is 1e-4 of the greatest velocity + 1e-5 (rad/s, m/s).
+    The bound is 1e-4 of the maximum velocity + 1e-5 (rad/s, m/s).
     """
     return np.abs(ours - theirs).max(axis=1) / (1e-4 * np.abs(theirs).max(axis=1) + 1e-5)
 
 
 def rows(name: str) -> list[str]:
-    """The lines of the table for one task."""
+    """Return the rows of the table for one task."""
     env = environments.make(name)
     visited = STATES[name](env)
     steps = {iterations: our_step(env, visited, iterations) for iterations in ("task", "more")}
     own, more = (env.mj_model.opt.iterations, env.mj_model.opt.ls_iterations), MORE_ITERATIONS
     model = mjx.put_model(env.mj_model)
-    if newton.supports(model) or mjx_model.prefers_scalar_engine(model):  # line searches of ours have no such number
+    if newton.supports(model) or mjx_model.prefers_scalar_engine(model):  # these solvers have no line search iterations
         own, more = own[:1], more[:1]
     lines = []
     for weld_term in (True, False) if env.mj_model.neq else (True,):
@@ -221,12 +221,12 @@ def rows(name: str) -> list[str]:
 
 
 def _short(number: float) -> str:
-    """Two digits, or all of a larger number."""
+    """Format with two significant digits (one below 0.1), or as an integer from 10 on."""
     return f"{number:,.0f}" if number >= 10 else f"{number:.1g}" if number < 0.1 else f"{number:.2g}"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the table, in Markdown."""
+    """Print the table as Markdown; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"any of {', '.join(STATES)}; default: all")
     options = parser.parse_args(arguments)

@@ -1,9 +1,9 @@
-"""A million random steps of every task, none of which may give a number that is not finite.
+"""A million random steps of every task, none of which may produce a non-finite number.
 
     python -m benchmarks.tasks.random_steps [TASK ...] [--steps 1000000] [--envs 8192]
 
-Actions are uniform, and one in a hundred is far outside [-1, 1], infinite or not a number, which tasks clip. Exits with 1 where
-a position, a velocity or a distance is not finite. Meant for a GPU.
+Actions are uniform; one in a hundred is far outside [-1, 1], infinite or NaN, which tasks clip. Exits with 1 if a position, a
+velocity, an achieved state or a reward is not finite. Meant for a GPU.
 """
 
 import argparse
@@ -21,10 +21,10 @@ _BAD = (1e6, -1e6, jnp.inf, -jnp.inf, jnp.nan)
 
 
 def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
-    """Play whole episodes of ``count`` environments until there are ``steps``.
+    """Roll out whole episodes of ``count`` environments for at least ``steps`` steps.
 
     Returns:
-        Steps played, and episodes that had a number that was not finite.
+        Number of steps, and number of episodes with a non-finite number.
     """
     env = jaxrl_vis_envs.make(name)
 
@@ -52,7 +52,7 @@ def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print a line for each task; 1 where any was not finite."""
+    """Print a line for each task; return 1 if any number was not finite, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", default=list(TASKS), metavar="TASK")
     parser.add_argument("--steps", type=int, default=1_000_000)

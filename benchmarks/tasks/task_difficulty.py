@@ -2,8 +2,8 @@
 
     python -m benchmarks.tasks.task_difficulty [ENV ...] [--episodes 1000]
 
-Chance: share of episodes that end within the threshold under actions that are drawn uniformly at every step.
-Difficulty: mean distance of start and goal, in thresholds.
+Chance: fraction of episodes that end within the threshold under actions sampled uniformly at every step.
+Difficulty: mean distance from start to goal, in thresholds.
 """
 
 import argparse
@@ -20,11 +20,11 @@ import numpy as np  # noqa: E402
 import jaxrl_vis_envs  # noqa: E402
 from jaxrl_vis_envs.names import TASKS  # noqa: E402
 
-_BATCH = 200  # episodes side by side
+_BATCH = 200  # parallel episodes
 
 
 def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[float, float]:
-    """Chance and difficulty of a task, over ``episodes`` episodes."""
+    """Return chance and difficulty of a task, over ``episodes`` episodes."""
     env: Any = jaxrl_vis_envs.make(name, **overrides)
 
     def play(key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -42,7 +42,7 @@ def measure(name: str, episodes: int, seed: int = 0, **overrides: Any) -> tuple[
 
 
 def measure_hand(episodes: int, seed: int = 0) -> tuple[float, float]:
-    """The same for HandReach in C MuJoCo, by its own rules: the compiled program of its episodes has hung on a CPU."""
+    """Return those of HandReach, reimplemented in C MuJoCo, because the compiled program of its episodes has hung on a CPU."""
     env: Any = jaxrl_vis_envs.make("HandReach")
     model, config, generator = env.mj_model, env.config, np.random.default_rng(seed)
     tips = [model.site(name).id for name in ("fftip", "mftip", "rftip", "lftip", "thtip")]
@@ -68,7 +68,7 @@ def measure_hand(episodes: int, seed: int = 0) -> tuple[float, float]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print one line a task."""
+    """Print one line per task; return the exit status."""
     parser = argparse.ArgumentParser(description="Chance level and difficulty of tasks.")
     parser.add_argument("env", nargs="*", default=list(TASKS), help=f"any of {', '.join(TASKS)}; default: all")
     parser.add_argument("--episodes", type=int, default=1000)

@@ -52,7 +52,7 @@ _READER_LEFT = 141
 
 
 def all_commands() -> dict[str, tuple[type, Callable[[Any], int]]]:
-    """Return every command by name: `COMMANDS` and those of `jaxrl_vis.stalks`, which is imported for this alone."""
+    """Return every command by name: `COMMANDS` and those of `jaxrl_vis.stalks`, which is imported only here."""
     from jaxrl_vis.stalks.cli import COMMANDS as STALK_COMMANDS
 
     return {**COMMANDS, **STALK_COMMANDS}
@@ -130,7 +130,7 @@ def _ended_by(number: int) -> int:
 
 
 def _output_status(words: Sequence[str], printed: SafeStream) -> int:
-    """Return the exit status of a successful command with regard to its output."""
+    """Return the exit status of a successful command, considering errors of its output."""
     prints_result = " ".join(words).startswith(_PRINT_RESULTS) or not words or {"-h", "--help", "--version"} & set(words)
     if not isinstance(printed.failure, OSError) or not prints_result:
         return 0

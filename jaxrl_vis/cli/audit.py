@@ -14,10 +14,10 @@ from jaxrl_vis.report.outputs import check_figure, check_writable
 
 @dataclasses.dataclass(frozen=True)
 class Audit(TaskImages):
-    """Compare rewards of image and goal image with the truth of a task: false rewards, order, calibration, exploitation.
+    """Compare image-based rewards with a task's true rewards: false rewards, order, calibration, exploitation.
 
-    Nothing is trained. A reward of your own is a function of two batches of images [B, C, H, W] uint8, with values between
-    0 and 1: --rewards module:function. A run folder stands for the reward that the run has trained along.
+    Nothing is trained. A custom reward (--rewards module:function) is a function of two batches of images [B, C, H, W] uint8
+    with values between 0 and 1. A run folder stands for the reward model trained in that run.
     """
 
     rewards: tuple[str, ...] = ("indicator", "indicator_tolerance")
@@ -25,19 +25,19 @@ class Audit(TaskImages):
     episodes: int = 64
     """Number of episodes of random actions."""
     goals: int = 32
-    """Number of goals that a random search is to reach by the reward alone."""
+    """Number of goals that a random search tries to reach using only the reward."""
     sequences: int = 64
-    """Number of sequences of actions that it tries for each goal."""
+    """Number of action sequences that it tries per goal."""
     noise: float = 0.0
     """Standard deviation of camera noise, grey levels."""
     tolerance: float = 8.0
-    """Difference that indicator_tolerance forgives, grey levels."""
+    """Maximum difference of equal elements for indicator_tolerance, grey levels."""
     tolerance_share: float = 0.99
-    """Fraction of the elements that must be equal for indicator_tolerance."""
+    """Fraction of the image's elements that must be equal for indicator_tolerance."""
     reward_encoder: str | None = None
-    """File with the encoder of features, from `jaxrl-vis encoder`."""
+    """File with the encoder for features, from `jaxrl-vis encoder`."""
     out: Path | None = None
-    """Also draw rewards against distances into this .png, .pdf or .svg."""
+    """Also plot rewards against distances to this .png, .pdf or .svg file."""
     json: Path | None = None
     """Also write the numbers to this file."""
     trust: bool = False

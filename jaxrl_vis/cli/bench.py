@@ -19,17 +19,17 @@ Benchmark = Literal["render", "physics", "env", "update", "train"]
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """Measure this machine, keep a record, and print the change since the last record where the two can be compared."""
+    """Measure this machine, store a record, and print the change since the last comparable record."""
 
     benchmark: Annotated[Benchmark | None, tyro.conf.Positional] = None
     """Quantity to measure: images, physics, both with resets, gradient steps, or whole training iterations."""
     env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
-    """Environment; module:Name is one of your own."""
+    """Environment; module:Name for a custom one."""
     preset: Literal["paper", "fast", "cpu", "debug"] | None = None
     """Preset of the networks and gradient steps (update, train); fast on accelerators and cpu on a CPU if not given."""
     envs: tuple[int, ...] = ()
-    """Batch sizes in environments (or images), with one measurement for each (all but update, which has none); sizes that suit
-    the device if not given."""
+    """Batch sizes in environments (or images), with one measurement for each (except update); sizes suitable for the device if
+    not given."""
     image_size: int | None = None
     """Height and width of images; 64 on accelerators and 32 on a CPU if not given. render measures 64 and 100, or 32 and 64,
     unless this is a different one."""
@@ -40,7 +40,7 @@ class Bench:
     seeds: int = 1
     """Learners in one program (update, train)."""
     devices: str | None = None
-    """Number of devices, or all; one device with its share of the work is measured beside them (train)."""
+    """Number of devices, or all; one device with its fraction of the work is also measured (train)."""
     data_devices: int | None = None
     """Number of devices that share each learner; all of them if there is one seed, else one (train)."""
     repeats: int = 5
@@ -48,9 +48,9 @@ class Bench:
     aux_tasks: tuple[AuxTaskName, ...] = ()
     """Auxiliary tasks in the gradient steps (update, train)."""
     weighting: WeightingName = "none"
-    """Weighting of their losses (update, train)."""
+    """Weighting of the auxiliary losses (update, train)."""
     scene: str | None = None
-    """finger, fetch_reach, primitives or the path of an MJCF file: draw this instead of an environment (render)."""
+    """finger, fetch_reach, primitives or the path of an MJCF file: render this instead of an environment (render)."""
     json: Path | None = None
     """Additional file for the records of this run."""
     results: Path | None = None

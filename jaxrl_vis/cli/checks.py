@@ -15,11 +15,11 @@ from jaxrl_vis.run.trained import shipped
 
 
 def check_env(name: str, folder: str | None = None) -> None:
-    """Check that an environment exists; one that is not built in is imported.
+    """Check that an environment exists; custom ones are imported.
 
     Args:
         name: Name of the environment.
-        folder: Folder where the module of ``module:Name`` was found before.
+        folder: Folder in which the module of ``module:Name`` was found earlier.
 
     Raises:
         RequestError: It does not exist, or its module cannot be imported.
@@ -37,7 +37,7 @@ def check_env(name: str, folder: str | None = None) -> None:
 
 
 def may_run_code(run_dir: Path, trust: bool) -> bool:
-    """Return True if a run's own code may be used: permitted now or before, trained here, or confirmed on the terminal.
+    """Return True if a run's custom code may be executed: permitted now or earlier, trained here, or confirmed interactively.
 
     Args:
         run_dir: The run folder.

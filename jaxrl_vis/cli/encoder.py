@@ -12,16 +12,16 @@ from jaxrl_vis.report.outputs import check_writable
 
 @dataclasses.dataclass(frozen=True)
 class Encoder(TaskImages):
-    """Train a small encoder of a task's images, as an autoencoder, for `train --method features --reward-encoder FILE`."""
+    """Train a small image encoder for a task, as an autoencoder, for `train --method features --reward-encoder FILE`."""
 
     out: Path = Path("encoder.npz")
     """The .npz file to write."""
     episodes: int = 200
-    """Number of episodes of random actions whose images it is trained on."""
+    """Number of episodes of random actions that provide the training images."""
     updates: int = 2000
     """Number of gradient steps."""
     latent_size: int = 128
-    """Size of an encoded image."""
+    """Size of the latent vector of an image."""
 
 
 def run(options: Encoder) -> int:

@@ -20,7 +20,7 @@ class Envs:
     env: Annotated[tuple[str, ...], AlsoPositional()] = ()
     """Only these environments: built in, of an installed package, or module:Name; all of the first two if not given."""
     gallery: Path | None = None
-    """Also draw the environments with images into this file: start and goals as colours, depth and geoms."""
+    """Also write a gallery of the environments with images to this file: start and goals as colours, depth and geoms."""
     image_size: int = 128
     """Height and width of the gallery's images, in pixels."""
     goals: int = 4

@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 FigureName = Literal["5.1", "5.2", "estimators", "cameras", "goals", "5.4", "5.5", "5.6", "5.7", "quadratic", "pareto"]
 UNFINISHED = 3
-"""Exit status: finished, with something left out."""
+"""Exit status of an incomplete figure."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
     """Draw a figure: train or compute its content, and write it to a file, with tables beside it.
 
-    5.1, 5.2: rewards with and without ground truth. estimators: rewards from state estimators that err. cameras: noisy and
-    varied images. goals: rewards of every kind, TD3 and contrastive RL, on one bench. 5.4: auxiliary losses, and how they
-    are weighted. 5.5: single auxiliary tasks. 5.6: their weights over training. 5.7: what OL-AUX-5 owes to looking ahead.
-    These train what is missing, one process a GPU, and resume what was begun, so they may be interrupted and started again
-    at any time; the exit status is 3 where something is still missing.
+    5.1, 5.2: rewards with and without ground truth. estimators: rewards from imperfect state estimators. cameras: noisy and
+    randomized images. goals: comparison of all kinds of rewards, TD3 and contrastive RL. 5.4: auxiliary losses and their
+    weightings. 5.5: single auxiliary tasks. 5.6: their weights over training. 5.7: effect of looking ahead in OL-AUX-5.
+    These train missing runs, one process per GPU, and resume unfinished ones, so they may be interrupted and started again
+    at any time; the exit status is 3 if something is still missing.
 
     quadratic: adaptive weights of auxiliary losses on three losses of a point in the plane. pareto: paths to the Pareto front
-    of two losses, by twelve weightings. In these nothing is trained, and --out is the only option. Figures of stalks:
+    of two losses, by twelve weightings. These train nothing, and --out is their only option. Figures of stalks:
     `phenotype figure`, `grasp figure`.
     """
 
@@ -39,7 +39,7 @@ class Figure:
     """Name of the figure."""
     out: Path | None = None
     """A .png, .pdf or .svg file; figure_FIGURE.png (or quadratic.png, pareto.png) in the current folder if not given. Tables of
-    training runs go beside it, as .md and .csv."""
+    training runs are written beside it, as .md and .csv."""
     preset: str | None = None
     """Preset of all runs; paper for figures 5.4 to 5.7 and fast for the others if not given."""
     quick: bool = False
@@ -48,13 +48,13 @@ class Figure:
     tasks: tuple[str, ...] = ()
     """Only these environments; all of the figure's if not given."""
     methods: tuple[str, ...] = ()
-    """These lines instead of the figure's own, such as none sum fixed_0.1 ol_aux_5."""
+    """Methods to be compared instead of the figure's own, such as none sum fixed_0.1 ol_aux_5."""
     seed: int | None = None
     """First seed; 0 if not given."""
     seeds: int | None = None
     """Number of seeds; 5 if not given."""
     seeds_per_run: int | None = None
-    """Largest number of seeds in one program, to save memory; all of them if not given."""
+    """Maximum number of seeds per program, to save memory; all of them if not given."""
     env_steps: int | None = None
     """Environment steps of every run; the figure's own budgets if not given."""
     env_options: tuple[str, ...] = ()
@@ -64,28 +64,28 @@ class Figure:
     minutes: float | None = None
     """Time limit in minutes: runs are saved, finished ones are drawn, and the next start resumes."""
     per_device: int = 1
-    """Parallel runs per device: while one is compiled, another one computes."""
+    """Parallel runs per device, so that one can compute while another compiles."""
     draw_only: bool = False
-    """Train nothing: draw existing runs, including those with other settings, such as an earlier version's, which the table
-    notes."""
+    """Train nothing: draw existing runs, including those with other settings (such as an earlier version's), which are noted in
+    the table."""
 
 
 def run(options: Figure) -> int:
-    """Draw one figure; `UNFINISHED` where a run that belongs to it is not finished."""
+    """Draw one figure; return `UNFINISHED` if one of its runs is not finished."""
     if options.figure in ("quadratic", "pareto"):
         return _draw_example(options)
     out = options.out or Path(f"figure_{options.figure}.png")
     check_figure(out)
     for file in (out.with_suffix(".md"), out.with_suffix(".csv")):
         check_writable(file, "--out")
-    # Nothing below starts JAX in this process: the accelerator's memory belongs to the runs.
+    # Nothing below initialises JAX in this process: the accelerator's memory is for the runs.
     from jaxrl_vis.studies.figures import make
 
     return 0 if make.make_figure(_request(options, out)) else UNFINISHED
 
 
 def _draw_example(options: Figure) -> int:
-    """Draw a figure of a few losses in the plane."""
+    """Draw an example figure with a few losses in the plane."""
     for field in dataclasses.fields(options):
         if field.name not in ("figure", "out") and getattr(options, field.name) != field.default:
             raise RequestError(

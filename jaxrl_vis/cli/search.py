@@ -19,17 +19,17 @@ from jaxrl_vis.report.outputs import check_writable
 class Search:
     """Search for hyper-parameters with Optuna: train trials, one per device, and print the best (needs the extra ``search``).
 
-    A trial's score is the metric of --best-by (success if not given) at its last evaluation. It may be interrupted and started
-    again at any time, for more --trials, too. The exit status is 3 if something is still missing.
+    A trial's score is the metric of --best-by (success if not given) at its last evaluation. The search may be interrupted and
+    started again at any time, also with more --trials. The exit status is 3 if something is still missing.
     """
 
     env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
-    """Environment: a name that `jaxrl-vis envs` lists, or module:Name for your own."""
+    """Environment: a name listed by `jaxrl-vis envs`, or module:Name for a custom one."""
     vary: tuple[str, ...] = ()
-    """Options that vary, and their values: NAME=LOW..HIGH, NAME=LOW..HIGH,log or NAME=VALUE,VALUE,..., such as
+    """Search space of the options: NAME=LOW..HIGH, NAME=LOW..HIGH,log or NAME=VALUE,VALUE,..., such as
     actor_learning_rate=1e-4..1e-2,log batch_size=128,256."""
     trials: int = 20
-    """Number of trials, those of earlier starts included."""
+    """Number of trials, including those of earlier starts."""
     preset: Annotated[str, DefaultText(default_preset)] = "auto"
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
     changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)

@@ -22,7 +22,7 @@ from jaxrl_vis.report.outputs import check_writable
 class Sweep:
     """Train several tasks with several methods and seeds, one run per device or per cluster job, and print a table.
 
-    It may be interrupted and started again at any time: finished runs are kept, and unfinished ones are resumed. The exit
+    The sweep may be interrupted and started again at any time: finished runs are kept, and unfinished ones resumed. The exit
     status is 3 if something is still missing.
     """
 
@@ -34,21 +34,21 @@ class Sweep:
     """paper, fast, cpu or debug; auto is fast on an accelerator, else cpu."""
     changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
     seeds_per_run: int | None = None
-    """Largest number of seeds in one program, to spread them over more devices; all of them if not given."""
+    """Maximum number of seeds per program, to spread them over more devices; all of them if not given."""
     runs: Path | None = None
     """Folder of all run folders and logs; runs/sweep if not given."""
     minutes: float | None = None
     """Time limit in minutes: runs are saved, and the next start resumes."""
     executor: Literal["local", "slurm"] | None = None
-    """Start each run as a job of submitit, on Slurm or likewise on this machine. Processes, one per device, if not given."""
+    """Start each run as a submitit job, on Slurm or on this machine; as processes, one per device, if not given."""
     jobs: int = 64
-    """Largest number of simultaneous jobs (--executor slurm)."""
+    """Maximum number of simultaneous jobs (--executor slurm)."""
     job_options: tuple[str, ...] = ()
     """Parameters of submitit's executor as name=value, such as timeout_min=600 slurm_partition=gpu cpus_per_task=8."""
 
 
 def run(options: Sweep) -> int:
-    """Run a sweep; return `UNFINISHED` if a run of it is not finished."""
+    """Run a sweep; return `UNFINISHED` if one of its runs is not finished."""
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")

@@ -1,4 +1,4 @@
-"""Options of commands that look at the images of a task without training on it."""
+"""Options of commands that use the images of a task without training a policy."""
 
 import dataclasses
 from typing import Annotated, Any
@@ -9,10 +9,10 @@ from jaxrl_vis.config import Config, Pixels, preset
 
 @dataclasses.dataclass(frozen=True)
 class TaskImages:
-    """Images of a task."""
+    """Options for the images of a task."""
 
     env: Annotated[str, AlsoPositional()] = "VisualFetchReach"
-    """Environment with images: a name that `jaxrl-vis envs` lists, or module:Name for your own."""
+    """Environment with images: a name listed by `jaxrl-vis envs`, or module:Name for a custom one."""
     pixels: Pixels = "rgbd"
     """Channels of the images."""
     image_size: int = 64
@@ -20,7 +20,7 @@ class TaskImages:
     env_options: tuple[str, ...] = ()
     """Further options of the environment, as name=value."""
     seed: int = 0
-    """Seed of everything random."""
+    """Random seed."""
 
     def config(self, **changes: Any) -> Config:
         """Return the configuration of the preset `fast` with these images, and further options by name."""

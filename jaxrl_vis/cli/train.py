@@ -46,14 +46,14 @@ class Train:
     """Train on an environment. Options that are not given come from the preset, or with --resume from the run."""
 
     env: Annotated[str | None, AlsoPositional()] = None
-    """Environment: a name that `jaxrl-vis envs` lists, or module:Name for your own. VisualFetchReach if not given."""
+    """Environment: a name listed by `jaxrl-vis envs`, or module:Name for a custom one; VisualFetchReach if not given."""
     preset: Annotated[str, DefaultText(default_preset)] = "auto"
     """paper, fast, cpu or debug, some with task-specific values (docs/configuration.md); auto is fast on an accelerator, else
     cpu."""
     changes: Annotated[Mapping[str, Any], FieldsOf(Config, describe_default)] = dataclasses.field(default_factory=dict)
     devices: str | None = None
-    """Number of devices, or all (docs/scaling.md). Multiple seeds are spread over them; with a single seed, its batches and
-    environments are. One if not given."""
+    """Number of devices, or all (docs/scaling.md), over which seeds are distributed or, with a single seed, batches and
+    environments; one if not given."""
     run_dir: Path | None = None
     """Folder for metrics, images and checkpoints; a new one under runs/ if not given."""
     show_config: bool = False
@@ -61,7 +61,7 @@ class Train:
     resume: bool = False
     """Continue from the newest checkpoint in an existing run folder."""
     overwrite: bool = False
-    """Start afresh in an existing run folder."""
+    """Delete the run in an existing run folder and start again."""
     coordinator: str | None = None
     """Address of the first of several processes that train together, as HOST:PORT; not needed under srun and mpirun."""
     num_processes: int | None = None
@@ -69,9 +69,9 @@ class Train:
     process_id: int | None = None
     """Index of this process, from 0; the first one writes metrics and images."""
     start_timeout: int = distributed.START_S
-    """Time that they wait for each other at the start, s."""
+    """Time limit for the processes to find each other at the start, s."""
     trust: bool = False
-    """With --resume: execute the run's own code without asking, if its task is module:Name and was started by somebody else."""
+    """With --resume: execute the run's custom code without asking, if its task is module:Name and another user started it."""
     log: tuple[LoggerName, ...] = ()
     """Also log to TensorBoard or Weights & Biases; with --resume, the run's own loggers if not given."""
 
@@ -165,7 +165,7 @@ def run(options: Train) -> int:
     if options.resume and "env_folder" not in options.changes and (run_dir / "config.json").exists():
         named = {options.env, *(word for value in options.changes.values() for word in _words(value))}
         if set(own_names(config).values()) - named:
-            may_run_code(run_dir, options.trust)  # its user named neither such a part nor where it lies: the run does
+            may_run_code(run_dir, options.trust)  # the custom part is named by the run, not by the user
     check_env(config.environment.env, config.environment.env_folder)
     from jaxrl_vis.run import trainer
 

@@ -1,7 +1,7 @@
 """Repair of XLA's on-disk cache, which JAX does not write atomically: a truncated entry causes a warning at every start.
 
-When JAX cannot read an entry it warns and recompiles the program, but does not replace the entry. So damaged entries of a
-program are deleted when JAX warns about it, and JAX then stores the compiled program.
+If JAX cannot read an entry it warns and recompiles the program, but does not replace the entry. So damaged entries of a program
+are deleted when JAX warns about them, and JAX then stores the compiled program.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Devices to compute on: queried from JAX, or guessed where the answer must not wait for JAX."""
+"""Compute devices: queried from JAX, or guessed if the answer must not wait for JAX."""
 
 import contextlib
 import dataclasses
@@ -19,7 +19,7 @@ from jaxrl_vis.host.files import make_private, user_cache
 from jaxrl_vis.host.provenance import child_environment
 
 _MAX_MEMORY = 0.9
-"""Fraction of a GPU's memory; drivers, CUDA graphs and libraries need the rest."""
+"""Fraction of a GPU's memory that JAX preallocates; drivers, CUDA graphs and libraries need the rest."""
 _DEFAULT_MIN_COMPILE_S = 1.0  # JAX's default: programs that take longer to compile should be cached
 _BLOCK = 4096  # bytes; a full disk can still create empty files
 
@@ -29,7 +29,7 @@ _TPU = (("libtpu",), ("/dev/accel0", "/dev/vfio/0"))
 
 
 def claim_memory() -> None:
-    """Let JAX preallocate nine tenths of a GPU's memory instead of its default three quarters; call it before importing JAX.
+    """Let JAX preallocate 90 % of a GPU's memory instead of its default 75 %; call it before importing JAX.
 
     For processes with exclusive use of a GPU, as in training. Values set by the user or a study (`shared`) are not changed.
     """
@@ -107,7 +107,7 @@ def enable_compilation_cache() -> str:
 
 
 def hush_cache() -> None:
-    """Suppress JAX's warnings about a faulty cache, one per program; the run reports the fault once."""
+    """Suppress JAX's warnings about an unusable cache, one per program; the run reports it once."""
     import jax
 
     if jax.config.jax_compilation_cache_dir and cache_fault() is not None:
@@ -115,7 +115,7 @@ def hush_cache() -> None:
 
 
 def default_cache() -> Path:
-    """Default folder of the compilation cache."""
+    """Return the default folder of the compilation cache."""
     return user_cache() / "xla"
 
 
@@ -150,7 +150,7 @@ def _write_fault(folder: Path) -> str | None:
 
 
 def count_devices(requested: str) -> int:
-    """Convert an option to a number of devices: a number, or ``all``, the devices of all processes.
+    """Parse a number of devices: a number, or ``all`` for the devices of all processes.
 
     Raises:
         RequestError: The value is neither.
@@ -165,7 +165,7 @@ def count_devices(requested: str) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Device:
-    """A device that a process may use.
+    """Device available to a process.
 
     Attributes:
         name: Name for messages.
@@ -219,7 +219,7 @@ def shared(devices: Sequence[Device], processes: int) -> list[Device]:
 
 
 def guess_accelerator() -> bool:
-    """Return True if JAX will probably use an accelerator: a guess without importing JAX, for help that must be fast."""
+    """Guess whether JAX will use an accelerator, without importing JAX, for fast help output."""
     requested = [word.strip() for word in os.environ.get("JAX_PLATFORMS", "").split(",") if word.strip()]
     if requested:
         return requested[0] != "cpu"

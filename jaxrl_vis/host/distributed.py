@@ -1,7 +1,7 @@
 """Multi-process training, on one machine or several (`jax.distributed`); every process has devices of its own.
 
 Every process runs the same program with the same arguments. The first process (index 0) is the coordinator; it alone writes
-metrics, images and console output. Steps that all processes must take together, such as saving, are agreed upon.
+metrics, images and console output. Collective steps, such as saving, are synchronised.
 """
 
 import dataclasses

@@ -11,7 +11,7 @@ from jaxrl_vis.host.devices import cache_fault, check_devices, enable_compilatio
 
 
 def versions() -> str:
-    """Return the versions of Python and of the packages that matter."""
+    """Return the versions of Python and of relevant packages."""
     installed = provenance.versions()
     # The checkout itself does not have to be installed.
     missing = [name for name, version in installed.items() if version == provenance.NOT_INSTALLED and name != "jaxrl-vis"]
@@ -37,7 +37,11 @@ def memory() -> str:
 
 
 def compilation_cache() -> str:
-    """Return the folder of the compilation cache, or why there is none."""
+    """Return the folder of the compilation cache, or why it is off.
+
+    Raises:
+        PermissionError: The cache cannot be used.
+    """
     import jax
 
     folder = enable_compilation_cache()
@@ -78,7 +82,7 @@ def physics_and_camera() -> str:
 
 
 def renderer() -> str:
-    """Draw a ball above a floor, and check depths and segmentation that follow from their places."""
+    """Render a ball above a floor, and check depths and segmentation against their known geometry."""
     import jax
     import mujoco
     import numpy as np

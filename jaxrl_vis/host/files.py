@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.documents import parse_json, read_text
 
 _TEMPORARY = re.compile(r"\.\d+-[0-9a-f]{16}\.tmp")
-_MOST_BYTES = 200_000_000  # of JSON: the records of the largest study have a hundredth of that
+_MOST_BYTES = 200_000_000  # maximum size of a JSON file: 100 times the records of the largest study
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
@@ -90,7 +90,7 @@ def read_json(path: Path, kind: type = dict, mend: str = "") -> Any:
     Args:
         path: The file.
         kind: Expected type of the value: dict, list, or object for any.
-        mend: Remedy for an unusable file, appended to the message.
+        mend: Hint on how to fix an unusable file, appended to the message.
 
     Raises:
         RequestError: The file is missing, unreadable, not UTF-8, not JSON, nested too deeply, or holds a value of another type.
@@ -151,7 +151,7 @@ def make_private(folder: Path) -> None:
 
 
 def stranger_to(status: os.stat_result) -> str | None:
-    """Describe who, other than this user and root, can have written a file or folder; None for nobody, and on Windows.
+    """Describe who else than this user and root may have written a file or folder; None if nobody, and on Windows.
 
     Args:
         status: Result of `os.stat`, or of `os.fstat` for an open file.
@@ -166,7 +166,7 @@ def stranger_to(status: os.stat_result) -> str | None:
 
 
 def read_private(path: Path) -> bytes | None:
-    """Read a file that only this user or root can have written; return None if it is missing or not such a file.
+    """Read a file that only this user or root can have written; return None if it is missing or may be another user's.
 
     Symbolic links are not followed.
     """

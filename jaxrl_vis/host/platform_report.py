@@ -25,7 +25,7 @@ _TASK = "VisualReacher"
 
 
 def driver() -> str | None:
-    """Return the version of the NVIDIA driver; None without one."""
+    """Return the version of the NVIDIA driver; None if there is none."""
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)
@@ -46,16 +46,17 @@ def processor() -> str:
 
 
 class Training:
-    """Smoke test: a training of the smallest preset with images, to its end.
+    """Smoke test: a complete training run of the smallest preset with images.
 
     Attributes:
-        figures: Of the last training: ``task``, ``preset``, ``env_steps``, ``env_steps_per_s`` without compilation, ``wall_s``.
+        figures: Results of the last run: ``task``, ``preset``, ``env_steps``, ``env_steps_per_s`` (without compilation) and
+            ``wall_s``.
     """
 
     figures: dict[str, Any] | None = None
 
     def __call__(self) -> str:
-        """Train, and check that numbers stay finite (a trainer does)."""
+        """Train; the trainer checks that all numbers stay finite."""
         import jaxrl_vis
 
         start = time.perf_counter()

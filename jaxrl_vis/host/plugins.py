@@ -1,7 +1,7 @@
-"""Named parts of a run: built-in ones by a word, custom ones as ``module:Name``. Imports no JAX by itself.
+"""Lookup of named parts of a run: built-in ones by name, custom ones as ``module:Name``. Imports no JAX by itself.
 
-Algorithms, reward methods, auxiliary losses and weightings are named so, as tasks are (`jaxrl_vis_envs.task_modules`). A module
-is imported from ``Config.env_folder``, or else the current folder, or else as Python finds it.
+Applies to algorithms, reward methods, auxiliary losses and weightings, and likewise to tasks (`jaxrl_vis_envs.task_modules`). A
+module is imported from ``Config.env_folder``, else from the current folder, else from Python's search path.
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
     """Import the module of ``module:Name``, and return it with the second half of the name.
 
     Raises:
-        RequestError: It is not written so, or cannot be imported.
+        RequestError: ``name`` does not have this form, or the module cannot be imported.
     """
     try:
         module, attribute = task_modules.split(name)
@@ -68,13 +68,13 @@ def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
     """Call a custom function, and check the type of its result.
 
     Args:
-        kind, name: As of `find`, for messages.
+        kind, name: As in `find`, for messages.
         maker: The function, or the part itself.
         arguments: Arguments of the function.
         of: Class of the part.
 
     Raises:
-        RequestError: It fails, or makes something else.
+        RequestError: The function fails, or returns another type.
     """
     if isinstance(maker, of):
         return maker

@@ -25,7 +25,7 @@ NOT_INSTALLED = "not installed"
 CHECKOUT = Path(__file__).resolve().parents[2]
 """Folder that holds both packages: the checkout, or site-packages for an installed copy."""
 
-# Files that results can depend on. Changed records and run folders do not make a checkout dirty.
+# Files that can affect results. Changed records and run folders do not make a checkout dirty.
 _CODE = ("jaxrl_vis", "envs", "benchmarks", "pyproject.toml", ":!benchmarks/results")
 
 

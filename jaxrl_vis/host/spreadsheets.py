@@ -1,6 +1,6 @@
 """CSV tables without formula injection.
 
-A spreadsheet evaluates a cell that begins with one of a few characters: a folder's name could read files or start programs. A
+Spreadsheets evaluate cells that begin with certain characters, so that a folder's name could read files or start programs. A
 leading apostrophe marks such a cell as text. Numbers are not changed.
 """
 

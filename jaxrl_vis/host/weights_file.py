@@ -20,13 +20,13 @@ from jaxrl_vis_envs.documents import parse_json
 SUFFIX = ".safetensors"
 _ABOUT = "about"
 _KINDS = {"F16": np.float16, "F32": np.float32}
-# An array of 10 bits is three in the file: the upper 8 bits under its own name, and with these suffixes the lower 2 bits, four
-# numbers in a byte, and the factors of its last axis. A wheel's compression would make little of 10 bits in words of 16.
+# An array quantised to 10 bits is stored as three: the upper 8 bits under its own name, and with these suffixes the lower 2
+# bits, four per byte, and the scales of the last axis. A wheel's compression would hardly shrink 10 bits in 16-bit words.
 _LOW, _SCALE = ".low", ".scale"
 _PLACES = np.array([0, 2, 4, 6], np.uint8)
 _LEVELS = 511
-_FEWEST_QUANTISED = 4096  # smaller arrays keep 16 bits: they cost nothing
-_LONGEST_HEADER = 1 << 20  # bytes; those of our networks have some 15,000
+_FEWEST_QUANTISED = 4096  # minimum size of quantised arrays; smaller ones keep 16 bits, at negligible cost
+_LONGEST_HEADER = 1 << 20  # bytes; our networks have headers of some 15,000
 
 Settings = TypeVar("Settings")
 
@@ -38,14 +38,14 @@ def write_parameters(
     bits: Literal[10, 16, 32] = 16,
     exact: Collection[str] = (),
 ) -> None:
-    """Write parameters to a file, which is complete whenever it can be read.
+    """Write parameters to a file, atomically.
 
     Args:
         path: The file, .safetensors.
         params: Nested dictionaries of arrays.
-        about: What they are and where they come from; anything that JSON holds.
-        bits: Bits of a number. With 10, arrays of two axes or more and 4,096 numbers or more become integers from -511 to 511
-            and a factor for each index of the last axis, and the others keep 16.
+        about: Description and origin, as a JSON value.
+        bits: Bits per number. With 10, arrays with two or more axes and at least 4,096 numbers are quantised to integers from
+            -511 to 511 with a scale per index of the last axis; the others use 16.
         exact: Names of arrays that keep 32 bits.
 
     Raises:
@@ -77,7 +77,7 @@ def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarra
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
     """Write named arrays without conversion."""
-    whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}  # numbers stay without axes
+    whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}  # scalars stay 0-dimensional
     write_atomically(path, save(whole, {_ABOUT: json.dumps(dict(about))}))
 
 
@@ -89,7 +89,7 @@ def _named(params: Any) -> dict[str, Any]:
 def read_parameters(
     path: Path, command: str, declare: Callable[[dict[str, Any]], tuple[Settings, Any]]
 ) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
-    """Read a file of `write_parameters`. Names, shapes and types are compared with the network's before any array is read.
+    """Read a file of `write_parameters`. Names, shapes and dtypes are compared with the network's before any array is read.
 
     Args:
         path: The file.
@@ -133,7 +133,7 @@ def read_parameters(
         if isinstance(error, RequestError):
             raise
         raise RequestError(f"{path} holds no weights: name a file that `{command}` wrote") from error
-    # By NumPy: JAX would compile a program for each shape.
+    # With NumPy, because JAX would compile a program for each shape.
     for name in quantised:
         arrays[name] = _restored(arrays[name], arrays.pop(f"{name}{_LOW}"), arrays.pop(f"{name}{_SCALE}"))
     unsound = next((name for name, array in arrays.items() if not np.isfinite(array).all()), None)

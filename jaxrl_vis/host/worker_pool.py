@@ -4,7 +4,7 @@
     missing = [number for number in numbers if number not in records]
     evaluate_all(function, missing, workers, records.add)    # function(number) -> record; records.add writes the file
 
-Records are JSON values. A record must depend on its number only, so that it is the same with any number of workers.
+Records are JSON values. A record must depend only on its number, so that it is the same for any number of workers.
 """
 
 import contextlib
@@ -85,8 +85,7 @@ class UnorderedMap(Protocol):
 
 @contextlib.contextmanager
 def worker_pool(workers: int) -> Iterator[UnorderedMap]:
-    """Context of worker processes that share the GPUs and cores; they are killed after an error, and whenever this process
-    ends.
+    """Context of worker processes that share the GPUs and cores, killed after an error and when this process ends.
 
     Args:
         workers: Number of processes; 1 or less for this one.
@@ -109,7 +108,7 @@ def worker_pool(workers: int) -> Iterator[UnorderedMap]:
 
     def unordered_map(function: Callable[[A], T], arguments: Iterable[A]) -> Iterator[T]:
         arguments = iter(arguments)
-        # Two submitted calls per worker, so that none waits for this process.
+        # Two pending calls per worker, so that none waits for this process.
         waiting = {submit(function, argument) for argument in itertools.islice(arguments, 2 * workers)}
         while waiting:
             ready, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -145,7 +144,7 @@ def _environments(workers: int) -> list[dict[str, str]]:
 
     devices = list_devices()
     threads = dict.fromkeys(_THREADS, str(max(num_cores() // workers, 1)))
-    # Workers open no window; importing MuJoCo would start another process that looks for GLFW, and outlives its worker.
+    # Workers open no window; otherwise importing MuJoCo would start a process that looks for GLFW and outlives the worker.
     share = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": os.environ.get("MUJOCO_GL", "disable")}
     if cache := jax.config.jax_compilation_cache_dir:  # a program is compiled once for all
         share["JAX_COMPILATION_CACHE_DIR"] = cache

@@ -1,1 +1,1 @@
-"""Recorded episodes: as .npz, as LeRobot's dataset of version 3, and as this project's replay."""
+"""Recorded episodes as .npz files, as LeRobot datasets (version 3), and as replays of this project."""

@@ -1,4 +1,4 @@
-"""Recorded episodes in any of the formats, by the place where they are."""
+"""Reading (with the format inferred from the path) and writing of recorded episodes."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ LEROBOT, NPZ = "lerobot", "npz"
 
 
 def holds_recordings(path: Path) -> bool:
-    """Return True if ``path`` is an .npz file, the folder of one, or a LeRobot dataset."""
+    """Return True if ``path`` is an .npz file, a folder that contains one, or a LeRobot dataset."""
     check_path(path)
     return path.suffix == ".npz" or (path / npz.FILE_NAME).is_file() or lerobot_reader.is_dataset(path)
 
@@ -24,7 +24,7 @@ def read(path: Path | str) -> Recordings:
         path: See `holds_recordings`.
 
     Raises:
-        RequestError: There are none, or they are damaged.
+        RequestError: There are no recordings, or they are damaged.
     """
     path = Path(path)
     if lerobot_reader.is_dataset(path):
@@ -33,15 +33,15 @@ def read(path: Path | str) -> Recordings:
 
 
 def _npz_file(path: Path) -> Path:
-    """Return the file of episodes that ``path`` is, or that lies in this folder."""
+    """Return the path of the .npz file: ``path`` itself, or the file in this folder."""
     return path if path.suffix == ".npz" else path / npz.FILE_NAME
 
 
 def check_out(out: Path, kind: str) -> None:
-    """Check that episodes can be written to ``out``. Call it before playing them.
+    """Check that episodes can be written to ``out``. Call it before recording them.
 
     Raises:
-        RequestError: The place is taken or not writable, or a package is missing.
+        RequestError: The file exists, the folder is not empty, ``out`` is not writable, or a package is missing.
     """
     if kind == LEROBOT:
         lerobot.check_packages()

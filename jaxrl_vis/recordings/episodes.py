@@ -1,7 +1,7 @@
-"""Recorded episodes on the host, and the replay that holds them.
+"""Recorded episodes on the host, and their conversion to a replay.
 
-played = Recordings.of_rollout(episodes, frame_stack, about)    what `rollout.play` returns, as a person reads it
-replay, state = recordings.to_replay()                          as the learner reads it: byte for byte what was recorded
+recordings = Recordings.of_rollout(episodes, success, about)    from the result of `rollout.play`, in conventional layouts
+replay, state = recordings.to_replay()                          in the learner's layout, byte for byte what was recorded
 """
 
 import dataclasses
@@ -24,13 +24,13 @@ class Recordings:
     """N episodes of T steps each. Images are [H, W, C] uint8: colour, depth, or both in this order.
 
     Attributes:
-        observations: [N, T+1, H, W, C] uint8, or [N, T+1, S] float32: after 0, 1, ... T steps, the newest image of each.
+        observations: [N, T+1, H, W, C] uint8, the newest image of each stack, or [N, T+1, S] float32; after 0, 1, ... T steps.
         actions: [N, T, A] float32, as executed, in [-1, 1].
-        goals: [N, H, W, C] uint8, or [N, S] float32; None if nobody has asked for anything.
-        states: [N, T+1, G] float32, the true states at the same times; None if nobody knows them.
-        goal_states: [N, G] float32, those of the goals; None likewise.
-        success: [N] bool, at the last step; None likewise.
-        about: Where they come from: ``task``, ``control_period`` (s), ``frame_stack``, ``depth_range`` (m), ...
+        goals: [N, H, W, C] uint8, or [N, S] float32; None for episodes without goals.
+        states: [N, T+1, G] float32, true states at the same times; None if unknown.
+        goal_states: [N, G] float32, true states of the goals; None if unknown.
+        success: [N] bool, at the last step; None if unknown.
+        about: Metadata: ``task``, ``control_period`` (s), ``frame_stack``, ``depth_range`` (m), ...
     """
 
     observations: np.ndarray
@@ -45,7 +45,7 @@ class Recordings:
         """Check shapes, types and numbers.
 
         Raises:
-            RequestError: Something does not fit; the message names the array.
+            RequestError: An array is invalid; the message names it.
         """
         seen, actions = self.observations, self.actions
         images = seen.dtype == np.uint8 and seen.ndim == 5 and seen.shape[-1] in _CHANNELS
@@ -85,12 +85,12 @@ class Recordings:
 
     @property
     def count(self) -> int:
-        """N."""
+        """N, the number of episodes."""
         return self.observations.shape[0]
 
     @property
     def horizon(self) -> int:
-        """T."""
+        """T, the number of steps per episode."""
         return self.actions.shape[1]
 
     @property
@@ -100,17 +100,17 @@ class Recordings:
 
     @property
     def frame_stack(self) -> int:
-        """F, number of images that the policy saw at once; each is recorded once."""
+        """F, the number of images stacked in an observation of the policy; each image is recorded only once."""
         return self.about.get("frame_stack", 1)
 
     @classmethod
     def of_rollout(cls, episodes: Episodes, success: Any, about: Mapping[str, Any]) -> Self:
-        """Take the episodes of one learner, [N, ...] arrays on any device, to the host.
+        """Convert the episodes of one learner, [N, ...] arrays on any device, to recordings on the host.
 
         Args:
             episodes: As `rollout.play` returns them.
             success: [N], at the last step.
-            about: As of `Recordings`.
+            about: As in `Recordings`.
         """
         seen = np.asarray(episodes.observations)
         if seen.dtype == np.uint8:
@@ -127,15 +127,15 @@ class Recordings:
         )
 
     def first(self, count: int | None) -> Self:
-        """Return the first ``count`` episodes, or all for None."""
+        """Return the first ``count`` episodes; all if None."""
         arrays = (field.name for field in dataclasses.fields(self) if field.name != "about")
         return dataclasses.replace(
             self, **{name: array[:count] for name in arrays if (array := getattr(self, name)) is not None}
         )
 
     def to_episodes(self) -> Episodes:
-        """Convert to the learner's form, with one image in each slot. A missing goal is the last observation; missing true
-        states are zeros [G = 1].
+        """Convert to the learner's layout, with one image in each slot. Missing goals are replaced by the last observation,
+        missing true states by zeros with G = 1.
         """
         goals = self.observations[:, -1] if self.goals is None else self.goals
         seen = np.concatenate([self.observations, goals[:, None]], axis=1)
@@ -147,9 +147,9 @@ class Recordings:
         return Episodes(observations=jnp.asarray(planar), states=jnp.asarray(states), actions=jnp.asarray(self.actions))
 
     def to_replay(self) -> tuple[Replay, ReplayState]:
-        """Return a replay that holds just these episodes, and its sizes: sample from it as from any other.
+        """Return a replay of exactly these episodes, and its state, for sampling.
 
-        The true states that oracle rewards read are there if they were recorded.
+        It contains the true states, which oracle rewards need, only if they were recorded.
         """
         of_one_image = Replay(1, self.count, self.horizon)
         state = jax.jit(of_one_image.of_rollout)(self.to_episodes())

@@ -1,6 +1,7 @@
-"""Lossless images in files: colours as H.264 video in RGB, depth as PNG.
+"""Lossless image files: colours as H.264 video in RGB, depth as PNG.
 
-A video in YUV, as players like it, would change pixels, and with it which images are equal: indicator rewards count on that.
+Videos in YUV, as supported by most players, would change pixels and thus the equality of images, on which indicator rewards
+rely.
 """
 
 import fractions
@@ -71,17 +72,17 @@ def read_video(path: Path) -> Generator[np.ndarray]:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode an image [H, W, 3] or [H, W, 1] uint8; one channel is written three times, as LeRobot wants it."""
+    """Encode an image [H, W, 3] or [H, W, 1] uint8 as PNG; a single channel is repeated three times, as LeRobot requires."""
     file = io.BytesIO()
     Image.fromarray(np.broadcast_to(image, (*image.shape[:2], 3))).save(file, "PNG")
     return file.getvalue()
 
 
 def decode_png(data: bytes) -> np.ndarray:
-    """Decode an image: [H, W, 3] uint8.
+    """Decode a PNG to [H, W, 3] uint8.
 
     Raises:
-        OSError, ValueError: It is no image.
+        OSError, ValueError: ``data`` is not an image.
     """
     with Image.open(io.BytesIO(data)) as image:
         return np.asarray(image.convert("RGB"))

@@ -1,4 +1,4 @@
-"""Writer of LeRobot datasets, see `lerobot_format`. Actions, states and images are written without loss."""
+"""Writer of LeRobot datasets, see `lerobot_format`. Actions, states and images are stored losslessly."""
 
 import fractions
 import json
@@ -17,11 +17,11 @@ from jaxrl_vis.recordings import lerobot_format as form
 from jaxrl_vis.recordings.episodes import Recordings
 
 _QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-_SECOND = 1.0  # control period of episodes that do not say theirs, s
+_SECOND = 1.0  # default control period of episodes without one, s
 
 
 def check_packages(with_video: bool = True) -> None:
-    """Raise a `RequestError` unless the packages that write and read a dataset are installed."""
+    """Raise a `RequestError` unless the packages for writing and reading datasets are installed."""
     try:
         import pandas  # noqa: F401
         import pyarrow.parquet  # noqa: F401
@@ -32,15 +32,15 @@ def check_packages(with_video: bool = True) -> None:
 
 
 def write(recordings: Recordings, folder: Path) -> None:
-    """Write episodes as a LeRobot dataset, which is complete whenever there is a folder of that name.
+    """Write episodes as a LeRobot dataset; the folder appears atomically.
 
     Args:
         recordings: The episodes.
-        folder: A folder that does not exist, or is empty.
+        folder: A folder that does not exist or is empty.
 
     Raises:
-        RequestError: A package is missing, or the folder holds something.
-        OSError: Something cannot be written.
+        RequestError: A package is missing, or the folder is not empty.
+        OSError: A file cannot be written.
     """
     check_packages(recordings.are_images)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -78,7 +78,7 @@ class _Writer:
         return path
 
     def _images(self, name: str, episode: int) -> np.ndarray:
-        """Return the images of an episode [T+1, H, W, 1 or 3] uint8 under a feature's name."""
+        """Return the images [T+1, H, W, 1 or 3] uint8 of an episode for a feature."""
         recordings, is_goal = self._recordings, name in (form.GOAL_CAMERA, form.GOAL_DEPTH)
         if is_goal:
             assert recordings.goals is not None
@@ -92,7 +92,7 @@ class _Writer:
             yield from self._images(name, episode)[:-1]
 
     def _columns(self) -> dict[str, np.ndarray]:
-        """Return the numbers of all steps by feature: [N, T, ...]."""
+        """Return the numerical features of all steps by name: [N, T, ...]."""
         recordings = self._recordings
         count, steps = recordings.count, recordings.horizon
         frame = np.broadcast_to(np.arange(steps), (count, steps))
@@ -139,7 +139,7 @@ class _Writer:
         pq.write_table(pa.table(columns), self._path(form.DATA))
 
     def _encoded(self, name: str, episode: int) -> list[bytes]:
-        """Encode the images of an episode before its actions; a goal's image once."""
+        """Encode the images of an episode before each action; the goal's image is encoded only once."""
         shown = self._images(name, episode)[:-1]
         if name == form.GOAL_DEPTH:
             return [images.encode_png(shown[0])] * len(shown)
@@ -178,7 +178,7 @@ class _Writer:
         pq.write_table(pa.Table.from_pylist(rows), self._path(form.EPISODES))
 
     def _last(self, episode: int) -> dict[str, Any]:
-        """Return what is seen after the last action, by column."""
+        """Return the final observation (after the last action), by column."""
         recordings = self._recordings
         last: dict[str, Any] = {}
         if recordings.are_images:
@@ -232,7 +232,7 @@ class _Writer:
 
 
 def _of_numbers(values: np.ndarray) -> dict[str, Any]:
-    """Return statistics of values [steps, D], with lists of D numbers."""
+    """Return statistics of values [steps, D], as lists of D numbers."""
     quantiles = np.quantile(values, list(_QUANTILES.values()), axis=0)
     return {
         "min": values.min(axis=0).tolist(),
@@ -244,7 +244,7 @@ def _of_numbers(values: np.ndarray) -> dict[str, Any]:
 
 
 def _of_images(episodes: list[np.ndarray]) -> dict[str, Any]:
-    """Return statistics of images [..., H, W, C] uint8 over 255, [3, 1, 1] each; computed from exact histograms."""
+    """Return statistics of images [..., H, W, C] uint8, scaled by 1/255, [3, 1, 1] each; computed from exact histograms."""
     channels = episodes[0].shape[-1]
     counts = sum(np.stack([np.bincount(part[..., c].ravel(), minlength=256) for c in range(channels)]) for part in episodes)
     counts, levels = np.broadcast_to(counts, (3, 256)), np.arange(256) / 255.0

@@ -1,14 +1,14 @@
 """Names and features of a LeRobot dataset of version 3, for its writer and its reader.
 
-    meta/info.json  meta/stats.json  meta/tasks.parquet  meta/jaxrl_vis.json     what there is; the last is ours
-    meta/episodes/chunk-000/file-000.parquet      a row an episode
-    data/chunk-000/file-000.parquet               a row a step: observation before the action, action, true states
-    videos/KEY/chunk-000/file-000.mp4             colours, all episodes one after the other
+    meta/info.json  meta/stats.json  meta/tasks.parquet  meta/jaxrl_vis.json     metadata; the last file is ours
+    meta/episodes/chunk-000/file-000.parquet      one row per episode
+    data/chunk-000/file-000.parquet               one row per step: observation before the action, action, true states
+    videos/KEY/chunk-000/file-000.mp4             colours, all episodes concatenated
 
-LeRobot has a row for each action, so an episode has T rows. What is seen after the last action stands in columns of
-meta/episodes that begin with `LAST`, which LeRobot's loader does not look at.
+LeRobot has one row per action, so an episode has T rows. The final observation, after the last action, is stored in columns of
+meta/episodes that begin with `LAST`, which LeRobot's loader ignores.
 
-Source: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, and the loader of lerobot 0.4.4, which the format is tried with.
+Source: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, and the loader of lerobot 0.4.4, with which it was tested.
 """
 
 from typing import Any
@@ -25,10 +25,10 @@ ACTION = "action"
 STATE, GOAL = "observation.state", "observation.environment_state"  # the two vectors that LeRobot's policies take
 CAMERA, GOAL_CAMERA = "observation.images.camera", "observation.images.goal"
 DEPTH, GOAL_DEPTH = "observation.images.depth", "observation.images.goal_depth"
-# Not `observation....`: whatever begins so is an input of LeRobot's policies, and true states must not be.
+# Not `observation....`: all such columns are inputs of LeRobot's policies, which true states must not be.
 TRUE_STATE, TRUE_GOAL = "truth.state", "truth.goal"
 LAST, SUCCESS = "last/", "last/success"
-"""Prefix of columns of meta/episodes with what is seen after the last action."""
+"""Prefix of the columns of meta/episodes with the final observation, and the column of success."""
 
 COUNTERS = {
     "timestamp": "float32",
@@ -41,7 +41,7 @@ COUNTERS = {
 
 
 def image_feature(height: int, width: int, fps: float | None) -> dict[str, Any]:
-    """Describe images [H, W, 3]: as video of ``fps``, or as PNG if that is None."""
+    """Describe images [H, W, 3]: as a video of ``fps`` frames per second, or as PNG if None."""
     feature: dict[str, Any] = {
         "dtype": "image" if fps is None else "video",
         "shape": [height, width, 3],
@@ -62,12 +62,12 @@ def image_feature(height: int, width: int, fps: float | None) -> dict[str, Any]:
 
 
 def vector_feature(size: int, name: str) -> dict[str, Any]:
-    """Describe vectors [size] float32, whose numbers are called ``name_0``, ``name_1``, ..."""
+    """Describe vectors [size] float32, whose components are named ``name_0``, ``name_1``, ..."""
     return {"dtype": "float32", "shape": [size], "names": [f"{name}_{index}" for index in range(size)]}
 
 
 def features_of(recordings: Recordings, fps: float) -> dict[str, dict[str, Any]]:
-    """Describe all columns and videos of these episodes by name."""
+    """Describe all columns and videos of recordings, by name."""
     features = {}
     if recordings.are_images:
         height, width, channels = recordings.observations.shape[2:]

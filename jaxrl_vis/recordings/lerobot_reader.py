@@ -1,4 +1,4 @@
-"""Reader of LeRobot datasets of version 3: those of `lerobot`, bit for bit, and others with one camera and equal episodes."""
+"""Reader of LeRobot datasets (version 3): exact for those of `lerobot`; others need one camera and episodes of equal length."""
 
 import contextlib
 import itertools
@@ -22,15 +22,16 @@ def is_dataset(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recordings:
-    """Read a dataset whose episodes have equally many steps.
+    """Read a dataset with episodes of equal length.
 
-    In datasets of other programs the last observation of an episode closes it, and its action is dropped: T is one less.
+    In datasets of other programs, the last row of an episode provides the final observation, and its action is dropped: T is
+    one less.
 
     Args:
         folder: The dataset's folder.
 
     Raises:
-        RequestError: It is missing, damaged, of another version, or not as described.
+        RequestError: It is missing, damaged, of another version, or has episodes of different lengths or several cameras.
     """
     check_packages()
     info = read_json(folder / form.INFO, mend="export it again")
@@ -42,7 +43,7 @@ def read(folder: Path) -> Recordings:
         return _Reader(folder, info).read()
     except RequestError as error:
         raise RequestError(f"{folder}: {error}") from error
-    except Exception as error:  # pyarrow and PyAV have many kinds, and so have damaged files
+    except Exception as error:  # pyarrow and PyAV raise various exceptions on damaged files
         text = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise RequestError(f"{folder} cannot be read as a LeRobot dataset ({text}): export it again") from error
 
@@ -88,7 +89,7 @@ class _Reader:
         return pa.concat_tables([pq.read_table(path) for path in paths])
 
     def _numbers(self, name: str) -> np.ndarray:
-        """Return a column of numbers [N, T, D] float32."""
+        """Return a numerical column [N, T, D] float32."""
         column = self._data[name].combine_chunks()
         size = self._features[name]["shape"][0]
         flat = column if self._features[name]["shape"] == [1] else column.flatten()
@@ -96,7 +97,7 @@ class _Reader:
         return values.reshape(len(self._rows), self._steps, size)
 
     def _closed(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Append what is seen after the last action to a column [N, T, ...]."""
+        """Append the value after the last action to a column [N, T, ...]: [N, T+1, ...]."""
         last = np.array([row[form.LAST + name] for row in self._rows], values.dtype)
         return np.concatenate([values, last[:, None]], axis=1)
 

@@ -1,4 +1,4 @@
-"""Episodes in an .npz file, with the arrays of `Recordings` under their names; `jaxrl_vis.indicator.learn` reads them, too."""
+"""Episodes in an .npz file, with the arrays of `Recordings` by name; also read by `jaxrl_vis.indicator.learn`."""
 
 import dataclasses
 import io
@@ -19,7 +19,7 @@ _REQUIRED = ("observations", "actions")
 
 
 def write(recordings: Recordings, path: Path) -> None:
-    """Write episodes into one compressed file, which is complete whenever it can be read.
+    """Write episodes to one compressed file, atomically.
 
     Args:
         recordings: The episodes.
@@ -36,13 +36,13 @@ def write(recordings: Recordings, path: Path) -> None:
 
 
 def read(path: Path) -> Recordings:
-    """Read a file of `write`, or one with ``observations`` and ``actions`` that another program has written.
+    """Read a file of `write`, or one of another program with ``observations`` and ``actions``.
 
     Args:
         path: The file.
 
     Raises:
-        RequestError: It is missing, damaged, or holds no episodes.
+        RequestError: It is missing, damaged, or has no episodes.
     """
     names = [field.name for field in dataclasses.fields(Recordings) if field.name != _ABOUT]
     try:

@@ -9,6 +9,5 @@ def _is_relevant(record: logging.LogRecord) -> bool:
     return not any(words in str(record.msg) for words in _FOLDER_MESSAGES)
 
 
-# If the home folder is not writable, Matplotlib reports twice that it keeps its fonts in a temporary folder, which is
-# irrelevant.
+# If the home folder is not writable, Matplotlib reports twice that it caches fonts in a temporary folder, which is irrelevant.
 logging.getLogger("matplotlib").addFilter(_is_relevant)

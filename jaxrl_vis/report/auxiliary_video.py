@@ -43,7 +43,7 @@ class Predictions:
 def draw_frames(
     episodes: videos.EpisodeImages, predictions: Predictions, frame_seconds: float
 ) -> tuple[list[Image.Image], list[float]]:
-    """Draw all frames of the video; return them with their durations in seconds. Borders are as in `videos.draw_frames`.
+    """Draw all frames of the video; return them with their durations, s. Borders are as in `videos.draw_frames`.
 
     Args:
         episodes: T+1 images of each of K episodes, and their goals; success at the last step.
@@ -121,7 +121,7 @@ def _compose(columns: Sequence[Sequence[Tile]], footer: tuple[str, str], colour:
             border = colour if column == 0 else videos.PLAIN
             right, bottom = x + width + 2 * videos.BORDER - 1, y + _CAPTION + height + 2 * videos.BORDER - 1
             draw.rectangle((x, y + _CAPTION, right, bottom), fill=border)
-            # Borders that do not fill a block of the encoder are not predicted, and left empty.
+            # Borders that do not fill a block of the encoder are not predicted, and stay empty.
             size = (width * image.shape[1] // whole[1], height * image.shape[0] // whole[0])
             shown = Image.fromarray(image).resize(size, Image.Resampling.NEAREST)
             canvas.paste(shown, (x + videos.BORDER, y + _CAPTION + videos.BORDER))

@@ -119,8 +119,8 @@ def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
 
     Args:
         env: An environment with a camera (`MjxGoalEnv`).
-        key: [] a typed key.
-        goals: The number of goals.
+        key: Typed key [].
+        goals: Number of goals.
         size: Height and width, pixels.
     """
     keys = jax.random.split(key, goals)

@@ -1,4 +1,4 @@
-"""Evaluation of learning curves. "X by N steps": the evaluation at N and the next two all reach X, in the median over seeds."""
+"""Analysis of learning curves. "X by N steps": the evaluation at N and the next two all reach X, in the median over seeds."""
 
 import statistics
 from collections.abc import Mapping, Sequence

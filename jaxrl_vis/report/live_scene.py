@@ -1,4 +1,4 @@
-"""Three-dimensional scene of a MuJoCo model in a browser, by viser: the robot, and a translucent one at its goal."""
+"""Three-dimensional scene of a MuJoCo model in a browser (viser): the robot, and a translucent copy at its goal."""
 
 from typing import Any
 
@@ -9,10 +9,10 @@ import trimesh
 GOAL_COLOUR = (62, 207, 142)
 _GOAL_OPACITY = 0.35
 _VISIBLE_GROUPS = 3  # as in MuJoCo's viewers, geoms of groups 3 and up are for collisions
-_FLOOR_DROP = 0.002  # m; a plane would flicker where another shape stands on it
+_FLOOR_DROP = 0.002  # vertical offset of planes, m, against flickering below other shapes
 _FLAT = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH)
-_ENDLESS = 10.0  # half-size of a plane without one, m
-_ELEVATION, _TURN = np.radians(22.0), np.radians(35.0)  # of the first view, above the horizon and beside the task's camera
+_ENDLESS = 10.0  # half-size of infinite planes, m
+_ELEVATION, _TURN = np.radians(22.0), np.radians(35.0)  # initial view: above the horizon, and from the task's camera
 
 
 def surface(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -42,13 +42,13 @@ def surface(mj_model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray
 
 
 def colour(mj_model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Return the colour of a geom, RGBA [4] from 0 to 1."""
+    """Return the colour of a geom, RGBA [4] in [0, 1]."""
     material = mj_model.geom_matid[geom]
     return mj_model.geom_rgba[geom] if material < 0 else mj_model.mat_rgba[material]
 
 
 def visible_geoms(mj_model: mujoco.MjModel, body: int) -> list[int]:
-    """List the geoms of a body that are shown."""
+    """List the visible geoms of a body."""
     first, count = mj_model.body_geomadr[body], mj_model.body_geomnum[body]
     return [
         geom
@@ -58,19 +58,19 @@ def visible_geoms(mj_model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def moving_bodies(mj_model: mujoco.MjModel) -> list[int]:
-    """List the bodies that joints move and that have something to show."""
+    """List the movable bodies with visible geoms."""
     moved = (mj_model.body_weldid != 0) & (mj_model.body_mocapid < 0)
     return [body for body in range(mj_model.nbody) if moved[body] and visible_geoms(mj_model, body)]
 
 
 class LiveScene:
-    """Bodies of a model as nodes of viser's scene.
+    """Bodies of a model as nodes of a viser scene.
 
     Args:
         server: `viser.ViserServer`.
         mj_model: The model.
-        xpos, xquat: Poses of all bodies at first, [B, 3] (m) and [B, 4], scalar first.
-        camera: Name of the task's camera, from whose side the scene is looked at.
+        xpos, xquat: Initial poses of all bodies, [B, 3] (m) and [B, 4], scalar first.
+        camera: Name of the task's camera, which determines the initial view.
     """
 
     def __init__(self, server: Any, mj_model: mujoco.MjModel, xpos: np.ndarray, xquat: np.ndarray, camera: str):
@@ -85,7 +85,7 @@ class LiveScene:
         self._look(server, xpos, camera)
 
     def show(self, xpos: np.ndarray, xquat: np.ndarray, is_goal: bool = False) -> None:
-        """Move the robot, or the one at its goal, to poses [B, 3] and [B, 4]."""
+        """Move the robot, or its copy at the goal, to poses [B, 3] (m) and [B, 4]."""
         for body, frame in (self._goal if is_goal else self._robot).items():
             frame.position, frame.wxyz = xpos[body], xquat[body]
 
@@ -112,7 +112,7 @@ class LiveScene:
         return frame
 
     def _add_plane(self, name: str, geom: int) -> None:
-        """Add a plane as a light grid, whatever its colour: it is there to stand on."""
+        """Add a plane as a light grid, regardless of its colour."""
         width, height = (2 * float(side) if side > 0 else 2 * _ENDLESS for side in self._model.geom_size[geom][:2])
         self._scene.add_grid(
             name,
@@ -128,17 +128,17 @@ class LiveScene:
         )
 
     def _look(self, server: Any, xpos: np.ndarray, camera: str) -> None:
-        """Place the first view beside that of the task's camera, so that what moves fills it."""
+        """Set the initial view beside that of the task's camera, such that the moving bodies fill it."""
         mj_data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, mj_data)
         mujoco.mj_camlight(self._model, mj_data)
         towards = -mj_data.cam_xmat[self._model.camera(camera).id].reshape(3, 3)[:, 2]
-        # A camera that looks straight down has its lower edge in front of it.
+        # If the camera looks straight down, its up axis replaces the viewing direction.
         level = towards if abs(towards[2]) < 0.9 else mj_data.cam_xmat[self._model.camera(camera).id].reshape(3, 3)[:, 1]
         azimuth = np.arctan2(-level[1], -level[0]) + _TURN
         centre = xpos[self._moving].mean(axis=0)
         reach = max(float(np.linalg.norm(xpos[self._moving] - centre, axis=1).max()), 0.3 * float(self._model.stat.extent) / 3)
         away = np.array([np.cos(_ELEVATION) * np.cos(azimuth), np.cos(_ELEVATION) * np.sin(azimuth), np.sin(_ELEVATION)])
-        centre = centre - (0.0, 0.0, 0.2 * reach)  # it is seen from above
+        centre = centre - (0.0, 0.0, 0.2 * reach)  # because the view is from above
         view = server.initial_camera
         view.position, view.look_at, view.up = centre + 3.6 * reach * away, centre, (0.0, 0.0, 1.0)

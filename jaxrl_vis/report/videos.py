@@ -55,7 +55,7 @@ def first_seed(images: dict[str, Any]) -> EpisodeImages:
 
 
 def range_of_depth(episodes: EpisodeImages) -> tuple[float, float]:
-    """Return the range of depth in all these images, in grey levels, without outliers."""
+    """Return the robust depth range (percentiles) of all images, in grey levels."""
     depth = np.concatenate([episodes.frames[:, ::5, -1].ravel(), episodes.goals[:, -1].ravel()])
     near, far = np.percentile(depth, [0.5, 99.5])
     return float(near), max(float(far), float(near) + 1.0)
@@ -146,7 +146,7 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
 
 def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     """Encode a looping GIF. All frames share one palette, without dithering: no flicker, and good compression."""
-    # Each fourth pixel in each direction shows the same colours: images are enlarged by whole numbers.
+    # Every fourth pixel in each direction suffices for the palette, because images are enlarged by whole numbers.
     quarter = (max(1, images[0].width // 4), max(1, images[0].height // 4))
     samples = [image.resize(quarter, Image.Resampling.NEAREST) for image in images[:: max(1, len(images) // 16)] + images[-1:]]
     # Swatches reserve palette entries for the colours of borders and texts, however colourful the images are.

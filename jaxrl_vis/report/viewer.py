@@ -1,4 +1,4 @@
-"""HTML page of ``play --html``: episodes in three dimensions, in brax's viewer."""
+"""HTML page of ``play --html``: three-dimensional episodes in brax's viewer."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,12 +45,12 @@ class PosedEpisodes(NamedTuple):
 
 
 def play_poses(acting: Acting, train: TrainState, key: jax.Array, num_envs: int) -> PosedEpisodes:
-    """Play an episode of the first learner in each of E environments, without exploration.
+    """Roll out an episode of the first learner in each of E environments, without exploration.
 
     Args:
         acting: A MuJoCo environment, and the algorithm.
         train: The learners, [S, ...].
-        key: [] a typed key, which determines the episodes, as in `rollout.play`.
+        key: Typed key [] that determines the episodes, as in `rollout.play`.
         num_envs: E.
     """
     first = jax.tree.map(lambda leaf: leaf[:1], train)
@@ -61,12 +61,12 @@ def play_poses(acting: Acting, train: TrainState, key: jax.Array, num_envs: int)
 
 
 def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, out: Path) -> None:
-    """Play ``episodes`` episodes with the first seed of a learner, and write the page.
+    """Roll out episodes with the first seed of a learner, and write the page.
 
     Args:
         program: `train_step.TrainStep`.
         train: The learner, [S, ...].
-        key: Random key of the episodes.
+        key: Typed key [] of the episodes.
         episodes: Number of episodes, shown one after the other.
         out: The file.
     """

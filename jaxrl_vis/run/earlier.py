@@ -1,4 +1,4 @@
-"""Checks of an earlier part of a run: whether it is finished, its files are consistent, and how it is resumed."""
+"""Checks before a run is resumed: whether it is finished, and whether its files are consistent."""
 
 import sys
 from collections.abc import Callable, Collection
@@ -19,9 +19,9 @@ from jaxrl_vis.types import LoopState
 def is_finished(
     folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
 ) -> bool:
-    """Return True if a run is complete: a valid last checkpoint, its evaluation, and its images.
+    """Return True if a run is complete, with a valid last checkpoint, its evaluation, and its images.
 
-    The last one is that after ``total`` iterations, or after an early end.
+    The last checkpoint is that after ``total`` iterations, or after an early end.
     """
     last = _last_saved(checkpoints)
     if last < total and not has_ended_early(folder, programs.config, programs.seeds, last):
@@ -40,7 +40,7 @@ def has_ended_early(folder: RunFolder, config: Config, seeds: Collection[int], i
 
 
 def say_finished(folder: RunFolder, checkpoints: Checkpoints, config: Config, total: int) -> str:
-    """Return a message about a run that is complete, and how to go on."""
+    """Return the message for a complete run, including how to continue it."""
     last = _last_saved(checkpoints)
     if last < total:
         reached = f"{last} of {total} iterations, --stop-at {config.run.stop_at:g} is reached"
@@ -72,19 +72,19 @@ def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) 
 
 
 def last_evaluation(restored: Restored) -> int:
-    """Return the last iteration that was evaluated according to a checkpoint; 0 for none."""
+    """Return the last evaluated iteration according to a checkpoint; 0 if there is none."""
     since = restored.progress.get("since_evaluation")
     return 0 if since is None else restored.iteration - len(since)
 
 
 def refuse_missing_rows(folder: RunFolder, restored: Restored) -> None:
-    """Check that metrics.jsonl has the evaluations before a checkpoint.
+    """Check that metrics.jsonl contains the evaluations before a checkpoint.
 
-    Damaged lines and rows of another run may have been these evaluations, since one wrong bit makes either. So may lines that
-    an earlier resumption moved to the damaged or foreign checkpoints.
+    Damaged lines and rows of another run count as possible evaluations, because a single flipped bit produces either. So do
+    lines that an earlier resumption moved to the damaged or foreign checkpoints.
 
     Raises:
-        RequestError: The file ends earlier.
+        RequestError: Evaluations are missing.
     """
     evaluated = last_evaluation(restored)
     rows, contents = folder.rows(), metrics.read_contents(folder.metrics)
@@ -104,7 +104,7 @@ def cut_back(folder: RunFolder, checkpoints: Checkpoints, last: int, keeps_later
 
 
 def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
-    """Move other runs' files out of this folder before its run is deleted; returns lines that report it."""
+    """Move other runs' files aside before this folder's run is deleted; return lines that report it."""
     try:
         checkpoints.run_id = read_run_id(folder.path)
     except RequestError:  # without an id, no file can be attributed
@@ -120,5 +120,5 @@ def say_foreign(path: Path) -> str:
 
 
 def _asides(folder: RunFolder) -> tuple[Path, Path]:
-    """Files of lines that are damaged, and of rows of other runs."""
+    """Return the files for damaged lines, and for rows of other runs."""
     return folder.checkpoints / DAMAGED / folder.metrics.name, folder.checkpoints / FOREIGN / folder.metrics.name

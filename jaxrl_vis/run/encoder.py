@@ -1,4 +1,4 @@
-"""Training of a small encoder of a task's images, as an autoencoder on episodes of random actions, for method ``features``."""
+"""Training of a small image encoder, as an autoencoder on episodes of random actions, for the method ``features``."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ from jaxrl_vis_envs.base import GoalEnv
 
 
 def _collect(env: GoalEnv, episodes: int) -> Callable[[jax.Array], jax.Array]:
-    """Return key -> images [N, C, H, W] uint8 of episodes of random actions: those of all steps, and the goals."""
+    """Return a function key -> images [N, C, H, W] uint8 of episodes of random actions: all observations, and the goals."""
 
     def episode(key: jax.Array) -> jax.Array:
         start_key, action_key = jax.random.split(key)
@@ -45,16 +45,16 @@ def train_encoder(env: GoalEnv, config: Config, episodes: int, updates: int, pat
 
     Args:
         env: The task.
-        config: Sizes of the encoder, batch size, step size (the critic's) and seed.
+        config: Sizes of the encoder, batch size, learning rate (the critic's) and seed.
         episodes: Number of episodes of random actions.
         updates: Number of gradient steps.
         path: The file, .npz.
 
     Returns:
-        The mean squared error of the reconstruction, of normalised images, in each gradient step.
+        The mean squared reconstruction error of normalised images, for each gradient step.
 
     Raises:
-        RequestError: The task shows states.
+        RequestError: The task's observations are states.
     """
     if len(env.observation_spec.shape) != 3:
         raise RequestError(

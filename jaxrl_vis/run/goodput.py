@@ -1,4 +1,4 @@
-"""Goodput: gradient steps that are in the networks, as a fraction of those computed, over all processes of a run.
+"""Goodput: fraction of the computed gradient steps that are contained in the networks, over all processes of a run.
 
 processes.jsonl has one line per process that has trained the run:
 
@@ -43,7 +43,7 @@ class Account:
 
     Attributes:
         done: Iterations contained in the networks.
-        begun: Iterations begun by all processes; None where a line cannot be read.
+        begun: Iterations begun by all processes; None if a line cannot be read.
         resumes: Number of resumptions.
         replays_lost: Number of resumptions with an empty replay.
     """
@@ -55,7 +55,7 @@ class Account:
 
     @property
     def goodput(self) -> float | None:
-        """Fraction of the iterations begun that are in the networks; 1 before the first, None if unknown."""
+        """Fraction of the begun iterations that are contained in the networks; 1 before the first one, None if unknown."""
         if self.begun is None:
             return None
         return self.done / self.begun if self.begun else 1.0
@@ -128,7 +128,7 @@ class Goodput:
         """
         self._earlier = read_processes(self._path)
         before = self._path.read_bytes() if self._earlier else b""
-        if not self._earlier and iteration:  # earlier processes are known only by their result
+        if not self._earlier and iteration:  # only the result of earlier processes is known
             self._earlier = [Process(0, iteration)]
             before = bytes(Process(0, iteration))
         if before and not before.endswith(b"\n"):

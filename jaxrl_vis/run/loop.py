@@ -2,14 +2,14 @@
 
     dispatch iteration k+1                 the device never waits for the host ...
     read the metrics of iteration k        ... because the host reads one iteration late
-    at a boundary (evaluation, checkpoint, signal): read the current iteration too, then evaluate, write metrics, save
+    at a boundary (evaluation, checkpoint, signal): also read the current iteration, then evaluate, write metrics, save
 
-Everything that can refuse a run (folder, lock, memory, checkpoints, compilation, memory again) comes before the first byte is
+All checks that can refuse a run (folder, lock, memory, checkpoints, compilation, memory again) come before the first byte is
 written or deleted. Metrics are on the disk before the checkpoint of the same iteration is, so a checkpoint never runs ahead of
-metrics.jsonl; and nothing is saved before the iteration's metrics were read and found finite.
+metrics.jsonl; and nothing is saved before the iteration's metrics have been read and found finite.
 
-Of several processes (`jaxrl_vis.host.distributed`) all train, evaluate and save; the first alone writes everything else. They
-look for signals at boundaries only, where they wait for each other anyway.
+With several processes (`jaxrl_vis.host.distributed`), all train, evaluate and save; only the first writes everything else. They
+check for signals only at boundaries, where they synchronise anyway.
 """
 
 import contextlib
@@ -50,7 +50,7 @@ from jaxrl_vis.types import LoopState
 
 _FILTERED_TOO_MUCH, _FILTERED_EVALUATIONS = 0.9, 3
 GUARD = "guard/"
-"""Metrics whose names begin like this stop a run where they are not 0; all others reach metrics.jsonl."""
+"""Name prefix of metrics that stop a run if they are not 0; all others are written to metrics.jsonl."""
 
 
 class RunLoop:
@@ -60,8 +60,8 @@ class RunLoop:
         programs: Programs of the run.
         folder: Folder of its files.
         log: Names of the loggers, see `loggers`.
-        on_begun: Called when the folder is this run's.
-        callbacks: Called after each evaluation, when all is saved.
+        on_begun: Called once the folder belongs to this run.
+        callbacks: Called after each evaluation, once everything is saved.
     """
 
     def __init__(
@@ -88,19 +88,19 @@ class RunLoop:
         self._progress = Progress()
         self._goodput = Goodput(folder.processes)
         self._done = 0
-        self._recent_at: int | None = None  # what this process has gone on from, if it was a recent state
-        self._replay_lost = False  # by this process, which has gone on from a light checkpoint
+        self._recent_at: int | None = None  # iteration of the recent state from which this process resumed
+        self._replay_lost = False  # True if this process resumed from a light checkpoint
         self._loop: LoopState | None = None
         self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
         self._started, self._compile_s = time.monotonic(), 0.0
         self._pace = Pace(self._program.steps_per_iteration * self._config.run.seeds)
         self._is_left_alone = False
-        self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration that the run goes on from
-        self._evaluates_ahead = False  # while the iteration before is still learned from
-        self._evaluated_at = 0  # the last evaluation that what was restored knows of
-        self._owed_evaluation = False  # what was restored owes an evaluation, and would whenever it is restored
-        self.has_begun = False  # the folder is this run's
+        self._evaluated_there: set[int] = set()  # seeds that have a row of the iteration from which the run resumes
+        self._evaluates_ahead = False  # True if evaluations are dispatched before the iteration's metrics are read
+        self._evaluated_at = 0  # last evaluation according to the restored checkpoint
+        self._owed_evaluation = False  # True if the restored checkpoint lacks its evaluation
+        self.has_begun = False  # True once the folder belongs to this run
 
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """Run to the end, yielding reports; see `Trainer.run`."""
@@ -112,7 +112,7 @@ class RunLoop:
         shapes, layout = self._programs.shapes, self._programs.layout
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
-        distributed.meet("checked")  # before the first of them writes anything that the others would find
+        distributed.meet("checked")  # before the first process writes anything that the others would detect
         if goes_on:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with run_lock(self._folder.path, self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
@@ -123,9 +123,9 @@ class RunLoop:
                 return
             interruption = Interruption()
             try:
-                with safe_streams():  # libraries that warn as they compile
+                with safe_streams():  # for warnings of libraries during compilation
                     compiled = self._prepare(goes_on, memory)
-                # Not before: while XLA compiles, no Python runs that could look at a flag, and there is nothing to save.
+                # Not before: while XLA compiles, no Python code can check the flag, and there is nothing to save.
                 with interruption:
                     self._begin(compiled, goes_on, overwrite)
                     yield from self._train(interruption)
@@ -142,7 +142,7 @@ class RunLoop:
             except NonFiniteError:
                 raise
             except (KeyboardInterrupt, SystemExit):
-                if not interruption:  # raised by a handler of the caller's own, which was left in charge
+                if not interruption:  # raised by the caller's own handler, which was kept
                     self._rescue()
                 raise
             except Exception as error:
@@ -166,7 +166,7 @@ class RunLoop:
             self._folder.check_ours(self._checkpoints.run_id, self._held)
 
     def _gone(self) -> FolderGoneError | None:
-        """Reason why nothing can be saved any more; None while the run folder is this run's."""
+        """Return why nothing can be saved any more; None if the run folder still belongs to this run."""
         try:
             self._check_ours()
         except FolderGoneError as gone:
@@ -176,10 +176,10 @@ class RunLoop:
 
     def _rescue(self) -> None:
         self._console.stop()
-        if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may be another's, or gone
+        if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may belong to another run
             return
         if distributed.are_several():
-            self._is_left_alone = True  # whatever went wrong, the others may have ended, and saving would wait for them
+            self._is_left_alone = True  # the other processes may have ended, and saving would wait for them
             return
         with contextlib.suppress(Exception):
             while self._unread:
@@ -209,7 +209,7 @@ class RunLoop:
         return compiled
 
     def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
-        """Check the memory once more, the last check that can refuse the run; then prepare folder and state."""
+        """Check the memory again, the last check that can refuse the run; then prepare folder and state."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
@@ -238,7 +238,7 @@ class RunLoop:
         self._pace.begin(self._done)
 
     def _open(self, goes_on: bool, overwrite: bool) -> None:
-        """Prepare the folder, unless it was moved or deleted since it was locked: compiling takes a while."""
+        """Prepare the folder, unless it was moved or deleted during compilation."""
         assert self._held is not None
         self._folder.check_place(self._held)
         try:
@@ -255,9 +255,9 @@ class RunLoop:
         """Truncate the metrics to the iteration from which the run continues, and open the loggers.
 
         Args:
-            goes_on: True if it does.
-            damaged: Checkpoints that were set aside.
-            foreign: Those of other runs.
+            goes_on: True if the run resumes.
+            damaged: Damaged checkpoints that were set aside.
+            foreign: Checkpoints of other runs that were set aside.
         """
         if goes_on:
             if said := earlier.cut_back(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
@@ -274,7 +274,7 @@ class RunLoop:
         self._done, self._evaluated_at = restored.iteration, earlier.last_evaluation(restored)
         if earlier.has_ended_early(self._folder, self._config, self._programs.seeds, self._done):
             self._total = min(self._total, self._done)
-        # A run that has come far enough before it was evaluated, or that is asked for fewer steps than it has, ends with that.
+        # A run that had all its steps but not the evaluation, or is resumed with fewer total steps, ends with an evaluation.
         self._progress.evaluation_due |= self._done >= self._total and not earlier.is_evaluated(
             self._folder, self._programs.seeds, restored
         )
@@ -313,12 +313,12 @@ class RunLoop:
             recent = self._saver.is_recent_due(light)
             if not (evaluation or light or full or recent or (interruption and not distributed.are_several())):
                 continue
-            # Before the metrics are read, so that the device does not wait for the host meanwhile.
+            # Before the metrics are read, so that the device does not wait for the host.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None
             report = self._read()
             if interruption.reached_any():
                 self._save_and_end(evaluation, interruption)
-            if recent:  # and once more after an evaluation, which takes so long that a process may be killed meanwhile
+            if recent:  # and again after an evaluation, during which the process may be killed
                 self._progress.evaluation_due = evaluation
                 self._saver.recent(self._loop, self._done, self._progress_now())
             if evaluation:
@@ -329,7 +329,7 @@ class RunLoop:
                 self._saver.light(self._loop, self._done, self._progress_now())
             if full:
                 self._saver.full(self._loop, self._done, self._progress_now())
-            # A signal that came during the evaluation must not wait for another iteration.
+            # A signal received during the evaluation must not wait for another iteration.
             if self._done < self._total and interruption.reached_any():
                 self._save_and_end(False, interruption)
             if evaluation:
@@ -337,7 +337,7 @@ class RunLoop:
             yield report
 
     def _end_early(self, report: Report) -> None:
-        """Make this iteration the last one if an evaluation, or a callback that is told of it, asks for that."""
+        """Make this iteration the last one if an evaluation or a callback requests it."""
         if (reason := self._milestones.ends(report, self._callbacks)) and self._done < self._total:
             self._say(f"stopped at iteration {self._done} of {self._total}: {reason}")
             self._total = self._done
@@ -353,7 +353,7 @@ class RunLoop:
         """Wait for the metrics of the oldest unread iteration, and record them.
 
         Raises:
-            NonFiniteError: A guard has counted something.
+            NonFiniteError: A guard metric is not 0.
         """
         iteration, pending = self._unread[0]
         values = pending.read_per_seed(self._config.run.seeds)
@@ -367,7 +367,7 @@ class RunLoop:
         return self._report(iteration, values)
 
     def _begin_evaluation(self) -> Pending:
-        """Start evaluating the learner; `_evaluate` waits for the outcome."""
+        """Dispatch an evaluation of the learner; `_evaluate` waits for the outcome."""
         assert self._loop is not None
         self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)
@@ -401,7 +401,7 @@ class RunLoop:
             self._loggers.rows(rows)
         progress.evaluation_due = False
         self._warn_if_filtered(means)
-        # The last evaluation may come between two scheduled ones; a longer run, resumed from here, goes on with the means.
+        # The last evaluation may lie between two scheduled ones; a longer run, resumed from here, continues the means.
         if self._is_due(self._config.run.eval_interval):
             progress.since_evaluation = []
         self._show(values, speed)
@@ -416,7 +416,7 @@ class RunLoop:
         env_steps = self._done * self._program.steps_per_iteration
         words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {show_shares(success)}"]
         words.append(f"distance {np.median(distance):.3f} {unit}")
-        if self._done > self._pace.begun:  # none yet where an evaluation is made up for: nobody knows the speed
+        if self._done > self._pace.begun:  # the speed is unknown if only a missed evaluation was made up for
             words.append(f"{speed:,.0f} steps/s")
             if self._done < self._total:
                 words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")

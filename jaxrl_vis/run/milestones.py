@@ -1,4 +1,4 @@
-"""Events of a run that depend on its evaluations: a new best checkpoint, and an early end."""
+"""Events of a run triggered by its evaluations: a new best checkpoint, and an early end."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,7 +18,7 @@ SCORE, SCORED = "score", "scored"
 
 
 class Milestones:
-    """Milestones of one run. The best score is kept with the best checkpoint alone, so every resumption finds it there.
+    """Milestones of one run. The best score is stored only with the best checkpoint, where every resumption finds it.
 
     Args:
         config: The run.
@@ -64,7 +64,7 @@ class Milestones:
             self._best = score
 
     def ends(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
-        """Return why the run ends after this evaluation; None if it goes on."""
+        """Return why the run ends after this evaluation; None if it continues."""
         asked = False
         for callback in callbacks:  # each of them, also after one that asks to stop
             asked |= callback(report) is True

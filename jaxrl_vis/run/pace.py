@@ -31,5 +31,10 @@ class Pace:
         return max(0, done - self._marked) * self._steps / max(1e-9, time.monotonic() - self._marked_at)
 
     def seconds_left(self, done: int, total: int) -> float:
-        """Return the seconds until ``total`` iterations are done, at the average speed; at least one must be done."""
+        """Return the estimated time until ``total`` iterations are done, s, at the average speed.
+
+        Args:
+            done: Iterations completed so far; must exceed `begun`.
+            total: Iterations of the whole run.
+        """
         return (total - done) * (time.monotonic() - self._begun_at) / (done - self.begun)

@@ -1,4 +1,4 @@
-"""Reports of a run's iterations, and the functions that are told of them."""
+"""Reports of a run's iterations, and callbacks that receive them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,7 +14,7 @@ class Report:
         iteration: Iterations done since the run began, this one included.
         env_steps: Environment steps so far, per seed.
         updates: Gradient steps so far, per seed.
-        metrics: Name -> one number per seed; ``eval/*`` only where the iteration ended with an evaluation.
+        metrics: One number per seed, by name; ``eval/*`` only if the iteration ended with an evaluation.
     """
 
     iteration: int
@@ -24,4 +24,4 @@ class Report:
 
 
 Callback = Callable[[Report], bool | None]
-"""Called with each report that has an evaluation, in every process; returns True to end the run, as if it were finished."""
+"""Function called in every process with each report that has an evaluation; returns True to end the run early."""

@@ -32,7 +32,7 @@ from jaxrl_vis.types import LoopState
 
 
 def import_saving_libraries() -> None:
-    """Import Matplotlib and orbax, which takes a second or two, in parallel with XLA's compilation."""
+    """Import Matplotlib and orbax, which takes a second or two; called while XLA compiles."""
     for name in ("jaxrl_vis.report.plots", "orbax.checkpoint"):
         importlib.import_module(name)
 
@@ -61,7 +61,7 @@ class Saver:
         self._keeps_full = programs.config.run.full_checkpoint_interval > 0
 
     def has(self, tier: str, iteration: int) -> bool:
-        """Return True if a tier has a checkpoint of an iteration; several processes agree on the answer."""
+        """Return True if a tier has a checkpoint of an iteration; all processes return the same answer."""
         return distributed.any_process(iteration in self._checkpoints.iterations(tier))
 
     def light(self, loop: LoopState, iteration: int, progress: Progress) -> None:
@@ -84,7 +84,7 @@ class Saver:
             loop: The state.
             iteration: Iterations completed.
             progress: Progress of the host.
-            about: Entries that its manifest has in addition to those of the progress.
+            about: Additional entries of its manifest.
         """
         self._check()
         self._refuse_nonfinite(loop, iteration)
@@ -101,11 +101,11 @@ class Saver:
         return self._programs.layout.mesh is None and is_cheap(self._programs.shapes.replay)
 
     def is_recent_due(self, light: bool) -> bool:
-        """Return True if `recent` should be called after this iteration: it is cheap, and the last call was long enough ago.
+        """Return True if `recent` should be called after this iteration: it is cheap, and enough time has passed.
 
         Args:
-            light: A light checkpoint is about to be written, which must not be the newest one, because the run would resume
-                from it.
+            light: True if a light checkpoint is about to be written, which must not become the newest one, because the run
+                would resume from it.
         """
         return self._keeps_recent and self._checkpoints.recent.is_due(light)
 
@@ -182,7 +182,7 @@ class Saver:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """Convert errors of the run's files into a `StorageError`; use it only around file operations."""
+        """Context that converts OSErrors into a `StorageError`; for file operations of the run only."""
         try:
             yield
         except OSError as error:
@@ -190,7 +190,7 @@ class Saver:
             raise StorageError(f"cannot write to {self._folder.path} ({reason})") from error
 
     def storage_error(self, error: StorageError) -> StorageError:
-        """Extend an error of writing by the last checkpoint and the command that resumes the run."""
+        """Extend a write error by the last checkpoint and the command that resumes the run."""
         newest = self._checkpoints.newest()
         good = "there is no checkpoint yet" if newest is None else f"the last checkpoint is of iteration {newest}"
         cause = error.__cause__

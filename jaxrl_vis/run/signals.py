@@ -28,7 +28,7 @@ _NAMES = (
 )
 _REAL_TIME = range(signal.SIGRTMIN, signal.SIGRTMAX + 1) if hasattr(signal, "SIGRTMIN") else range(0)
 SIGNALS: tuple[int, ...] = (*(int(getattr(signal, name)) for name in _NAMES if hasattr(signal, name)), *_REAL_TIME)
-"""All signals that end a process by default, except faults, SIGKILL, and those that Python ignores (SIGPIPE, SIGXFSZ)."""
+"""All signals that terminate a process by default, except faults, SIGKILL, and those ignored by Python (SIGPIPE, SIGXFSZ)."""
 
 # Sent deliberately; a second one means that the sender does not want to wait. A second one of the others has no meaning:
 # SIGXCPU comes every second, and on a closed terminal both the kernel and the shell send SIGHUP.
@@ -66,7 +66,7 @@ def shielded_children() -> Iterator[None]:
 
 
 def shield_this_thread() -> None:
-    """Block `SIGNALS` for the rest of this thread's life: an initializer for pools of compiling threads."""
+    """Block `SIGNALS` permanently in this thread; an initializer for pools of compiling threads."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
 
@@ -170,7 +170,7 @@ class Interruption(_Handlers):
 
 
 def _ignore_half_made_loops() -> None:
-    """Silence asyncio (orbax saves with it) about an event loop that a raising handler has kept from being made."""
+    """Silence asyncio, used by orbax for saving, about an event loop whose creation was interrupted by a raising handler."""
     before = sys.unraisablehook
 
     def hook(unraisable: "sys.UnraisableHookArgs") -> None:
@@ -194,7 +194,7 @@ class Ending(_Handlers):
             thread does not return to Python. It must end the process. None: no such watchdog.
 
     Attributes:
-        signal: The first signal received, except those handled by an `Interruption`; None for none.
+        signal: The first signal received, except those handled by an `Interruption`; None if there was none.
     """
 
     def __init__(self, give_up: Callable[[int], None] | None = None) -> None:

@@ -2,10 +2,10 @@
 
     trainer = make_trainer(config)
     loop = trainer.init(jax.random.key(0))
-    loop, metrics = trainer.train_iteration(loop)       # a rollout and gradient steps; what you do between two is up to you
-    for report in trainer.run(): ...                    # or the whole thing: logs, evaluates, saves, draws
+    loop, metrics = trainer.train_iteration(loop)       # a rollout and gradient steps, in a loop of your own
+    for report in trainer.run(): ...                    # or a complete run, with logs, evaluations, checkpoints and images
 
-What was trained is used by `jaxrl_vis.run.trained.restored_run`.
+Trained runs are loaded by `jaxrl_vis.run.trained.restored_run`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,11 +40,11 @@ class Trainer:
     Args:
         config: The run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
-        run_dir: Folder of the files of `run`; None: `jaxrl_vis.run.storage.folder.default_folder`.
-        resume: Go on with the run in ``run_dir``.
+        run_dir: Folder of the files of `run`; None for `jaxrl_vis.run.storage.folder.default_folder`.
+        resume: Continue the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
         log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
-        keep_programs: Trace nothing that an earlier process has traced (`jaxrl_vis.run.compiled.trace_cache`).
+        keep_programs: Cache traced programs between processes (`jaxrl_vis.run.compiled.trace_cache`).
 
     Attributes:
         config: The run.
@@ -124,10 +124,10 @@ class Trainer:
 
         Args:
             loop: The learner.
-            key: A typed key that draws the episodes; None: always the same ones.
+            key: Typed key [] that determines the episodes; None for the same ones at every call.
 
         Raises:
-            RequestError: ``key`` is a seed, a key of the old kind, or several keys.
+            RequestError: ``key`` is an integer, an untyped key, or several keys.
         """
         if key is not None:
             _check_key("evaluate", key)
@@ -145,8 +145,8 @@ class Trainer:
 
         Args:
             callbacks: Each is called with every report that has an evaluation, once all of it is saved. One that returns True
-                ends the run there, as if that were its end: the curve and the video are drawn, and nothing is left to resume
-                but more iterations.
+                ends the run there, as if it were complete: the curve and the video are written, and resuming it only adds
+                further iterations.
 
         Raises:
             RequestError: The folder, the saved run or the memory does not suit the configuration, or another process writes
@@ -182,13 +182,13 @@ def make_trainer(
 
     Args:
         config: The run.
-        run_dir: Folder of the files of `Trainer.run`; None: below ``runs/``, named after the configuration.
-        resume: Go on with the run in that folder; in an empty one it starts from the beginning, and reports so.
+        run_dir: Folder of the files of `Trainer.run`; None for one below ``runs/``, named after the configuration.
+        resume: Continue the run in that folder; an empty one starts a new run, with a message.
         overwrite: Delete the run in that folder and start again.
         log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
-        keep_programs: Trace nothing that an earlier process has traced. For processes that have replaced nothing in this
-            package's modules, which would not be seen (`jaxrl_vis.run.compiled.trace_cache`).
-        policy_alone: The learner is a policy, which plays and cannot be trained (`Algorithm.of_policies`).
+        keep_programs: Cache traced programs between processes. Only for processes that do not modify this package's modules,
+            which the cache would not detect (`jaxrl_vis.run.compiled.trace_cache`).
+        policy_alone: The learner is only a policy, which cannot be trained (`Algorithm.of_policies`).
 
     Raises:
         RequestError: The configuration is contradictory, or differs from the saved run.

@@ -21,7 +21,7 @@ from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
-_MOST = 2000  # runs that are stored; the oldest are deleted
+_MOST = 2000  # maximum number of stored runs; the oldest are deleted
 _trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 
@@ -31,7 +31,7 @@ def is_own(config: Config) -> bool:
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
-    """Return True if a run's code was trusted before and is, as far as can be told, unchanged; or if it has none.
+    """Return True if a run has no custom code, or if its code was trusted before and appears unchanged.
 
     Raises:
         RequestError: There is no run in ``run_dir``, or a part of it is not written ``module:Name``.
@@ -41,12 +41,12 @@ def is_trusted(run_dir: Path, config: Config) -> bool:
 
 
 def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None:
-    """Remember that the custom parts of a run may be imported.
+    """Store the permission to import the custom parts of a run.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        was_trained_here: Allow later changes of the file, which a user who trains also edits; not if it lies in the run folder.
+        was_trained_here: Also permit later changes of the files by the user, except of files in the run folder.
     """
     changing, as_it_is = _names(run_dir, config)
     is_inside = any(_is_inside(run_dir, file) for file in _files(config).values())
@@ -62,16 +62,16 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
 
 
 def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True") -> None:
-    """Check that the code of a run may be imported; permission by ``may`` is stored.
+    """Check that the code of a run may be imported; the permission ``may`` is stored.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
         may: Permission by the user.
-        mend: Instruction for giving the permission, for the message.
+        mend: Hint on how to give the permission, for the message.
 
     Raises:
-        RequestError: There is no permission.
+        RequestError: Permission is missing.
     """
     if not is_own(config) or is_trusted(run_dir, config):
         return

@@ -1,8 +1,8 @@
-"""Gradient steps of our learner and of the same learner in PyTorch, on the same device and in the same call.
+"""Speed of gradient steps of our learner and of the same learner in PyTorch, on the same device and in the same call.
 
     python -m benchmarks.peers.torch [--env VisualFetchReach] [--preset paper] [--image-size 64] [--batch-size 512]
 
-Needs PyTorch. Both learn from goals that are never trivial and from images that are not shifted: PyTorch's learner has neither.
+Needs PyTorch. Trivial goals and random shifts of images are off for both, because PyTorch's learner lacks them.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from jaxrl_vis.bench import Measurement, Settings, update
 from jaxrl_vis.learner.train_step import make_train_step
 
 LEFT_OUT = {"random_shift": 0, "trivial_goals": 1.0}
-"""Fields of the configuration that PyTorch's learner lacks, at the values that switch them off."""
+"""Configuration fields that PyTorch's learner lacks, with the values that disable them."""
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
@@ -26,7 +26,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
 
     Raises:
         RequestError: PyTorch is missing, or its learner lacks an option that is set.
-        AssertionError: PyTorch does not compute what we do.
+        AssertionError: PyTorch's results differ from ours.
     """
     comparison.load()  # first, because it may be missing
     updates = update.updates_per_call(settings)

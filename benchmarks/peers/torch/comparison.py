@@ -1,8 +1,8 @@
 """Comparison of our gradient steps with PyTorch's (`learner`), on the same device and in the same call.
 
-First both are checked to compute the same: they start from our parameters, statistics and replay, take three gradient steps on
-the same three batches in float32, and must agree on every loss and on the gradient of one layer of each network. Then PyTorch's
-steps are timed in the dtype of ours, with either encoder, and the faster one counts.
+First, equality is checked: both start from our parameters, statistics and replay, take three gradient steps on the same three
+batches in float32, and must agree on every loss and on the gradient of one layer of each network. Then PyTorch's steps are
+timed in our dtype with either encoder, and the faster one counts.
 
 JAX takes most of a GPU's memory when it starts; if PyTorch then runs out, set XLA_PYTHON_CLIENT_MEM_FRACTION=.5.
 """
@@ -32,16 +32,16 @@ from jaxrl_vis.types import ReplayState, TrainState
 STEPS = 3
 """Number of compared gradient steps."""
 LOSS_TOLERANCE, GRADIENT_TOLERANCE = 1e-3, 1e-3
-"""Largest relative difference of a loss, and of a gradient in norm, in float32."""
+"""Maximum relative difference of a loss, and of a gradient (by norm), in float32."""
 DTYPE_TOLERANCE = 0.1
-"""Largest relative difference of the first critic loss between float32 and the timed dtype."""
+"""Maximum relative difference of the first critic loss between float32 and the timed dtype."""
 COMPARED_LAYER = {"critic": "encoder/kernel_1", "actor": "head/hidden_0/kernel"}
 """Layer of each network whose gradients are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """Our first gradient steps in float32, and their starting point. All arrays are NumPy's.
+    """Our first gradient steps in float32, and their starting point, as NumPy arrays.
 
     Attributes:
         parameters: Parameters by network and name, before the first step.
@@ -74,7 +74,7 @@ def load() -> Any:
 
 
 def by_name(tree: Any) -> dict[str, Any]:
-    """Flatten nested dictionaries to leaves by path, such as encoder/kernel_0."""
+    """Flatten nested dictionaries into leaves by path, such as encoder/kernel_0."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
 
@@ -98,10 +98,10 @@ def distinguishable(train: TrainState, program: TrainStep, replay: ReplayState) 
 
 
 def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Reference:
-    """Take our steps, in float32 with exact products, from `distinguishable`.
+    """Take our steps from `distinguishable`, in float32 with full-precision products.
 
     Args:
-        program: Program, of which the configuration and sizes count, but not its dtype.
+        program: Program; its configuration and sizes are used, but not its dtype.
         train, replay: State of one seed.
     """
     config = program.config.replace(compute_dtype="float32")
@@ -124,7 +124,7 @@ def reference(program: TrainStep, train: TrainState, replay: ReplayState) -> Ref
 
     def step(with_actor: bool, train: TrainState, replay: ReplayState, choice: Choice) -> tuple[TrainState, jax.Array, Any]:
         working = algorithm.begin(train.agent, train.statistics)
-        # The actor's gradient is compared in every step, and applied only in the actor's turns.
+        # The actor's gradient is computed in every step, but applied only in the actor's turns.
         gradients, metrics = algorithm.gradients(working, algorithm.prepare(working, sampler.batch(replay, choice)), True)
         losses = jnp.stack([metrics["train/critic_loss"], metrics["train/actor_loss"]])
         taken = gradients if with_actor else gradients._replace(actor=None)
@@ -160,7 +160,7 @@ def compare(reference: Reference, losses: np.ndarray, gradients: Mapping[str, np
         gradients: Gradient of the `COMPARED_LAYER` of each network in the first step, shaped as ours.
 
     Raises:
-        AssertionError: The two learners compute different things.
+        AssertionError: The differences exceed the tolerances.
     """
     difference = float(np.max(np.abs(losses - reference.losses) / np.maximum(np.abs(reference.losses), 1e-3)))
     differences = {"loss_difference": difference}
@@ -168,7 +168,7 @@ def compare(reference: Reference, losses: np.ndarray, gradients: Mapping[str, np
         ours = reference.gradients[network][COMPARED_LAYER[network]]
         differences[f"{network}_gradient_difference"] = float(np.linalg.norm(gradient - ours) / np.linalg.norm(ours))
     bounds = {name: LOSS_TOLERANCE if name == "loss_difference" else GRADIENT_TOLERANCE for name in differences}
-    if not all(differences[name] <= bound for name, bound in bounds.items()):  # NaN is not within a bound either
+    if not all(differences[name] <= bound for name, bound in bounds.items()):  # fails for NaN, too
         raise AssertionError(
             f"PyTorch does not compute what we do: {differences}, losses {losses.tolist()}, {reference.losses.tolist()}"
         )
@@ -176,7 +176,7 @@ def compare(reference: Reference, losses: np.ndarray, gradients: Mapping[str, np
 
 
 def _rules(learner: Any, program: TrainStep, train: TrainState, encoder: str, dtype: Any) -> Any:
-    """Make `learner.Rules` of a configuration. The parameters tell which networks have an encoder."""
+    """Make `learner.Rules` from a configuration; the parameters determine which networks have an encoder."""
     config, resolved = program.config, program.resolved
     numbers = {**config.flat(), **dataclasses.asdict(resolved), "threshold": float(program.env.threshold)}
     known = {

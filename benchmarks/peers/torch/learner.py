@@ -1,13 +1,12 @@
-"""Learner of `jaxrl_vis.learner` in PyTorch, written to be as fast as PyTorch allows; `comparison` measures it.
+"""PyTorch implementation of `jaxrl_vis.learner`'s learner, optimised for speed; `comparison` measures it.
 
     step        gather -> normalise -> losses -> gradients -> Adam -> target networks: one function, compiled as a whole
-    run         draw the batches of all steps, then replay one CUDA graph per step
+    run         sample the batches of all steps, then replay one CUDA graph per step
 
 Parameters are float32 tensors by name ("encoder/kernel_0", "head/output/bias"); large kernels have a copy in the compute
 dtype of the networks, which Adam updates with them. Everything is updated in place, because a CUDA graph has fixed addresses.
 
-The replay stores images in the order that the encoder reads, see `layout`, which saves the rearrangement that ours makes in
-every step.
+The replay stores images in the encoder's layout, see `layout`, which saves the rearrangement that ours does in every step.
 """
 
 import dataclasses
@@ -24,14 +23,14 @@ from benchmarks.peers.torch import layout
 NETWORKS = ("actor", "critic", "target_actor", "target_critic")
 
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8  # Adam's, as in optax
-_REARRANGED = 64  # episodes that are rearranged at a time
+_REARRANGED = 64  # episodes rearranged at a time
 
 Tensors = dict[str, Any]  # torch.Tensor by name
 
 
 @dataclasses.dataclass(frozen=True)
 class Rules:
-    """Hyper-parameters: the numbers of a `Config` and its `Resolved`.
+    """Hyper-parameters, from a `Config` and its `Resolved`.
 
     Attributes:
         encoder: Layout of images and kernels, see `layout`.
@@ -75,7 +74,7 @@ class Rules:
 
 
 class Replay:
-    """Episodes on the device, as `replay.ReplayState` holds them, with every image in the order that the encoder reads.
+    """Episodes on the device, as in `replay.ReplayState`, with images in the encoder's layout.
 
     Args:
         observations: NumPy array [N, T+2, C, H, W] uint8.
@@ -185,7 +184,7 @@ class Learner:
     # -- Batches
 
     def draw(self, steps: int) -> Any:
-        """Draw transitions and goals for many steps: episodes, times and goal slots [steps, 3, B] int64; see `relabel`."""
+        """Sample transitions and goals for many steps: episodes, times and goal slots [steps, 3, B] int64; see `relabel`."""
         rules, shape = self.rules, (steps, self.rules.batch_size)
         random = functools.partial(torch.rand, shape, device=self.device)
         episode = torch.randint(0, self.replay.episodes, shape, device=self.device)
@@ -272,7 +271,7 @@ class Learner:
         return critic_error, policy_loss, critic_gradients, actor_gradients
 
     def apply(self, critic: Tensors, actor: Tensors, with_targets: bool = True) -> None:
-        """Apply Adam to the critic, to the actor if it has gradients, then update the target networks if it is their turn."""
+        """Apply Adam to the critic, and to the actor if it has gradients; update the target networks if ``with_targets``."""
         self._adam("critic", critic, self.rules.critic_learning_rate)
         if actor:
             self._adam("actor", actor, self.rules.actor_learning_rate)
@@ -280,7 +279,7 @@ class Learner:
             self.follow()
 
     def follow(self) -> None:
-        """Move the target networks towards the online networks."""
+        """Update the target networks: exponential moving average of the online networks."""
         for network in ("critic", "actor"):
             target = self.networks[f"target_{network}"]
             online = [self.networks[network][name] for name in target]
@@ -344,7 +343,7 @@ class Compiled:
         mode = "max-autotune-no-cudagraphs" if on_gpu else None
         compile_ = functools.partial(torch.compile, fullgraph=True, dynamic=False, mode=mode)
         step, follow = compile_(learner.step), compile_(learner.follow)
-        # Rare updates of target networks run after the step: as part of the step, they would have it compiled twice.
+        # Infrequent updates of target networks run after the step, which would otherwise be compiled twice.
         at_every_step = learner.rules.target_update_interval == 1
         interval = math.lcm(learner.rules.actor_interval, learner.rules.target_update_interval)
         self._calls: dict[tuple[bool, bool], Callable[[], None]] = {}
@@ -372,7 +371,7 @@ class Compiled:
         return graph.replay
 
     def __call__(self) -> Any:
-        """Draw new batches and dispatch all steps; return the last losses of critic and actor, [2] float32, asynchronously."""
+        """Sample batches and dispatch all steps; return the last losses of critic and actor, [2] float32, asynchronously."""
         self._choices.copy_(self.learner.draw(self.steps))
         self._cursor.zero_()
         for _ in range(self.steps):

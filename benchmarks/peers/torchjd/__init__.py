@@ -1,11 +1,11 @@
-"""Weightings beside TorchJD's, which runs in an environment of its own.
+"""Comparison of our weightings with TorchJD's, which runs in an environment of its own.
 
     python -m venv torchjd && torchjd/bin/pip install torch "torchjd[full]==0.18.0"
     python -m benchmarks.peers.torchjd equality --python torchjd/bin/python    same Jacobians, same results
     python -m benchmarks.peers.torchjd cost --python torchjd/bin/python        time on one device, in one call
 
-jacobians   random ones of all ranks, and the numbers that random methods would draw
-ours, peer  the results of either side; `peer` imports PyTorch and TorchJD alone, and is run as a script
-equality    differences, and how well each side solves the method's problem
+jacobians   random ones of all ranks, and the random numbers of random methods
+ours, peer  results of either side; `peer` imports only PyTorch and TorchJD, and is run as a script
+equality    differences, and residuals of each side's solution of the method's problem
 cost        time of a step for 2 to 16 losses; `peer_cost`: TorchJD's
 """

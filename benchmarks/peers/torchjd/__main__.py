@@ -1,10 +1,10 @@
-"""Compares our weightings with TorchJD's: results (equality) or time (cost).
+"""Compare our weightings with TorchJD's: results (equality) or time (cost).
 
     python -m benchmarks.peers.torchjd equality --python PYTHON [--jacobians 1000]
     python -m benchmarks.peers.torchjd cost --python PYTHON [--losses 2 4 8 16] [--width 576] [--batch-size 256] [--repeats 20]
 
-PYTHON is that of an environment with torchjd[full] (see the package). Records: weighting_parity.json,
-weighting_cost-DEVICE.json. The exit status of equality is 1 if a method differs by more than it may.
+PYTHON is the interpreter of an environment with torchjd[full] (see the package). Records: weighting_parity.json,
+weighting_cost-DEVICE.json. The exit status of equality is 1 if a method exceeds its tolerance.
 """
 
 import argparse
@@ -29,13 +29,13 @@ def run_peer(python: Path, script: str, *arguments: str) -> None:
     """Run a script of this folder in the peer's environment; its output passes through.
 
     Raises:
-        subprocess.CalledProcessError: It failed.
+        subprocess.CalledProcessError: The script failed.
     """
     subprocess.run([str(python), str(Path(__file__).with_name(script)), *arguments], check=True)
 
 
 def equality(python: Path, jacobians: int, results: Path) -> int:
-    """Compute the results of both sides at once, compare them, and write the record."""
+    """Compute the results of both sides in parallel, compare them, and write the record; return the exit status."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -53,7 +53,7 @@ def equality(python: Path, jacobians: int, results: Path) -> int:
 
 
 def keep(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray], results: Path) -> int:
-    """Compare the results of both sides, print and write the record; return 1 if a method differs by more than it may."""
+    """Compare the results of both sides, print and write the record; return 1 if a method exceeds its tolerance, else 0."""
     from benchmarks.peers.torchjd import equality
 
     versions = dict(str(line).split(" ") for line in theirs.pop("versions"))
@@ -69,7 +69,7 @@ def keep(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dic
 
 
 def main() -> int:
-    """Read the command line and do what it asks for."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     actions = parser.add_subparsers(dest="action", required=True)
     commands = {name: actions.add_parser(name) for name in ("equality", "cost")}

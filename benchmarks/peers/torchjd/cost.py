@@ -1,7 +1,7 @@
-"""Time of our weightings for several numbers of losses on a trunk, alone and with the backward passes, beside TorchJD's.
+"""Time of our weightings for several numbers of losses on a trunk, alone and with backward passes, compared with TorchJD's.
 
-The trunk has three layers of tanh, 1 M parameters at the default width; each loss is the mean squared error of a linear head on
-it. Parameters and batch are float32. What is timed is one compiled function:
+The trunk has three tanh layers, 1 M parameters at the default width; each loss is the mean squared error of a linear head on
+it. Parameters and batch are float32. One compiled function is timed:
 
     alone    from gradients of all losses, or their Gramian, to weights or a direction
     step     from a batch to the gradient of all parameters: forward and backward passes, weighting, weighted sum
@@ -25,9 +25,9 @@ from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import write_atomically
 
 TARGETS = 16
-"""Numbers that each head predicts."""
+"""Output size of each head."""
 PASSES = 10
-"""Calls of the function in one timing."""
+"""Calls of the function per timing."""
 METHODS = tuple(name for name in jw.WEIGHTINGS if name not in ("none", "none_log", "fixed", "ol_aux_ablation"))
 
 
@@ -37,9 +37,9 @@ class Size:
 
     Attributes:
         losses: Numbers of losses.
-        width: Of the trunk's layers and of the input.
-        batch_size: Examples.
-        repeats: Timings of each function, of which the median counts.
+        width: Width of the trunk's layers and of the input.
+        batch_size: Number of examples.
+        repeats: Number of timings of each function; the median counts.
     """
 
     losses: tuple[int, ...]
@@ -49,12 +49,12 @@ class Size:
 
 
 def names_of(count: int) -> tuple[str, ...]:
-    """Names of K losses, the main one among them."""
+    """Return the names of K losses, the main one first."""
     return (jw.MAIN, *(f"other_{place}" for place in range(count - 1)))
 
 
 def problem(size: Size, count: int) -> tuple[dict[str, Any], dict[str, jax.Array]]:
-    """Return parameters, and a batch."""
+    """Draw parameters and a batch."""
     keys = jax.random.split(jax.random.key(0), 3 + 2 * count)
     width = size.width
     layers = [jax.random.normal(key, (width, width)) / width**0.5 for key in keys[:3]]
@@ -68,7 +68,7 @@ def problem(size: Size, count: int) -> tuple[dict[str, Any], dict[str, jax.Array
 
 
 def encode(trunk: list[jax.Array], batch: dict[str, jax.Array]) -> jax.Array:
-    """Features [B, width]."""
+    """Compute the trunk's features [B, width]."""
     hidden = batch["inputs"]
     for layer in trunk:
         hidden = jnp.tanh(hidden @ layer)
@@ -76,12 +76,12 @@ def encode(trunk: list[jax.Array], batch: dict[str, jax.Array]) -> jax.Array:
 
 
 def losses_of(params: Any, features: jax.Array, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Mean squared error of each head."""
+    """Compute the mean squared error of each head."""
     return {name: jnp.mean(jnp.square(features @ head - batch[name])) for name, head in params["heads"].items()}
 
 
 def time_call(function: Callable[..., Any], arguments: tuple[Any, ...], repeats: int) -> float:
-    """Median seconds of a call."""
+    """Return the median time of a call, s, without compilation."""
     call = jax.jit(function)
     jax.block_until_ready(call(*arguments))
     seconds = []
@@ -96,7 +96,7 @@ def time_call(function: Callable[..., Any], arguments: tuple[Any, ...], repeats:
 
 
 def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
-    """Time one weighting for K losses: a row for itself alone, and one for a step by each way that it allows."""
+    """Time one weighting for K losses: a row for the weighting alone, and one for a step by each method that it allows."""
     weighting, (params, batch) = jw.make_weighting(name), problem(size, count)
     state = weighting.init(names_of(count), params["trunk"])
     losses = {each: jnp.float32(1.0) for each in names_of(count)}
@@ -119,7 +119,7 @@ def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
 
 
 def measure_all(size: Size, python: Path | None, results: Path) -> int:
-    """Time all methods on both sides, print a table and write the record."""
+    """Time all methods on both sides, print a table and write the record; return the exit status."""
     from benchmarks.peers.torchjd.__main__ import run_peer
 
     with tempfile.TemporaryDirectory() as folder:

@@ -8,29 +8,30 @@ import numpy as np
 from benchmarks.peers.torchjd.ours import CAGRAD_RADIUS, FAIR_ALPHA, SOLVED
 
 TOLERANCE = 1e-5
-"""Of closed forms and of random methods with given numbers."""
+"""Maximum relative difference of closed forms, and of random methods with given random numbers."""
 _TINY = 1e-12
 _ROUNDING = 1e-6
-"""Length of a step, over that of the longest gradient, below which it counts as 0."""
+"""Norm of a step, relative to the largest gradient norm, below which it counts as 0."""
 
 
 def relative(one: np.ndarray, other: np.ndarray, least: np.ndarray | float = _TINY) -> np.ndarray:
-    """Distance between rows over the length of the second's, or over ``least`` where that is less."""
+    """Return the distance between rows [n], relative to the norm of the second one, or to ``least`` if the norm is smaller."""
     axes = tuple(range(1, one.ndim))
     length = np.sqrt((other**2).sum(axis=axes))
     return np.sqrt(((one - other) ** 2).sum(axis=axes)) / np.maximum(length, least)
 
 
 def gap(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Gap of MGDA's duality, over the greatest squared length: 0 at the shortest vector."""
+    """Return MGDA's duality gap, relative to the largest squared gradient norm: 0 at the minimum-norm vector."""
     step = weights @ jacobian
     return float((step @ step - (jacobian @ step).min()) / _longest(jacobian) ** 2)
 
 
 def cagrad_loss(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """By how much the worst slope falls short of the bound by the dual, over that of the mean gradient's square.
+    """Return by how much the worst slope falls short of the dual bound, relative to the mean gradient's squared norm.
 
-    The bound is that at the weights inside the hull; with weights of 0, for a stationary point, that at the hull's vector 0.
+    The dual is evaluated at the weights within the convex hull. An excess of the step over CAGrad's radius, relative to the
+    radius, is added. The result is 0 for weights of 0, which stand for a stationary point.
     """
     mean = jacobian.mean(axis=0)
     radius, step = CAGRAD_RADIUS * np.linalg.norm(mean), weights @ jacobian
@@ -45,26 +46,26 @@ def cagrad_loss(jacobian: np.ndarray, weights: np.ndarray) -> float:
 
 
 def cone_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Greatest slope that is opposed, over the lengths of gradient and step."""
+    """Return the largest conflict of the step with a gradient: minus their cosine similarity, at least 0."""
     step = weights @ jacobian
     lengths = np.linalg.norm(jacobian, axis=1) * max(np.linalg.norm(step), _ROUNDING * _longest(jacobian))
     return float(max(0.0, -(jacobian @ step / lengths).min()))
 
 
 def dual_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Greatest violation of the conditions of DualProj's projection: opposed slopes, and complementary slackness."""
+    """Return the largest violation of the optimality conditions of DualProj: no conflicts, and complementary slackness."""
     step, mean = weights @ jacobian, jacobian.mean(axis=0)
     slack = abs((weights - 1 / len(weights)) @ (jacobian @ step)) / max(mean @ mean, (_ROUNDING * _longest(jacobian)) ** 2)
     return max(cone_residual(jacobian, weights), float(slack))
 
 
 def fair_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Greatest relative error of G w = w^(-1 / alpha)."""
+    """Return the largest relative error of G w = w^(-1 / alpha)."""
     return float(np.abs(jacobian @ (weights @ jacobian) * weights ** (1 / FAIR_ALPHA) - 1.0).max())
 
 
 def nash_residual(jacobian: np.ndarray, weights: np.ndarray) -> float:
-    """Greatest relative error of G w = c / w, for the best c: TorchJD scales the Gramian."""
+    """Return the largest relative error of G w = c / w for the mean c, because TorchJD scales the Gramian."""
     products = jacobian @ (weights @ jacobian) * weights
     return float(np.abs(products / products.mean() - 1.0).max())
 
@@ -81,16 +82,16 @@ RESIDUALS: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     "dualproj": dual_residual,
     "nash_mtl": nash_residual,
 }
-_FULL_RANK = ("fairgrad", "nash_mtl")  # where gradients depend on each other, there may be no solution
-_NO_LINE = ("gradvac",)  # on a line, a gradient is turned to nothing, and its next cosine is rounding
+_FULL_RANK = ("fairgrad", "nash_mtl")  # linearly dependent gradients may have no solution
+_NO_LINE = ("gradvac",)  # at rank 1, a gradient is reduced to 0, and its next cosine is rounding error
 
 
 def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Compare all methods; one row for each.
+    """Compare all methods, with one row for each.
 
     Returns:
-        Rows of method, kind (closed form or solver), count of cases, the greatest and median relative difference of directions
-        (of weights, where only losses are read), and of solvers the greatest and median residual of both sides.
+        Rows of method, kind (closed form or solver), number of cases, maximum and median relative difference of directions (of
+        weights, for methods that read only losses), and for solvers the maximum and median residual of both sides.
     """
     counts = sorted({int(name.split("/")[0]) for name in arrays})
     rows = []
@@ -108,7 +109,7 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
                 one, other = (np.einsum("nk,nkp->np", weights, jacobians) for weights in (one, other))
                 if method == "nash_mtl":
                     one, other = (step / np.linalg.norm(step, axis=1, keepdims=True) for step in (one, other))
-                # Steps that nearly vanish are compared with the gradients.
+                # Differences of nearly vanishing steps are relative to the gradients.
                 scale = np.linalg.norm(jacobians, axis=2).max(axis=1) if method != "nash_mtl" else 1.0
                 length = np.maximum(np.linalg.norm(other, axis=1), 1e-2 * scale)
                 differences += list(np.linalg.norm(one - other, axis=1) / length)
@@ -128,7 +129,7 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
 
 
 def failures(rows: list[dict[str, Any]]) -> list[str]:
-    """List the rows that break what is asked: closed forms within `TOLERANCE`, residuals no greater than TorchJD's."""
+    """List the failing methods: closed forms must be within `TOLERANCE`, residuals no greater than TorchJD's."""
     wrong = [row["method"] for row in rows if row["kind"] == "closed form" and not row["difference_max"] <= TOLERANCE]
     solved = [row for row in rows if row["kind"] == "solver"]
     return wrong + [row["method"] for row in solved if not row["residual_max_ours"] <= max(row["residual_max_theirs"], 1e-9)]

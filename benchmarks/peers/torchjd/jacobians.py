@@ -1,25 +1,25 @@
-"""Random Jacobians of ranks 1 to K for the comparison, with what random methods draw, and losses."""
+"""Random Jacobians of ranks 1 to K for the comparison, with the random numbers of random methods, and losses."""
 
 import numpy as np
 
 COUNTS = (2, 3, 5, 8)
-"""Numbers of losses, K."""
+"""Values of K, the number of losses."""
 SIZE = 24
-"""Shared parameters."""
+"""Number of shared parameters."""
 STEPS = 6
-"""Updates of methods with a memory of the losses."""
+"""Number of updates of methods that depend on past losses."""
 
 
 def draw(each: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Draw arrays by name; those of K losses begin with ``K/``.
 
     Args:
-        each: Jacobians of every number of losses.
-        seed: Of all draws.
+        each: Number of Jacobians for every number of losses.
+        seed: Random seed.
 
     Returns:
-        K/jacobians [each, K, SIZE] float64, of normal factors, whose ranks go through 1 to K; K/ranks [each]; K/orders [each,
-        K, K], permutations; K/uniform [each, SIZE]; K/normal [each, K]; K/losses [each, STEPS, K], positive.
+        K/jacobians [each, K, SIZE] float64, products of normal factors, with ranks cycling through 1 to K; K/ranks [each];
+        K/orders [each, K, K], permutations; K/uniform [each, SIZE]; K/normal [each, K]; K/losses [each, STEPS, K], positive.
     """
     random, arrays = np.random.default_rng(seed), {}
     for count in COUNTS:

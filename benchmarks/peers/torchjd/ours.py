@@ -1,4 +1,4 @@
-"""Results of our weightings for the Jacobians of `jacobians`, in float64: as `peer` gives them."""
+"""Results of our weightings for the Jacobians of `jacobians`, in float64, in the format of `peer`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ from jaxrl_vis.weighting.directions import graddrop_direction
 
 STCH_MU, CAGRAD_RADIUS, FAIR_ALPHA, VAC_BETA = 0.2, 0.5, 2.0, 0.3  # as in `peer`
 DIRECTIONS = ("uniform", "sum", "imtl_g", "aligned_mtl", "config")
-"""Closed forms, of which the direction [SIZE] is compared."""
+"""Methods in closed form; the direction [SIZE] is compared."""
 SOLVED: dict[str, jw.Weighting] = {
     "mgda": jw.mgda(),
     "cagrad": jw.cagrad(CAGRAD_RADIUS),
@@ -22,7 +22,7 @@ SOLVED: dict[str, jw.Weighting] = {
     "dualproj": jw.dualproj(),
     "nash_mtl": jw.nash_mtl(),
 }
-"""Methods with a solver, of which the weights [K] are compared, too."""
+"""Methods with a solver; the weights [K] are also compared."""
 READERS: dict[str, jw.Weighting] = {
     "geometric_mean": jw.geometric_mean(eps=1e-14),
     "stch": jw.stch(STCH_MU),
@@ -31,16 +31,16 @@ READERS: dict[str, jw.Weighting] = {
     "dwa": jw.dwa(epoch=2),
     "famo": jw.famo(),
 }
-"""Methods that read losses, whose weights [STEPS, K] are compared."""
+"""Methods that read losses; the weights [STEPS, K] are compared."""
 
 
 def names_of(count: int) -> tuple[str, ...]:
-    """Names of K losses, in the order of arrays over them."""
+    """Return the names of K losses, in the order of the arrays' loss axis."""
     return tuple(f"loss_{place}" for place in range(count))
 
 
 def weights_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], jax.Array]:
-    """Function of a Jacobian [K, SIZE] to weights [K] at the first step."""
+    """Return the function from a Jacobian [K, SIZE] to the weights [K] of the first step."""
     names = names_of(count)
 
     def weights(jacobian: jax.Array) -> jax.Array:
@@ -54,7 +54,7 @@ def weights_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array
 
 
 def path_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], jax.Array]:
-    """Function of losses [STEPS, K] to weights [STEPS, K]."""
+    """Return the function from losses [STEPS, K] to weights [STEPS, K]."""
     names = names_of(count)
 
     def path(losses: jax.Array) -> jax.Array:
@@ -69,7 +69,7 @@ def path_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], 
 
 
 def vaccinated(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
-    """Direction of the second step of GradVac."""
+    """Compute the direction of GradVac's second step."""
     gramian, usual, weights = jacobian @ jacobian.T, jnp.zeros(2 * (len(jacobian),)), jnp.zeros(len(jacobian))
     for _ in range(2):
         weights, usual = surgery.gradvac_weights(gramian, usual, orders, VAC_BETA)
@@ -77,7 +77,7 @@ def vaccinated(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
 
 
 def results(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute all results by ``K/NAME``; needs 64-bit JAX."""
+    """Compute all results, by ``K/NAME``; needs 64-bit JAX."""
     found: dict[str, Any] = {}
     for count in sorted({int(name.split("/")[0]) for name in arrays}):
         jacobians, orders = (jnp.asarray(arrays[f"{count}/{name}"]) for name in ("jacobians", "orders"))

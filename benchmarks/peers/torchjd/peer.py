@@ -1,7 +1,7 @@
 """Results of TorchJD for the Jacobians of a file: ``python peer.py IN.npz OUT.npz``. Imports nothing of this project.
 
-Names as in `ours`: weights [n, K] of methods that give weights, directions [n, SIZE] of others, and weights [n, STEPS, K], as
-the derivative of the scalarised loss, of those that read losses.
+Names are those of `ours`: weights [n, K] of methods that return weights, directions [n, SIZE] of others, and for methods that
+read losses, weights [n, STEPS, K] as the derivative of the scalarised loss.
 """
 
 import multiprocessing
@@ -19,12 +19,12 @@ STCH_MU, CAGRAD_RADIUS, FAIR_ALPHA, VAC_BETA = 0.2, 0.5, 2.0, 0.3  # as in `ours
 
 
 def gramian_weights(weighting: Any) -> Callable[[torch.Tensor], np.ndarray]:
-    """Weights from a Jacobian by a weighting of Gramians."""
+    """Return the function from a Jacobian to weights for a weighting of Gramians."""
     return lambda jacobian: weighting(jacobian @ jacobian.T).numpy()
 
 
 def nash_weights() -> Callable[[torch.Tensor], np.ndarray]:
-    """Weights of Nash-MTL, begun anew for every Jacobian."""
+    """Return the function from a Jacobian to Nash-MTL's weights, with a fresh state for every Jacobian."""
     made: dict[int, Any] = {}
 
     def weights(jacobian: torch.Tensor) -> np.ndarray:
@@ -53,17 +53,17 @@ METHODS: dict[str, Callable[[torch.Tensor], np.ndarray]] = {
 
 
 def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Results of random methods, with the numbers of the file in place of PyTorch's."""
+    """Compute the results of random methods, with the file's random numbers instead of PyTorch's."""
     jacobians = torch.from_numpy(arrays[f"{prefix}/jacobians"])
     results: dict[str, list[np.ndarray]] = {name: [] for name in ("pcgrad", "gradvac", "graddrop", "random")}
     for place, jacobian in enumerate(jacobians):
         orders = [torch.from_numpy(row) for row in arrays[f"{prefix}/orders"][place]]
         with mock.patch.object(torch, "randperm", side_effect=orders):
             results["pcgrad"].append(aggregation.PCGrad()(jacobian).numpy())
-        # GradVac draws an order of the others: their places among those that are left.
+        # GradVac draws an order of the other losses: their positions among the remaining ones.
         others = [torch.tensor([j - (j > i) for j in row.tolist() if j != i]) for i, row in enumerate(orders)]
         vaccine, total = aggregation.GradVac(beta=VAC_BETA), torch.zeros(jacobian.shape[1])
-        for _ in range(2):  # the second finds means that are not 0
+        for _ in range(2):  # in the second step, the means are not 0
             with mock.patch.object(torch, "randperm", side_effect=list(others)):
                 total = vaccine(jacobian)
         results["gradvac"].append(total.numpy())
@@ -75,13 +75,13 @@ def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
 
 
 def derivative(scalarizer: Any, losses: torch.Tensor) -> np.ndarray:
-    """Weights: the derivative of a scalarised loss by the losses [K]."""
+    """Return the weights: the derivative of a scalarised loss with respect to the losses [K]."""
     losses = losses.clone().requires_grad_()
     return torch.autograd.grad(scalarizer(losses), losses)[0].numpy()
 
 
 def paths(losses: torch.Tensor) -> Iterator[tuple[str, np.ndarray]]:
-    """Weights of the methods that read losses, along [STEPS, K] of them: name, [STEPS, K]."""
+    """Yield name and weights [STEPS, K] of each method that reads losses, for losses [STEPS, K]."""
     count = losses.shape[1]
     plain = {"geometric_mean": scalarization.GeometricMean(), "stch": scalarization.STCH(STCH_MU)}
     for name, scalarizer in plain.items():
@@ -117,7 +117,7 @@ def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
     jacobians, is_full = torch.from_numpy(arrays[f"{prefix}/jacobians"]), arrays[f"{prefix}/ranks"] == int(prefix)
     results: dict[str, np.ndarray] = {}
     for name, method in METHODS.items():
-        # Seconds each, and where gradients depend on each other there may be no solution: full ranks alone.
+        # Takes seconds each, and linearly dependent gradients may have no solution: full rank only.
         chosen = is_full if name == "nash_mtl" else np.ones(len(jacobians), bool)
         found = [method(jacobian) for jacobian in jacobians[torch.from_numpy(chosen)]]
         results[f"{prefix}/{name}"] = np.full((len(jacobians), len(found[0])), np.nan)
@@ -129,7 +129,7 @@ def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Read the file of Jacobians and write that of results, with one process for each number of losses."""
+    """Read the file of Jacobians and write the file of results, with one process per number of losses."""
     prefixes = sorted({name.split("/")[0] for name in np.load(sys.argv[1])})
     results: dict[str, Any] = {"versions": np.array([f"torchjd {version('torchjd')}", f"torch {torch.__version__}"])}
     with multiprocessing.get_context("spawn").Pool(len(prefixes)) as pool:

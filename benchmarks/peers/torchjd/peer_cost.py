@@ -1,7 +1,7 @@
-"""Time of TorchJD's methods on the problem of `cost`: ``python peer_cost.py SETTINGS OUT.json``. Imports PyTorch alone.
+"""Time of TorchJD's methods on the problem of `cost`: ``python peer_cost.py SETTINGS OUT.json``. Imports only PyTorch.
 
-Rows as in `cost`: alone, from a Jacobian's Gramian to weights (or from the Jacobian to a direction); step, by `mtl_backward`
-and `jac_to_grad`. Both on the GPU if PyTorch sees one.
+Rows as in `cost`: alone, from a Jacobian's Gramian to weights (or from the Jacobian to a direction); step, with `mtl_backward`
+and `jac_to_grad`. Runs on the GPU if PyTorch sees one.
 """
 
 import functools
@@ -45,7 +45,7 @@ def wait() -> None:
 
 
 def time_call(function: Callable[[], Any], repeats: int, passes: int) -> float:
-    """Median seconds of a call."""
+    """Return the median time of a call, s."""
     function()
     wait()
     seconds = []
@@ -61,7 +61,7 @@ def time_call(function: Callable[[], Any], repeats: int, passes: int) -> float:
 def problem(
     settings: dict[str, Any], count: int
 ) -> tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor, list[torch.Tensor]]:
-    """Trunk, heads, inputs and targets, as in `cost`."""
+    """Draw trunk, heads, inputs and targets, as in `cost`."""
     width, size = settings["width"], settings["batch_size"]
     torch.manual_seed(0)
     trunk = [(torch.randn(width, width, device=DEVICE) / width**0.5).requires_grad_() for _ in range(3)]
@@ -73,7 +73,7 @@ def problem(
 def make_step(
     trunk: list[torch.Tensor], heads: list[torch.Tensor], inputs: torch.Tensor, targets: list[torch.Tensor]
 ) -> Callable[[Any], None]:
-    """Build the function of an aggregator that computes the gradient of all parameters."""
+    """Return the function of an aggregator that computes the gradient of all parameters."""
 
     def step(aggregator: Any) -> None:
         hidden = inputs

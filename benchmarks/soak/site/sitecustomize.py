@@ -1,8 +1,7 @@
-"""Read by each Python that has this folder on its path: a clock that jumps, and a file system without locks.
+"""Startup hook of every Python with this folder on its path: a clock that jumps, and a file system without locks.
 
-SOAK_CLOCK names a file: as soon as it is there, the clock is so many seconds off as it says. What measures durations
-(`time.monotonic`) is right, as on any computer whose clock is set. SOAK_NO_LOCKS lets `flock` fail as some network file
-systems do.
+SOAK_CLOCK names a file: once it exists, the clock is offset by the number of seconds in it. Durations (`time.monotonic`) stay
+right, as on any computer whose clock is set. SOAK_NO_LOCKS makes `flock` fail as on some network file systems.
 """
 
 import errno

@@ -1,1 +1,1 @@
-"""Commands on what a run has left: its folder, or the folder of a policy."""
+"""Commands that use trained runs: a run folder, or the folder of a policy."""

@@ -11,20 +11,20 @@ from jaxrl_vis.errors import RequestError
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Write episodes that a run's policy plays, or convert recorded ones: for LeRobot, or as .npz."""
+    """Record episodes of a run's policy, or convert recorded ones, as a LeRobot dataset or .npz file."""
 
     source: Annotated[Path, AlsoPositional()]
-    """A run folder, whose policy plays; or episodes to convert: an .npz file, or the folder of a LeRobot dataset."""
+    """A run folder, whose policy is recorded; or episodes to convert: an .npz file, or the folder of a LeRobot dataset."""
     out: Path
     """A new folder; for npz also the name of an .npz file."""
     format: Literal["lerobot", "npz"] = "lerobot"
     """A LeRobot dataset of version 3 (needs the extra lerobot), or one .npz file of arrays."""
     episodes: int | None = None
-    """Number of episodes; 50 of a run, all of a conversion, if not given."""
+    """Number of episodes; 50 for a run, all for a conversion, if not given."""
     seed: int = 0
     """Seed of the starts and goals of a run's episodes."""
     trust: bool = False
-    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Dataset) -> int:

@@ -13,7 +13,7 @@ from jaxrl_vis.report.outputs import check_writable
 
 @dataclasses.dataclass(frozen=True)
 class Eval:
-    """Measure a trained run: success and distance at the last step, without exploration."""
+    """Evaluate a trained run: success and distance at the last step, without exploration."""
 
     run_dir: Annotated[Path, AlsoPositional()]
     """The run folder, or the name of a policy that comes with the package, such as fetch."""
@@ -22,9 +22,9 @@ class Eval:
     json: Path | None = None
     """Also write the results to this file."""
     checkpoint: str | None = None
-    """Iteration of the checkpoint, or best for the one that --best-by keeps; the newest valid one if not given."""
+    """Iteration of the checkpoint, or best for the best one by --best-by; the newest valid one if not given."""
     trust: bool = False
-    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Eval) -> int:

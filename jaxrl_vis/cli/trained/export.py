@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write a trained policy to a file that runs without this project, with its contract and golden frames; or check one.
+    """Export a trained policy to a file that runs without this project, with its contract and golden frames; or check one.
 
     The exit status is 1 if the file's actions differ from our own by more than 1e-4.
     """
@@ -25,18 +25,18 @@ class Export:
     format: Literal["onnx", "stablehlo", "safetensors"] = "onnx"
     """Format: ONNX (needs the extra ``export``), StableHLO for JAX without this project, or weights by name."""
     out: Path | None = None
-    """Folder for the policy, contract.json and golden.npz; export/FORMAT in the run folder if not given, or in one of
-    the policy's name here."""
+    """Folder for the policy, contract.json and golden.npz; export/FORMAT in the run folder if not given (for a policy of the
+    package, in NAME/ in the current folder)."""
     seed: int | None = None
-    """Seed, of a run with several; the first if not given."""
+    """Seed, for a run with several; the first if not given."""
     overwrite: bool = False
     """Replace an exported policy in the folder."""
     check: Path | None = None
-    """Export nothing: run this exported file on its golden frames, and print the largest difference."""
+    """Export nothing: run this exported file on its golden frames, and print the maximum difference."""
     checkpoint: str | None = None
-    """Iteration of the checkpoint, or best for the one that --best-by keeps; the newest valid one if not given."""
+    """Iteration of the checkpoint, or best for the best one by --best-by; the newest valid one if not given."""
     trust: bool = False
-    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Export) -> int:

@@ -12,29 +12,29 @@ from jaxrl_vis.run.trained.shipped import workplace
 
 @dataclasses.dataclass(frozen=True)
 class Play:
-    """Make a video of a trained run: each observation beside the goal."""
+    """Make a video of a trained run, with each observation beside the goal."""
 
     run_dir: Annotated[Path, AlsoPositional()]
     """The run folder, or the name of a policy that comes with the package, such as fetch."""
     out: Path | None = None
     """A .gif, .mp4 or .html file, or a .png of some steps; play.gif (play.html with --html, play_aux.gif with --aux) in the run
-    folder if not given, or in one of the policy's name here."""
+    folder if not given (for a policy of the package, in NAME/ in the current folder)."""
     html: bool = False
-    """Show the robot and its goal in three dimensions, on a page with brax's viewer (needs brax; the page needs a network)."""
+    """Write a page with a three-dimensional view of robot and goal in brax's viewer (needs brax; the page needs a network)."""
     live: bool = False
-    """Show the policy at work on a page of this machine, with a goal to drag (needs the extra live). --out names recordings."""
+    """Serve a local page that shows the policy live, with a draggable goal (needs the extra live). --out names recordings."""
     aux: bool = False
     """Also show the predictions of auxiliary tasks: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
     """Number of episodes to show."""
     checkpoint: str | None = None
-    """Iteration of the checkpoint, or best for the one that --best-by keeps; the newest valid one if not given."""
+    """Iteration of the checkpoint, or best for the best one by --best-by; the newest valid one if not given."""
     trust: bool = False
-    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Play) -> int:
-    """Draw a run's episodes."""
+    """Write the video of a run's episodes, or serve the live page."""
     run_dir = check_run(options.run_dir)
     check_counts(episodes=options.episodes)
     checkpoint = read_checkpoint(options.checkpoint)

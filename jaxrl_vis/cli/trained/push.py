@@ -19,7 +19,7 @@ class Push:
     seed: int | None = None
     """Seed whose policy is pushed; the run's first if not given."""
     trust: bool = False
-    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Push) -> int:

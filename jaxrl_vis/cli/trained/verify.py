@@ -23,7 +23,7 @@ class Verify:
     iterations: int | None = None
     """Number of iterations to repeat, from the seed and from each full checkpoint; up to the second evaluation if not given."""
     trust: bool = False
-    """Execute the run's own code without asking, if its task is module:Name and was trained by somebody else (docs/runs.md)."""
+    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Verify) -> int:

@@ -12,18 +12,18 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.parallel.sharding import ONE_DEVICE, Layout
 
-# What stays unclaimed: XLA's workspaces and the allocator's gaps on an accelerator, the program and its libraries on a host.
+# Memory left unclaimed: XLA's workspaces and the allocator's gaps on an accelerator, the program and its libraries on a host.
 _SLACK_BYTES = 256 * 2**20
 
-# Copies of one rollout that live beside the replay: the scan's frames in time-major order, then in the replay's order, and the
-# floats of a part of them on the way through the networks.
+# Copies of one rollout in addition to the replay: the scan's frames in time-major order, then in the replay's order, and the
+# float activations of a part of them.
 _ROLLOUT_COPIES = 3
 
-# Copies of the parameters and optimiser states: gradients, updates, and what XLA does not write in place.
+# Copies of the parameters and optimiser states: gradients, updates, and arrays that XLA does not update in place.
 _TRAIN_COPIES = 2
 
-# Float32 copies of a batch's images in a gradient step, hidden layers included; measured with XLA's memory_analysis (preset
-# cpu, one and three seeds). On an accelerator, `check_compiled` asks again with the compiler's own figures.
+# Float32 copies of a batch's images in a gradient step, including hidden layers; measured with XLA's memory_analysis (preset
+# cpu, one and three seeds). On an accelerator, `check_compiled` checks again with the compiler's own figures.
 _BATCH_COPIES = 30
 
 
@@ -63,7 +63,7 @@ def _container_bytes() -> int:
     try:
         limit = (group / "memory.max").read_text(encoding="ascii").strip()
         used = int((group / "memory.current").read_text(encoding="ascii"))
-        # Cached files count as used, but give way.
+        # Cached files count as used, but are evicted on demand.
         statistics = dict(line.split() for line in (group / "memory.stat").read_text(encoding="ascii").splitlines())
         return int(limit) - used + int(statistics.get("inactive_file", 0))
     except (OSError, ValueError):
@@ -77,10 +77,10 @@ def show_bytes(count: float) -> str:
 
 
 def _least_available(layout: Layout) -> int | None:
-    """Return the free memory of the fullest of the run's devices, in bytes; None if one is unknown."""
+    """Return the minimum free memory of the run's devices, in bytes; None if one is unknown."""
     if layout.mesh is None:
         return available_bytes()
-    if layout.devices[0].platform == "cpu":  # the host's memory is that of all of them
+    if layout.devices[0].platform == "cpu":  # all of them share the host's memory
         there = available_bytes()
         return None if there is None else there // len(layout.devices)
     available = [available_bytes(device) for device in layout.devices]
@@ -103,17 +103,17 @@ def check_memory(
         replay_bytes: Bytes of one seed's replay.
         steps_per_iteration: Environment steps of one seed in an iteration; the replay's capacity is a multiple of it.
         layout: Placement of the run.
-        frame_stack: Images that an observation stacks, of which the replay keeps one; rollouts and batches have all.
+        frame_stack: Images stacked in an observation; the replay stores only one of them, rollouts and batches all.
 
     Returns:
-        A line for the reader, such as ``replay 0.3 GiB of 22.0 GiB``.
+        A summary, such as ``replay 0.3 GiB of 22.0 GiB``.
 
     Raises:
-        RequestError: It does not fit. Says what would.
+        RequestError: The run does not fit. The message suggests what would.
     """
     capacity = math.ceil(config.run.replay_transitions / steps_per_iteration) * steps_per_iteration
     parts = layout.shards.count
-    share = parts / layout.num_devices  # of the seeds, on each device
+    share = parts / layout.num_devices  # fraction of the seeds on each device
     train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.run.seeds) * share
     replay = replay_bytes * config.run.seeds * share / parts
     bytes_per_rollout = replay * steps_per_iteration / capacity
@@ -139,11 +139,11 @@ def check_memory(
 
 
 def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> None:
-    """Compare the compiler's own figures with the free memory. Still nothing is allocated.
+    """Compare the compiler's own figures with the free memory, before anything is allocated.
 
     Args:
-        programs: Compiled programs by name; ``learn`` among them, where a state is to be made.
-        already_there: The loop state is on the device already.
+        programs: Compiled programs by name; must include ``learn`` if the loop state is still to be allocated.
+        already_there: True if the loop state is already on the device.
         layout: Placement of the run; the compiler's figures are those of one device.
 
     Raises:
@@ -162,10 +162,10 @@ def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout
 
 
 def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> bool:
-    """Return True if all programs fit into memory at once, so that one may be called while another still runs.
+    """Return True if all programs fit into memory at once, so that one may be launched while another still runs.
 
     Args:
-        programs, already_there, layout: As of `check_compiled`.
+        programs, already_there, layout: As in `check_compiled`.
     """
     there = _least_available(layout)
     state, scratch = _sizes(programs)

@@ -1,4 +1,4 @@
-"""Detection and dump of non-finite numbers."""
+"""Detection of non-finite numbers, and dump of the state that contains them."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ def _checked(tree: Any) -> dict[str, Any]:
 
 
 def broken_leaves(loop: LoopState) -> dict[str, jax.Array]:
-    """Check every floating-point leaf for NaN or infinity: name -> [] bool. Traceable; compiled before training starts."""
+    """Return for each floating-point leaf, by name, whether it has a NaN or an infinity, [] bool. Traceable under jit."""
     return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked(loop).items()}
 
 
@@ -31,9 +31,9 @@ def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
 
 
 def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
-    """Describe the evidence that the simulation produced a non-finite number; None if there is none.
+    """Describe the evidence that the simulation produced the non-finite number; None if there is none.
 
-    It did if such a number precedes the first non-finite action: what follows such an action is due to the learner.
+    There is evidence if a non-finite state precedes the first non-finite action: later ones are due to the learner.
 
     Args:
         loop: As in `dump`.

@@ -1,6 +1,6 @@
-"""Metrics that are still computed or copied to the host.
+"""Asynchronous transfer of metrics to the host.
 
-Reading an array from a GPU takes about 0.1 ms; one on several GPUs takes that for each of them. So they all travel as one.
+Reading an array from a GPU takes about 0.1 ms, times the number of GPUs. So all metrics are copied as one array.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class Pending:
     """Metrics that a device may still be computing.
 
     Args:
-        metrics: [S] or [] float32 each, by name. Those that the host has already are left alone.
+        metrics: [S] or [] float32 each, by name. NumPy arrays are kept as they are.
         stack: `stacked`, or its compiled program.
     """
 
@@ -40,6 +40,6 @@ class Pending:
         return dict(zip(self._names, np.asarray(self._rows), strict=True))
 
     def read_per_seed(self, seeds: int) -> PerSeed:
-        """Wait for the metrics; return one number per seed, the shortest decimal that reads back as the same float32."""
+        """Wait for the metrics; return one number per seed, the shortest decimal that represents the same float32."""
         spread = {name: np.broadcast_to(np.asarray(row, np.float32), (seeds,)) for name, row in self.read().items()}
         return {name: [float(str(number)) for number in row] for name, row in spread.items()}

@@ -1,9 +1,9 @@
-"""Configuration and its compiled programs: everything that a run, an evaluation or a notebook executes on the device.
+"""Compiled programs of a configuration: everything that a run, an evaluation or a notebook executes on the device.
 
-All of it is compiled before training starts, so that the end of a run, where signals and full disks come, compiles nothing.
+All of it is compiled before training starts, so that nothing is compiled at the end of a run, which a signal may have caused.
 
 A training iteration is two programs, ``play`` and ``learn`` (`jaxrl_vis.learner.train_step`), which XLA compiles in parallel.
-A CPU evaluates with ``play``, too; other devices have a program for it.
+A CPU also evaluates with ``play``; other devices have a separate program for evaluation.
 """
 
 import concurrent.futures
@@ -34,18 +34,18 @@ from jaxrl_vis.run.storage.arrays import to_host
 from jaxrl_vis.types import LoopState, Metrics, TrainState
 from jaxrl_vis_envs.compiling.compilation import assume_kernels_compile, failed_kernels, tracing_for_default_device
 
-# Evaluation draws from a key of its own, the same at every evaluation and for every seed.
+# Seed of the evaluation key, which is the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
 _TRAINING = ("play", "learn", "keys")
-# Programs that take long to trace.
+# Programs that are slow to trace, which are cached.
 _CACHED = ("init", "play", "learn", "evaluate")
-# Of objects made since the last collection of garbage; Python's own default is 700.
+# Garbage collection threshold (allocations since the last collection) while tracing; Python's default is 700.
 _OBJECTS_WHILE_TRACING = 100_000
 
 
 @contextlib.contextmanager
 def rarely_collecting_garbage() -> Iterator[None]:
-    """Collect garbage rarely while tracing, which makes millions of objects and little garbage: saves an eighth of the time."""
+    """Collect garbage less often while tracing, which creates millions of objects and little garbage: saves 1/8 of the time."""
     before = gc.get_threshold()
     gc.set_threshold(max(before[0], _OBJECTS_WHILE_TRACING) if before[0] else 0, *before[1:])
     try:
@@ -60,8 +60,8 @@ class Programs:
     Args:
         config: The run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
-        keep: Cache traced programs on disk: `trace_cache` says when that is right. Only where one device computes.
-        cache: Cache compiled programs on disk, too.
+        keep: Cache traced programs on disk, if permitted (see `trace_cache`); ignored on several devices.
+        cache: Cache compiled programs on disk; without, traced ones are not cached either.
 
     Attributes:
         config: The run.
@@ -94,7 +94,7 @@ class Programs:
     @functools.cached_property
     def shapes(self) -> LoopState:
         """Shapes, dtypes and shardings of the loop state; traced, not allocated."""
-        with tracing_for_default_device(), assume_kernels_compile():  # as it will be compiled, so that it is traced once
+        with tracing_for_default_device(), assume_kernels_compile():  # as in compilation, so that it is traced only once
             shapes = jax.eval_shape(self.program.init, self.run_keys)
         return self.layout.with_shardings(shapes, self.layout.loop)
 
@@ -107,12 +107,12 @@ class Programs:
 
     @property
     def image_seconds(self) -> float:
-        """Duration of a video frame, s: real time, but slow enough to follow."""
+        """Duration of a video frame, s: the control period, but at least 0.04 s."""
         return max(0.04, float(self.env.control_period))
 
     @property
     def evaluates_ahead(self) -> bool:
-        """True if `evaluate` returns before the device has done its work."""
+        """True if `evaluate` is asynchronous, i.e. returns before the device has finished."""
         return not self.program.plays_any
 
     @property
@@ -121,7 +121,7 @@ class Programs:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the programs that a run needs; those that compile longest come first and compile while others are traced."""
+        """Names of the programs that a run needs, slowest to compile first: they compile while others are traced."""
         return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "broken_leaves", "keys")))
 
     def compile(self, names: Sequence[str] | None = None, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -130,17 +130,17 @@ class Programs:
         Each function is traced once, here, and the programs compiled here are the ones that run later.
 
         Args:
-            names: Names of the programs; None: all that a run needs. Compiled ones are skipped.
-            meanwhile: Called when all is traced, and XLA has the processor to itself.
+            names: Names of the programs; None for all that a run needs. Compiled ones are skipped.
+            meanwhile: Called after tracing, while XLA compiles.
 
         Returns:
-            All programs that are compiled, by name.
+            All programs compiled so far, by name.
         """
         missing = [name for name in names or self.names if name not in self._compiled]
         traces, trusting = self._open_traces() if missing else None, True
         while missing:
             try:
-                # Tracing is Python and goes one by one; XLA compiles without the interpreter's lock, meanwhile.
+                # Tracing is Python and sequential; meanwhile, XLA compiles without the interpreter's lock.
                 with (
                     concurrent.futures.ThreadPoolExecutor(len(missing), initializer=shield_this_thread) as pool,
                     assume_kernels_compile() if trusting else contextlib.nullcontext(),
@@ -160,7 +160,7 @@ class Programs:
                     traces.write()
                 break
             except Exception:
-                if traces is not None:  # whatever is wrong with what is kept, or with a kernel in it, shows without it
+                if traces is not None:  # the fault may lie in the cached programs, or in their kernels: retry without the cache
                     traces.forget()
                     traces, self._may_keep = None, False
                 elif trusting and failed_kernels():
@@ -178,9 +178,9 @@ class Programs:
         return TraceCache(Path(cache) / "programs", identity, self.shapes, JIT_OPTIONS)
 
     def _finish(self, names: Sequence[str], meanwhile: Callable[[], None]) -> None:
-        """Do what can be done while XLA compiles."""
+        """Do all work that can overlap with XLA's compilation."""
         if "init" in names and not distributed.are_several():
-            # Taking keys apart, as saving does, is a program, too.
+            # Extracting the data of keys, as in saving, is also a compiled program.
             to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
         meanwhile()
 
@@ -225,13 +225,13 @@ class Programs:
         return {name: compiled[name] for name in _TRAINING}
 
     def play(self, train: TrainState, keys: jax.Array) -> list[Any]:
-        """Play a training rollout with typed keys [S]; return its parts in order (`rollout_parts.Played`)."""
+        """Run a training rollout with typed keys [S]; return its parts in order (`rollout_parts.Played`)."""
         count, exploration = self.config.run.num_envs, self.program.exploration
         return self._rollout.play(self.compiled("play"), train, keys, count, exploration)
 
     def train_iteration(self, loop: LoopState) -> tuple[LoopState, Metrics]:
         """Run one iteration; ``loop`` is donated. See `Trainer.train_iteration`."""
-        compiled = self.of_training()  # before the first is called, so that they are compiled side by side
+        compiled = self.of_training()  # before the first is called, so that they are compiled in parallel
         keys = compiled["keys"](loop.key, loop.iteration)
         learned: Learned = compiled["learn"](loop, self.play(loop.train, keys))
         return learned.loop, learned.metrics
@@ -241,7 +241,7 @@ class Programs:
 
         Args:
             train: The learner, [S, ...].
-            key: Draws the episodes; None: always the same ones.
+            key: Typed key [] that determines the episodes; None for `evaluation_key`, with the same episodes at every call.
         """
         chosen: Any = self.evaluation_key if key is None else self.layout.put(key, self.layout.everywhere)
         if not self.program.plays_any:
@@ -250,11 +250,11 @@ class Programs:
         return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.run.eval_episodes, self.env.frame_stack)
 
     def record(self, train: TrainState, key: jax.Array, count: int) -> list[Any]:
-        """Play episodes without noise by the program of training rollouts; return their parts (`rollout_parts.Played`).
+        """Roll out episodes without noise, with the program of training rollouts; return their parts (`rollout_parts.Played`).
 
         Args:
             train: The learner, [S, ...].
-            key: [] a typed key, which draws the episodes; all seeds play the same ones.
+            key: Typed key [] that determines the episodes, which are the same for all seeds.
             count: Episodes of each learner, rounded up to whole parts.
         """
         program, size = self.compiled("play"), self.program.part_size
@@ -262,7 +262,7 @@ class Programs:
             keys = jnp.stack([key] * len(self.seeds))
             return self._rollout.play(program, train, keys, count, NO_EXPLORATION)
         parts = []
-        for number in range(-(-count // size)):  # it plays nothing but whole rollouts
+        for number in range(-(-count // size)):  # the program supports only whole rollouts
             keys = self.layout.put(jnp.stack([jax.random.fold_in(key, number)] * len(self.seeds)), self.layout.by_seed)
             parts += self._rollout.play(program, train, keys, size, NO_EXPLORATION)
         return parts
@@ -276,7 +276,7 @@ class Programs:
         return [name for name, is_broken in jax.device_get(self.compiled("broken_leaves")(loop)).items() if is_broken]
 
     def says_of_cache(self) -> str:
-        """Describe which programs compiled now the next start will find in the cache."""
+        """Describe, for messages, whether the next start will find the programs compiled now in the cache."""
         folder, fault = enable_compilation_cache(), cache_fault()
         if fault is not None:
             return f"as will every start: {fault}"

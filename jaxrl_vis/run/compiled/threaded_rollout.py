@@ -1,7 +1,7 @@
-"""Rollouts and evaluations in parts, which the threads of a CPU run in parallel by the same program.
+"""Rollouts and evaluations in parts, which threads of a CPU run in parallel with the same program.
 
-Each thread waits for the programs that it calls. Without, XLA would take one call after the other. A rollout that is one part
-is called and not waited for, so that a GPU's host is ahead of it.
+Each thread waits for the result of its call; otherwise XLA would execute the calls sequentially. A rollout of a single part is
+dispatched asynchronously, so that the host runs ahead of a GPU.
 """
 
 import concurrent.futures
@@ -19,10 +19,10 @@ from jaxrl_vis_envs.cores import num_cores
 
 
 class ThreadedRollout:
-    """Rollout of any number of environments, in parts of one size.
+    """Rollout of any number of environments, in parts of equal size.
 
     Args:
-        size: P, environments of a part.
+        size: P, number of environments per part.
     """
 
     def __init__(self, size: int):
@@ -38,18 +38,18 @@ class ThreadedRollout:
         exploration: Exploration,
         num_kept: int | None = None,
     ) -> list[tuple[Episodes | None, Metrics]]:
-        """Play ``count`` episodes, rounded up to whole parts.
+        """Roll out ``count`` episodes, rounded up to whole parts.
 
         Args:
             program: `TrainStep.play`, compiled.
             train: The learners, [S, ...].
             keys: [S] typed keys.
-            count: Episodes of each learner.
+            count: Number of episodes per learner.
             exploration: The noise.
-            num_kept: Number of episodes to keep (the first ones, rounded up to whole parts); None: all.
+            num_kept: Number of episodes to keep (the first ones, rounded up to whole parts); None for all.
 
         Returns:
-            Each part's episodes (None where they are not kept) and outcome.
+            Each part's episodes (None if not kept) and outcome.
         """
         noise = Exploration(*map(np.float32, exploration))  # type: ignore[arg-type]
         if count <= self._size:
@@ -64,7 +64,7 @@ class ThreadedRollout:
     def evaluate(
         self, program: Callable[..., Played], train: TrainState, keys: jax.Array, count: int, frame_stack: int
     ) -> Evaluation:
-        """Evaluate by ``program``, as `TrainStep.evaluate` does, with the key of each seed, [S]; returns NumPy's arrays."""
+        """Evaluate like `TrainStep.evaluate`, with ``program`` and typed keys [S]; return NumPy arrays. See `play`."""
         num_kept = num_recorded(count)
         played = jax.device_get(self.play(program, train, keys, count, NO_EXPLORATION, num_kept=num_kept))
         outcome = {name: join_parts([part[name] for _, part in played], count, np, axis=1) for name in sorted(played[0][1])}

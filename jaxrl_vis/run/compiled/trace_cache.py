@@ -1,14 +1,14 @@
 """Cache of traced programs on disk, so that a run that has been traced once starts without tracing.
 
-XLA's cache spares compiling a program again. Tracing it, which is Python, goes before that, and takes seconds. Programs are
-stored as StableHLO (`jax.export`), next to XLA's cache: reading it runs no code.
+XLA's cache avoids recompilation of a program, but not the tracing before it, which is Python and takes seconds. Programs are
+stored as StableHLO (`jax.export`), next to XLA's cache: reading them runs no code.
 
 A program belongs to one fingerprint: the code of both packages, the versions of the libraries, the configuration, JAX's
-settings and the device. It does not cover changes of a process to its modules (a patched loss, say). So only commands use the
-cache, not scripts and notebooks, and not with parts from elsewhere. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns it off.
+settings and the device. It does not cover changes made to modules at runtime (such as a patched loss). So only commands use the
+cache, not scripts and notebooks, and only without custom parts. ``JAXRL_VIS_KEEP_PROGRAMS=0`` turns it off.
 
-Whoever writes a stored program decides what a run computes. So folder and files are kept for the user alone, nothing is read
-that another user has written or could have written, and a file's digest covers its name, too.
+A stored program determines what a run computes. So folder and files are private to the user, files that another user has or
+could have written are not read, and a file's digest also covers its name.
 """
 
 import contextlib
@@ -40,26 +40,26 @@ from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_de
 
 VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
 MOST_FILES = 300
-"""Largest number of files, of half a megabyte each; the oldest are deleted."""
+"""Maximum number of files, of half a megabyte each; the oldest are deleted."""
 
 _PACKAGES = ("jaxrl_vis", "jaxrl_vis_envs")
 _DIGEST_BYTES = 32
-# Triton's programs may mean something else to another jaxlib, of which JAX warns; a fingerprint has its version.
+# JAX warns that another jaxlib may interpret Triton's programs differently; the fingerprint includes the version.
 _CHECKS = (export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton"),)
-# Kinds of nodes that `jax.export` knows by name, and one node of each kind that only signatures of programs have.
+# Node types registered with `jax.export`, and an instance of each type that occurs only in signatures of programs.
 _registered: set[type] = set()
 _SIGNATURES = (Episodes(0, 0, 0), Exploration(), Learned(0, {}), Evaluation({}, {}))  # type: ignore[arg-type]
-# These say what JAX writes down and where, and change no program. Folders may differ from run to run.
+# Settings of what JAX writes, and where, which change no program. Folders may differ between runs.
 _WITHOUT_EFFECT = ("cache", "log", "dump", "dir", "timeout", "traceback")
 
 
 def fingerprint(config: Config, env: GoalEnv, learner: Any = None) -> str | None:
-    """Compute a hexadecimal digest of everything that a run's programs depend on; None if they are not to be cached.
+    """Compute a hexadecimal digest of everything that a run's programs depend on; None if they must not be cached.
 
     Args:
         config: The run.
         env: Its environment.
-        learner: Tree of the learner, which may be a policy alone; only its structure counts.
+        learner: Tree of the learner, or of a policy; only its structure counts.
     """
     is_ours = type(env).__module__.partition(".")[0] in _PACKAGES and not own_names(config)
     if not is_ours or os.environ.get(VARIABLE) == "0":
@@ -67,7 +67,7 @@ def fingerprint(config: Config, env: GoalEnv, learner: Any = None) -> str | None
     settings = {name: value for name, value in jax.config.values.items() if not any(part in name for part in _WITHOUT_EFFECT)}
     with tracing_for_default_device():
         target = [target_platform(), use_gpu_kernels()]
-    # The seed is an argument, in the form of keys.
+    # The seed is an argument of the programs, as keys.
     compiled_in = {name: value for name, value in config.flat().items() if name not in (*marked(HOST), "seed")}
     depends_on = [compiled_in, str(jax.tree.structure(learner)), versions(), device_record(), target, settings, _code()]
     return hashlib.sha256(json.dumps(depends_on, sort_keys=True, default=repr).encode()).hexdigest()
@@ -93,7 +93,7 @@ class TraceCache:
     Args:
         folder: Folder of the files; it need not exist.
         fingerprint: From `fingerprint`.
-        nodes: Tree with all kinds of nodes that arguments and results have, besides those of this package's own signatures.
+        nodes: Tree with all node types of arguments and results, besides those of this package's own signatures.
         jit_options: Arguments of `jaxrl_vis_envs.jit` by name of the program.
     """
 
@@ -107,8 +107,8 @@ class TraceCache:
 
         Args:
             name: Name of the program.
-            function: Jitted.
-            arguments: Trees of the shapes of its arguments.
+            function: Jitted function.
+            arguments: Shapes of its arguments, as trees.
         """
         _register((self._nodes, arguments, _SIGNATURES))
         data = self._read(name)
@@ -118,12 +118,12 @@ class TraceCache:
             again = jax.jit(lambda *arguments: jax.tree.unflatten(results, call(*jax.tree.leaves(arguments))))
             exported = export.export(again, platforms=(target_platform(),), disabled_checks=_CHECKS)(*arguments)
             self._fresh[name] = data = bytes(exported.serialize())
-        # Also what has just been traced: XLA's cache takes a program that was read for another one than that which was traced.
+        # Also used right after tracing: XLA's cache distinguishes between a traced program and the same one read from a file.
         program = export.deserialize(bytearray(data))
         return jaxrl_vis_envs.jit(program.call, **self._jit_options.get(name, {})).lower(*arguments)
 
     def write(self) -> None:
-        """Store the traced programs, after their compilation, if the folder can be written."""
+        """Store the newly traced programs, after their compilation; skipped if the folder cannot be written."""
         with contextlib.suppress(OSError):
             make_private(self._folder)
             for name, data in self._fresh.items() if self._is_private() else ():
@@ -144,7 +144,7 @@ class TraceCache:
         return self._folder / f"{name}-{self._fingerprint}.stablehlo"
 
     def _read(self, name: str) -> bytes | None:
-        """Return a stored program; None for one that is missing, damaged, or possibly another user's."""
+        """Return a stored program; None if it is missing, damaged, or possibly written by another user."""
         contents = read_private(self._path(name)) if self._is_private() else None
         if contents is None:
             return None
@@ -155,7 +155,7 @@ class TraceCache:
         return hashlib.sha256(self._path(name).name.encode() + b"\0" + data).digest()
 
     def _is_private(self) -> bool:
-        """Return True if the folder is private to this user; the rights of others are removed first if this user owns it."""
+        """Return True if the folder is private to this user; first revoke the permissions of others if this user owns it."""
         try:
             status = self._folder.stat()
             if stranger_to(status) is not None:
@@ -182,7 +182,7 @@ def _register(tree: Any) -> None:
             continue
         _registered.add(kind)
         name = f"{kind.__module__}.{kind.__qualname__}"
-        with contextlib.suppress(ValueError):  # somebody else has registered it
+        with contextlib.suppress(ValueError):  # registered by other code
             if issubclass(kind, tuple):
                 export.register_namedtuple_serialization(kind, serialized_name=name)
             else:  # a dataclass all of whose fields are children

@@ -1,1 +1,1 @@
-"""Trained policies as files that run without this project: ONNX, StableHLO, safetensors."""
+"""Export of trained policies to files that run without this project: ONNX, StableHLO, safetensors."""

@@ -1,4 +1,4 @@
-"""Contract of an exported policy: all that a robot's program must know to call it, in contract.json beside the file."""
+"""Contract of an exported policy: all information needed to call it on a robot, in contract.json beside the file."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ from jaxrl_vis_envs.render import Scene
 
 FILE, SCHEMA = "contract.json", 1
 FORMATS = {"onnx": "policy.onnx", "stablehlo": "policy.stablehlo", "safetensors": "policy.safetensors"}
-"""Formats, and the name of the policy's file in each."""
+"""Name of the policy's file by format."""
 TOLERANCE = 1e-4
-"""Largest difference from our own actions at which a file passes; actions lie in [-1, 1]."""
+"""Maximum difference from our own actions at which a file passes; actions lie in [-1, 1]."""
 _DTYPES = ("uint8", "float32")
 _COLOURS = ("red", "green", "blue")
 
@@ -34,7 +34,7 @@ class Contract:
     """Contract as read from a file.
 
     Attributes:
-        format: A key of `FORMATS`.
+        format: Format, a key of `FORMATS`.
         file: Path of the policy.
         golden: Path of the golden frames.
         forms: Form of ``observation``, ``goal`` and ``action``.
@@ -51,13 +51,13 @@ class Contract:
 def make_contract(
     policy: Policy, run_dir: Path, kind: str, unclipped: Mapping[str, tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, Any]:
-    """Describe a policy.
+    """Create the contract of a policy.
 
     Args:
         policy: The policy.
         run_dir: Folder of its run.
         kind: A key of `FORMATS`.
-        unclipped: Least and greatest number [S] that is not clipped of each input, for states if they are known.
+        unclipped: Minimum and maximum [S] of each state input that are not clipped, by name; empty for images or if unknown.
 
     Returns:
         A JSON value.
@@ -144,7 +144,7 @@ def _channels(pixels: str) -> list[str]:
 
 
 def _plain(config: Any) -> Any:
-    """Return a configuration of an environment as a JSON value; None if it is none."""
+    """Return an environment's configuration as a JSON value, without other types; None if it is not a dataclass."""
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         return None
     simple = (str, int, float, bool, list, tuple, dict, type(None))
@@ -158,7 +158,7 @@ def read_contract(path: Path) -> Contract:
         path: The policy's file, the contract, or the folder of both.
 
     Raises:
-        RequestError: There is none, it is damaged, or it describes another file.
+        RequestError: The contract is missing or damaged, or describes another file.
     """
     folder = path if path.is_dir() else path.parent
     file, mend = folder / FILE, "export again with --overwrite"
@@ -188,7 +188,7 @@ def _form(part: dict[str, Any]) -> Form:
     """Read the form of an input or output.
 
     Raises:
-        ValueError, TypeError, KeyError: It is none.
+        ValueError, TypeError, KeyError: ``part`` is invalid.
     """
     batch, *shape = part["shape"]
     if batch != "batch" or part["dtype"] not in _DTYPES or not 1 <= len(shape) <= 3:

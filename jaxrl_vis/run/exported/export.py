@@ -28,7 +28,7 @@ class Check(NamedTuple):
 
     Attributes:
         file: The policy.
-        difference: Largest absolute difference from our own actions on the golden frames.
+        difference: Maximum absolute difference from our own actions on the golden frames.
         count: Number of frames.
     """
 
@@ -51,20 +51,20 @@ def export_run(
     overwrite: bool = False,
     trust: bool = False,
 ) -> Check:
-    """Write the policy of a run, with the normalisation inside and without exploration, and check the file.
+    """Export the policy of a run, including normalisation and without exploration, and check the file.
 
     The folder receives the policy, contract.json and golden.npz. The policy is that of `load_policy`, in float32.
 
     Args:
         run_dir: The run folder, or the name of a policy that comes with the package.
         kind: ``onnx``, ``stablehlo`` or ``safetensors``.
-        out: The folder; None: export/KIND in the run folder.
-        seed, checkpoint, trust: As of `load_policy`.
+        out: The folder; None for export/KIND in the run folder.
+        seed, checkpoint, trust: As in `load_policy`.
         overwrite: Replace an exported policy in ``out``.
 
     Raises:
-        RequestError: The run cannot be used, the policy has no such form, a library is missing, or there is something in
-            ``out`` already.
+        RequestError: The run cannot be used, the policy does not support the format, a library is missing, or ``out`` is not
+            empty.
         StorageError: A file cannot be written.
     """
     if kind not in FORMATS:
@@ -74,7 +74,7 @@ def export_run(
     run_dir = find(run_dir)
     folder = workplace(run_dir) / EXPORT_FOLDER / kind if out is None else Path(out)
     _check_folder(folder, overwrite)
-    # Of networks that compute in bfloat16 or TF32, no other library would repeat the roundings.
+    # No other library would reproduce the rounding of networks in bfloat16 or TF32.
     trainer = open_run(run_dir, True, trust, eval_episodes=num_recorded(_EPISODES), compute_dtype="float32")
     seed = choose_seed(trainer, run_dir, seed)
     restored = load(trainer, run_dir, checkpoint)
@@ -87,7 +87,7 @@ def export_run(
 
 
 def _check_folder(folder: Path, overwrite: bool) -> None:
-    """Raise a RequestError if ``folder`` is a file, or holds something that may not be replaced."""
+    """Raise a RequestError if ``folder`` is a file, or has contents that must not be replaced."""
     check_writable(folder, "--out", folder=True)
     names = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
     if names and contracts.FILE not in names:
@@ -97,7 +97,7 @@ def _check_folder(folder: Path, overwrite: bool) -> None:
 
 
 def _unclipped(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return, for a policy of states, the numbers between which each input is not clipped; nothing if they are not known."""
+    """Return the unclipped range (low [S], high [S]) of each input of a state policy; empty for images or if unknown."""
     if len(policy.observation_spec.shape) == 3:
         return {}
     try:
@@ -114,9 +114,9 @@ def _unclipped(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def _write(
     folder: Path, kind: str, policy: Policy, layers: Layers | None, frames: golden.Golden, contract: dict[str, Any]
 ) -> None:
-    """Write the files, the contract last: an export that was interrupted has none, or that of a complete one."""
+    """Write the files, the contract last, so that an interrupted export has no contract."""
     file, described = folder / FORMATS[kind], folder / contracts.FILE
-    contents = b""  # made before anything there is deleted
+    contents = b""  # created before existing files are deleted
     if kind == "stablehlo":
         contents = stablehlo.to_bytes(policy)
     elif kind == "onnx" and layers is not None:
@@ -155,7 +155,7 @@ def check_file(path: Path | str) -> Check:
     run = _of_weights(contract) if contract.format == "safetensors" else _of_program(contract)
     try:
         action = run(frames.observation, frames.goal)
-    except Exception as error:  # the file may contain any graph
+    except Exception as error:  # the file may contain an arbitrary graph
         reason = " ".join(str(error).split())[:120]
         raise RequestError(f"{contract.file} cannot be run on its golden frames ({reason}): export it again") from error
     if action.shape != frames.action.shape:

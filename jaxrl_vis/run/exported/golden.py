@@ -1,4 +1,4 @@
-"""Golden frames: inputs that the task itself has shown, with the actions of our own policy, in an .npz file."""
+"""Golden frames: inputs from the task, with the actions of our own policy, in an .npz file."""
 
 import io
 import zipfile
@@ -32,7 +32,7 @@ class Golden(NamedTuple):
 
 
 def record(trainer: Trainer, train: TrainState, policy: Policy) -> Golden:
-    """Record frames of the first episodes of an evaluation, which a policy plays; they are the same at every call.
+    """Record frames of the first episodes of an evaluation of a policy; they are the same at every call.
 
     Args:
         trainer: From `open_run`, with few episodes per evaluation.
@@ -49,7 +49,7 @@ def record(trainer: Trainer, train: TrainState, policy: Policy) -> Golden:
     chosen = np.linspace(0, episodes * steps - 1, COUNT).astype(int)
     observations, aims = [], []
     for episode, step in zip(*divmod(chosen, steps), strict=True):
-        # Stacked images, the newest first; an episode begins with its first image repeated.
+        # Stack images, the newest first; at the start of an episode, its first image is repeated.
         images = [frames[episode, max(step - age, 0)] for age in range(stack)]
         observations.append(np.concatenate(images) if stack > 1 else images[0])
         aims.append(np.concatenate([goals[episode]] * stack) if stack > 1 else goals[episode])
@@ -91,7 +91,7 @@ def read(path: Path, forms: dict[str, tuple[tuple[int, ...], str]]) -> Golden:
         raise RequestError(f"{path} is missing: {mend}") from error
     except RequestError:
         raise
-    except Exception as error:  # zipfile, zlib and NumPy each have errors of their own
+    except Exception as error:  # zipfile, zlib and NumPy raise various exceptions
         raise RequestError(f"{path} is damaged ({type(error).__name__}): {mend}") from error
     for name, array in arrays.items():
         shape, dtype = forms[name]

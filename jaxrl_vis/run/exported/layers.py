@@ -31,7 +31,7 @@ COMPUTATION = (
     "concatenate observation and goal; times head/K/kernel [in, out], plus head/K/bias, ReLU",
     "times head/output/kernel, plus head/output/bias; tanh",
 )
-"""Computation of `forward` in words, for those who read the weights elsewhere."""
+"""Description of the computation of `forward`, for other users of the weights."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Layers:
 
     Attributes:
         limit: Bound of normalised observations.
-        arrays: Arrays float32 by name: ``observation/mean``, ``encoder/0/kernel`` [out, in, 2, 2], ``head/0/kernel`` [in, out],
+        arrays: Float32 arrays by name: ``observation/mean``, ``encoder/0/kernel`` [out, in, 2, 2], ``head/0/kernel`` [in, out],
             ..., see `COMPUTATION`.
     """
 
@@ -61,11 +61,11 @@ class Layers:
         return sum(bool(re.fullmatch(rf"{part}/\d+/kernel", name)) for name in self.arrays)
 
     def scaling(self, name: str) -> str:
-        """Return the input whose statistics normalise the input ``name``: goals may share those of observations."""
+        """Return the name of the input whose statistics normalise input ``name``: goals may share those of observations."""
         return name if f"{name}/mean" in self.arrays else INPUTS[0]
 
     def nested(self) -> dict[str, Any]:
-        """Return the arrays in nested dictionaries."""
+        """Return the arrays as nested dictionaries."""
         tree: dict[str, Any] = {}
         for name, array in self.arrays.items():
             *folders, last = name.split("/")
@@ -142,7 +142,7 @@ def forward(layers: Layers, observation: np.ndarray, goal: np.ndarray) -> np.nda
 
 
 def _convolved(images: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    """Convolve [N, C, H, W] with a 2x2 kernel [out, C, 2, 2] of stride 2, and rectify."""
+    """Convolve images [N, C, H, W] with a kernel [out, C, 2, 2] and stride 2, and apply ReLU."""
     count, channels, height, width = images.shape
     rows, columns = height // 2, width // 2
     windows = images[:, :, : 2 * rows, : 2 * columns].reshape(count, channels, rows, 2, columns, 2)

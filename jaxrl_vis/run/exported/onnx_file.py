@@ -10,7 +10,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.provenance import install_command
 from jaxrl_vis.run.exported.layers import INPUTS, OUTPUT, Layers
 
-# Old enough for runtimes of 2022, among them those of browsers.
+# Old enough for runtimes of 2022, including browsers.
 _OPSET, _IR_VERSION = 17, 8
 BATCH = "batch"
 
@@ -28,7 +28,7 @@ def require() -> tuple[Any, Any]:
 
 
 class _Graph:
-    """Nodes and initializers of a graph that is being written."""
+    """Nodes and initializers of a graph under construction."""
 
     def __init__(self, onnx: Any):
         self._onnx = onnx
@@ -53,8 +53,8 @@ def to_bytes(layers: Layers, shape: tuple[int, ...], dtype: np.dtype, about: str
 
     Args:
         layers: The policy.
-        shape, dtype: Those of an observation.
-        about: Description that is stored in the model.
+        shape, dtype: Shape and dtype of an observation.
+        about: Description stored in the model.
     """
     onnx, _ = require()
     helper, graph = onnx.helper, _Graph(onnx)
@@ -105,22 +105,22 @@ class Model:
         path: The file.
 
     Attributes:
-        inputs, outputs: Shape, with a name or None for a free size, and NumPy dtype of each, by name.
+        inputs, outputs: Shape (with a name or None for a free size) and NumPy dtype of each, by name.
 
     Raises:
-        RequestError: onnxruntime is missing, or the file is no model that it can run.
+        RequestError: onnxruntime is missing, or cannot run the file.
     """
 
     def __init__(self, path: Path):
         _, runtime = require()
         options = runtime.SessionOptions()
-        options.log_severity_level = 4  # it would report on stderr what is raised as well
+        options.log_severity_level = 4  # otherwise exceptions are also logged on stderr
         try:
             contents = path.read_bytes()
             self._session = runtime.InferenceSession(contents, options, providers=["CPUExecutionProvider"])
         except OSError as error:
             raise RequestError(f"cannot read {path} ({error.strerror or error})") from error
-        except Exception as error:  # onnxruntime has an exception for each of its status codes, without a common base
+        except Exception as error:  # onnxruntime's exceptions have no common base class
             raise RequestError(
                 f"{path} is no ONNX model that onnxruntime can run ({_first_line(error)}): export it again"
             ) from None
@@ -128,12 +128,12 @@ class Model:
         self.outputs = {part.name: (tuple(part.shape), _dtype(part.type)) for part in self._session.get_outputs()}
 
     def __call__(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Compute actions [N, A] float32 of a batch."""
+        """Compute the actions [N, A] float32 of a batch."""
         return self._session.run([OUTPUT], dict(zip(INPUTS, (observation, goal), strict=True)))[0]
 
 
 def _dtype(kind: str) -> str:
-    """Return the name of NumPy's dtype for onnxruntime's ``tensor(float)``."""
+    """Return the NumPy dtype name of an onnxruntime type such as ``tensor(float)``."""
     name = kind.removeprefix("tensor(").removesuffix(")")
     return {"float": "float32", "double": "float64"}.get(name, name)
 

@@ -1,4 +1,4 @@
-"""Policies as StableHLO: compiled-program text of `jax.export`, which any JAX runs without this project."""
+"""Policies as StableHLO, serialised by `jax.export`, which JAX runs without this project."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def to_bytes(policy: Policy) -> bytes:
     Raises:
         RequestError: JAX cannot export the policy.
     """
-    # As NumPy arrays, the parameters become constants of the program.
+    # Parameters as NumPy arrays become constants of the program.
     parameters, algorithm = jax.tree.map(np.asarray, policy.parameters), policy.algorithm
 
     def act(observation: jax.Array, goal: jax.Array) -> jax.Array:
@@ -31,7 +31,7 @@ def to_bytes(policy: Policy) -> bytes:
     spec = jax.ShapeDtypeStruct((batch, *policy.observation_spec.shape), policy.observation_spec.dtype)
     try:
         return bytes(export.export(jax.jit(act), platforms=PLATFORMS)(spec, spec).serialize())
-    except Exception as error:  # a policy of one's own may do anything
+    except Exception as error:  # custom policies may raise anything
         reason = " ".join(str(error).split())[:160]
         raise RequestError(
             f"the policy of algorithm {policy.config.run.algorithm} cannot be exported for any batch and platform ({reason})"
@@ -45,10 +45,10 @@ class Program:
         path: The file.
 
     Attributes:
-        inputs, outputs: Shape, with None for a free size, and NumPy dtype of each, by name.
+        inputs, outputs: Shape (with None for a free size) and NumPy dtype of each, by name.
 
     Raises:
-        RequestError: The file is no exported program of a policy.
+        RequestError: The file is not an exported policy.
     """
 
     def __init__(self, path: Path):
@@ -62,13 +62,13 @@ class Program:
             raise
         except OSError as error:
             raise RequestError(f"cannot read {path} ({error.strerror or error})") from error
-        except Exception as error:  # flatbuffers raises whatever its offsets lead to
+        except Exception as error:  # flatbuffers raises arbitrary exceptions on damaged offsets
             raise RequestError(
                 f"{path} is no StableHLO program that JAX {jax.__version__} can read: export it again"
             ) from error
 
     def __call__(self, observation: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Compute actions [N, A] float32 of a batch."""
+        """Compute the actions [N, A] float32 of a batch."""
         return np.asarray(self._exported.call(observation, goal))
 
 

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from jaxrl_vis.host.streams import SafeStream
 
-_LEAST_BAR = 10  # columns
+_LEAST_BAR = 10  # minimum width of the bar, columns
 _BETWEEN = "  "
 
 Wordings = Callable[[Task, str, str], Sequence[Sequence[str]]]
@@ -32,7 +32,7 @@ class FittingProgress(Progress):
 
     Args:
         stream: The terminal.
-        wordings: Alternatives, of which the first that fits is shown; the last one is cut off if necessary.
+        wordings: Alternative texts; the first one that fits is shown, and the last one is truncated if necessary.
         refresh_per_second: Refresh rate.
     """
 

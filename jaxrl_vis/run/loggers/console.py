@@ -13,7 +13,7 @@ from jaxrl_vis.run.loggers.bar import FittingProgress
 
 
 def show_shares(values: Sequence[float]) -> str:
-    """Format shares: ``0.93`` for one seed; for several, the median and all values: ``0.93 (0.91 0.93 0.96)``."""
+    """Format fractions: ``0.93`` for one seed; for several, the median and all values: ``0.93 (0.91 0.93 0.96)``."""
     median = f"{statistics.median(values):.2f}"
     return median if len(values) == 1 else f"{median} ({' '.join(f'{value:.2f}' for value in values)})"
 

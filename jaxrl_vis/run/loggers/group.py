@@ -1,7 +1,7 @@
 """Loggers (``--log tensorboard wandb``) of metrics.jsonl, the configuration, the curve and the video.
 
 metrics.jsonl remains the reference. At its start, a logger receives the rows that the file already has, and then every new row,
-so that a resumed run, or a logger added later, shows each evaluation once.
+so that a resumed run, or a logger added later, shows each evaluation exactly once.
 
 A failing logger is reported in one line and not used again: training continues without it.
 """
@@ -90,7 +90,7 @@ class Loggers:
                 self._try(logger_name, lambda logger=logger: logger.image(name, file, env_steps))
 
     def close(self, in_a_hurry: bool = False) -> None:
-        """Close the loggers, within a time limit: a library that waits for a network would otherwise never let the run end."""
+        """Close the loggers within a time limit: a library waiting for a network could otherwise block the end of the run."""
         for name in list(self._open):
             logger = self._open.pop(name)
             thread = threading.Thread(target=self._try, args=(name, logger.close), daemon=True)

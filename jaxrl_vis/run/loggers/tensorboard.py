@@ -1,6 +1,6 @@
 """TensorBoard logger: one folder per seed in ``tensorboard/`` of the run folder, so that each seed is a curve.
 
-Events are written synchronously: tensorboardX's own writer has a thread and a queue, which would wait for ever on a full disk.
+Events are written synchronously: tensorboardX's own writer has a thread and a queue, which would block forever on a full disk.
 A resumed run rewrites its files from metrics.jsonl, so that no evaluation appears twice, nor one that the run has discarded.
 """
 

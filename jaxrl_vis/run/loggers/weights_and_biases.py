@@ -1,7 +1,7 @@
 """Weights & Biases logger: one W&B run per seed, in a group named after the run folder.
 
 ``wandb.json`` in the run folder stores the W&B runs' ids and the last iteration sent: a resumed run continues under the same
-ids and sends nothing twice. Its entries of another run than that of config.json are ignored. W&B's own files are in ``wandb/``.
+ids and sends nothing twice. Entries of a run other than that of config.json are ignored. W&B's own files are in ``wandb/``.
 Account, project, server and network use are configured in W&B itself (``wandb login``, ``WANDB_PROJECT``,
 ``WANDB_MODE=offline``).
 """

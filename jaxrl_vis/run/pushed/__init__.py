@@ -1,1 +1,1 @@
-"""Runs for others: a folder with card, curve, video, configuration and weights, here or on a hub."""
+"""Publication of runs: a folder with card, curve, video, configuration and weights, local or on a hub."""

@@ -1,4 +1,4 @@
-"""Card of a policy, README.md: what it does, how well, and the command that trained it, for people and for a hub."""
+"""Card of a policy (README.md): task, success and training command, with metadata for a hub."""
 
 import json
 from collections.abc import Mapping
@@ -9,13 +9,13 @@ from jaxrl_vis.run.command import training_command
 
 
 class Score(NamedTuple):
-    """Success at the last step of evaluation episodes.
+    """Success rate at the last step of evaluation episodes.
 
     Attributes:
-        share: From 0 to 1.
-        low, high: Wilson's interval of 95 %.
+        share: Success rate, 0 to 1.
+        low, high: Bounds of the 95 % Wilson interval.
         episodes: Number of episodes.
-        env_steps: Environment steps of the training before.
+        env_steps: Environment steps trained before the evaluation.
         distance: Mean distance to the goal, in the task's unit.
     """
 
@@ -47,17 +47,17 @@ def card(
     name_here: str | None = None,
     remark: str = "",
 ) -> str:
-    """Write the card.
+    """Return the text of the card.
 
     Args:
         config: Configuration of the run.
         record: The run's config.json.
         seed: Seed whose weights are in the folder.
-        scores: By seed; empty if none was evaluated where the weights were saved.
+        scores: Scores by seed; empty if none was evaluated at the iteration of the weights.
         unit: Unit of distances.
-        pictures: File by caption.
-        name_here: Name under which the package has the policy; None: it is in a folder by itself, with metrics.jsonl.
-        remark: Further sentence about the scores.
+        pictures: Image files by caption.
+        name_here: Name of the policy in the package; None for a separate folder, with metrics.jsonl.
+        remark: Additional sentence about the scores.
     """
     task, name = config.environment.env, f"{config.environment.env}, {config.reward.method}, {config.run.algorithm}"
     lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in _front(task, name, scores.get(seed)).items()), "---", ""]
@@ -103,7 +103,7 @@ def card(
 
 
 def _front(task: str, name: str, of_seed: Score | None) -> dict[str, Any]:
-    """Return the front matter; its values are written as JSON, which YAML contains."""
+    """Return the front matter; its values are written as JSON, a subset of YAML."""
     front: dict[str, Any] = {
         "library_name": "jaxrl-vis",
         "pipeline_tag": "reinforcement-learning",

@@ -1,9 +1,9 @@
-"""`push`: a trained policy as a folder that others load, here or on a hub.
+"""`push`: publication of a trained policy as a loadable folder, local or on a hub.
 
     README.md  see `card`        config.json, metrics.jsonl  of the run        policy.safetensors  see `policy_file`
-    curve.png  video.gif         where the run has them
+    curve.png  video.gif         if the run has them
 
-The folder is assembled whole; then it takes its place, or is uploaded.
+The folder is assembled completely before it is moved into place or uploaded.
 """
 
 import json
@@ -27,13 +27,13 @@ _REPOSITORY = re.compile(r"[\w.-]{1,96}/[\w.-]{1,96}")
 
 
 def check_target(to: str) -> None:
-    """Check a target before the work begins.
+    """Check the target of a push before the work begins.
 
     Args:
         to: A folder that does not exist or is empty, or ``hub:user/name``.
 
     Raises:
-        RequestError: The folder holds something or cannot be written, the name is no repository's, or huggingface_hub is
+        RequestError: The folder is not empty or cannot be written, the repository name is invalid, or huggingface_hub is
             missing.
     """
     if to.startswith(HUB):
@@ -51,16 +51,16 @@ def check_target(to: str) -> None:
 
 
 def push(run_dir: Path | str, to: str, seed: int | None = None, trust: bool = False) -> str:
-    """Push the policy of a run's newest valid checkpoint; return the place.
+    """Push the policy of a run's newest valid checkpoint; return its folder or address.
 
     Args:
         run_dir: The run folder.
         to: See `check_target`.
-        seed: Seed, of a run with several; None: the first.
-        trust: As of `load_policy`.
+        seed: Seed, for a run with several; None for the first.
+        trust: As in `load_policy`.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, or no such target; or the hub refuses.
+        RequestError: There is no run, no usable checkpoint, or no such target; or the hub refuses.
         StorageError: The folder cannot be written.
     """
     check_target(to)
@@ -115,21 +115,21 @@ def assemble(run_dir: Path, policy: Policy, folder: Path) -> None:
 
 
 def public_record(run_dir: Path) -> dict[str, Any]:
-    """Return the contents of a run's config.json for others: where a task of one's own lay here is of no use elsewhere."""
+    """Return the contents of a run's config.json for publication, without the local folder of a custom task."""
     record = read_record(run_dir)
     environment = {**record["config"].get("environment", {}), "env_folder": None}
     return {**record, "config": {**record["config"], "environment": environment}}
 
 
 def _upload(folder: Path, repository: str) -> str:
-    """Upload a folder as a model of the hub, and return its address."""
+    """Upload a folder to the hub as a model, and return its address."""
     from huggingface_hub import HfApi  # pyright: ignore[reportMissingImports]
 
     try:
         api = HfApi()
         api.create_repo(repository, repo_type="model", exist_ok=True)
         api.upload_folder(repo_id=repository, repo_type="model", folder_path=str(folder), commit_message="Push a policy")
-    except Exception as error:  # of its client, of requests, of the network
+    except Exception as error:  # errors of the client, of requests, or of the network
         cause = " ".join(str(error).split())[:300]
         raise RequestError(
             f"the hub has not taken {repository} ({type(error).__name__}: {cause}): `hf auth login` once, or push to a folder"

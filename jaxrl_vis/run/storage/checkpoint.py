@@ -46,7 +46,7 @@ DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
 
 @contextlib.contextmanager
 def _damage_first(where: Path) -> Iterator[None]:
-    """Raise Unusable in place of a RequestError if files of the checkpoint have changed: a wrong bit is no other version."""
+    """Raise Unusable instead of a RequestError if files of the checkpoint have changed: damage is not another version."""
     try:
         yield
     except RequestError:
@@ -239,7 +239,7 @@ class Checkpoints:
         return self._folder / REPLACED / f"{tier}-{iteration}"
 
     def _put_aside(self, tier: str, iteration: int) -> None:
-        """Move a checkpoint to the place where `_recover` finds it if the process is killed before it is replaced."""
+        """Move a checkpoint aside, where `_recover` finds it if the process is killed before the replacement is complete."""
         distributed.meet("replacing")
         if distributed.is_first():
             aside = self._replaced(tier, iteration)
@@ -299,7 +299,7 @@ class Checkpoints:
     def retire_full(self, has_ended: bool = False) -> None:
         """Delete full checkpoints older than a light one that is safely on the disk: they are no longer needed for resuming.
 
-        Recent states that are not kept up to date any more go likewise.
+        Recent states that are no longer kept up to date are also deleted.
 
         Args:
             has_ended: Also delete equally new ones: the run is complete.

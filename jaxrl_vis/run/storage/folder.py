@@ -1,4 +1,4 @@
-"""Run folder: its files, the configuration that they belong to, and the right to write there.
+"""Run folder: its files, their configuration, and checks of the permission to write there.
 
 The files:
 
@@ -7,7 +7,7 @@ The files:
     run.lock        while a process writes here, see `lock`      tensorboard/, wandb/, wandb.json   see `loggers`
     processes.jsonl     see `goodput`
 
-A run has a random id, which is kept when it is resumed. Every row of metrics and every checkpoint has it, and nothing with
+A run has a random id, which it keeps when resumed. Every row of metrics and every checkpoint includes it, and nothing with
 another id is resumed, counted or deleted.
 """
 
@@ -132,7 +132,7 @@ class RunFolder:
         return [row for row in rows if row.get(RUN_ID) == run_id]
 
     def check_place(self, held: Held) -> None:
-        """Check that the folder is still in place since it was locked, before a run starts there.
+        """Check that the folder is still in place since it was locked, before the run starts.
 
         Args:
             held: What holds the folder.
@@ -145,7 +145,7 @@ class RunFolder:
             raise FolderGoneError(_where_gone(self.path, held.current_path(), "before the run began"))
 
     def check_ours(self, run_id: str, held: Held) -> None:
-        """Check that the folder still belongs to a run, before something is written into it.
+        """Check that the folder still belongs to a run, before writing into it.
 
         Args:
             run_id: Id of the run.

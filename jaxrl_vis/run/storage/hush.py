@@ -1,4 +1,4 @@
-"""Silencing of orbax and tensorstore, which print long messages, also from their threads, about errors that they also raise."""
+"""Silencing of orbax and tensorstore, which log long messages about errors that they also raise, even from their threads."""
 
 import contextlib
 import gc

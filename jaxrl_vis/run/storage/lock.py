@@ -131,7 +131,7 @@ def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]
 
 
 def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
-    """Lock the file until the end of ``stack``; False if the file system has no locks, or its present holder found none.
+    """Lock the file until the end of ``stack``; return False if the file system has no locks, or its holder found none.
 
     Raises:
         RequestError: Another process holds it.
@@ -154,7 +154,7 @@ def _lock_by_system(path: Path, stack: contextlib.ExitStack) -> bool:
 
 
 def _has_locks(folder: Path) -> bool:
-    """Return True if files in a folder can be locked; tried on an anonymous file, because a lock file would seem held."""
+    """Return True if files in a folder can be locked; tested on an anonymous file, because a lock file would appear held."""
     with tempfile.TemporaryFile(dir=folder) as file:
         try:
             filelock.lock_descriptor(file.fileno(), blocking=False)

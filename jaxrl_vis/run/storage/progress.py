@@ -16,7 +16,7 @@ class Progress:
         wall_s, compile_s: Time spent by earlier processes, s.
         since_evaluation: train/* and other metrics of every iteration since the last scheduled evaluation.
         evaluation_due: True if the evaluation at the end of the iteration was prevented by a signal.
-        filtered: Number of consecutive evaluations with too large a filtered share.
+        filtered: Number of consecutive evaluations with too large a fraction of filtered negatives.
         replay_lost_at: Last iteration at which the run resumed without its replay; None if it never did.
     """
 

@@ -4,12 +4,12 @@
     checkpoints/recent/<iteration>.rollout   the episodes collected in this iteration
 
 A rollout stays in the replay until the ring buffer overwrites it, so a state needs several files of earlier iterations and one
-new file: some milliseconds, where a full checkpoint writes the whole replay. That is worthwhile on a CPU, where reading the
-arrays costs nothing, for a replay of moderate size: `is_cheap`.
+new file: some milliseconds, whereas a full checkpoint writes the whole replay. It is used on a CPU, where reading the arrays is
+free, for replays of moderate size: `is_cheap`.
 
 Nothing is synced to the disk. A killed process leaves what it has written; a power cut may not, which the checksums detect, and
-the run then resumes from a light or a full checkpoint, which are synced. A file appears under its name only when it is
-complete. The newest two states are kept.
+the run then resumes from a light or a full checkpoint, which are synced. Files are written atomically. The newest two states
+are kept.
 """
 
 import contextlib
@@ -32,18 +32,18 @@ from jaxrl_vis.types import LoopState, ReplayState
 SCHEMA = 1
 ANY_RUN = "*"
 _KEPT = 2
-_MOST_BYTES = 2**30  # of a replay
-_SHARE = 0.03  # largest fraction of the time spent on saving: about every iteration of `cpu` on two cores
+_MOST_BYTES = 2**30  # maximum size of a replay
+_SHARE = 0.03  # maximum fraction of the time spent on saving: about every iteration of `cpu` on two cores
 _EPISODES = "replay.episodes."
 
 
 def is_cheap(replay: ReplayState) -> bool:
-    """Return True if this replay (or one of these shapes) is cheap to keep up to date in files, in time and disk space."""
+    """Return True if a replay (arrays or shapes) is cheap to keep up to date in files, in time and disk space."""
     return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
 
 
 class Unusable(Exception):
-    """Damaged checkpoint of any tier, or state with a damaged rollout. The message gives the reason in a few words."""
+    """Damaged checkpoint of any tier, or state with a damaged rollout. The message is a short reason."""
 
 
 class Recent:
@@ -68,7 +68,7 @@ class Recent:
         """Return True if enough time has passed since the last save for saving to take only a small fraction of it.
 
         Args:
-            in_any_case: Ignore the time.
+            in_any_case: Ignore the time since the last save.
         """
         return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
 
@@ -94,7 +94,7 @@ class Recent:
     def save(
         self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
     ) -> None:
-        """Write a state and its missing rollouts; if there is no space, this is reported, and nothing more is saved.
+        """Write a state and its missing rollouts; if there is no space, report it and disable further saving.
 
         Args:
             iteration: Iterations completed.
@@ -217,7 +217,7 @@ class Recent:
                 array[:, start : start + num_envs], offset = _array(contents, offset, shape, array.dtype)
 
     def resume_from(self, iteration: int | None) -> None:
-        """Prepare for resuming from the state of an iteration, and delete later rollouts; None: from none, so deletes all."""
+        """Prepare for resuming from the state of an iteration, and delete later rollouts; None: from no state; delete all."""
         if iteration is None:
             self.clear()
             return
@@ -304,7 +304,7 @@ def _bytes(array: np.ndarray) -> memoryview:
 
 
 def _array(contents: bytes, offset: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
-    """Return the array of a shape that begins at an offset, and the offset of its end."""
+    """Return the array of the given shape and dtype at an offset, and the offset of its end."""
     count = int(np.prod(shape))
     end = offset + count * np.dtype(dtype).itemsize
     if end > len(contents):

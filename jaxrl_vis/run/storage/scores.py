@@ -19,7 +19,7 @@ def metric(config: Config) -> str:
 
 
 def is_lower_better(config: Config) -> bool:
-    """Return True if smaller scores are better, as of distances."""
+    """Return True if smaller scores are better, as for distances."""
     return metric(config) in _LOWER_IS_BETTER
 
 
@@ -35,7 +35,7 @@ def score(config: Config, values: Mapping[str, Sequence[float]]) -> float:
 
 
 def is_better(config: Config, new: float, old: float | None) -> bool:
-    """Return True if a score is better than another; any is better than None. Equal ones are not."""
+    """Return True if ``new`` is strictly better than ``old``; any score is better than None."""
     if old is None:
         return True
     return new < old if is_lower_better(config) else new > old
@@ -55,7 +55,7 @@ def enough_at(config: Config, rows: Sequence[Mapping[str, Any]], seeds: Collecti
     Args:
         config: The run.
         rows: Rows of metrics.jsonl.
-        seeds: Seeds of the run, of which an evaluation must have rows.
+        seeds: Seeds of the run; evaluations without rows of all of them are ignored.
     """
     name = f"eval/{metric(config)}"
     by_iteration: dict[int, dict[int, float]] = {}

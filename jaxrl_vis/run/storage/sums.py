@@ -9,7 +9,7 @@ FILE_NAME = "SHA256SUMS"
 
 
 def _files(folder: Path) -> list[str]:
-    """Return the names of all files below a folder, relative to it and sorted, without the checksums' own."""
+    """Return the paths of all files below a folder, relative to it and sorted, except the checksum file."""
     names = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return sorted(name for name in names if name not in (FILE_NAME, f"{FILE_NAME}.tmp"))
 
@@ -20,7 +20,7 @@ def _sum(file: Path) -> str:
 
 
 def write_sums(folder: Path) -> None:
-    """Write the checksums of all files below a folder that is not written any more.
+    """Write the checksums of all files below a folder, which must be complete.
 
     Raises:
         OSError: A file cannot be read, or the checksums cannot be written.

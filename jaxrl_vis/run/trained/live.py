@@ -1,6 +1,6 @@
-"""`play --live`: a policy at work in the browser, with a goal that is dragged in three dimensions.
+"""`play --live`: interactive view of a policy in the browser, with a goal that can be dragged in three dimensions.
 
-`Session` is the policy in its environment, one control step at a time; `Page` shows it, and hands it what a person asks for.
+`Session` steps the policy in its environment; `Page` shows it and forwards the user's requests.
 """
 
 import contextlib
@@ -25,15 +25,15 @@ from jaxrl_vis_envs import goals
 from jaxrl_vis_envs.tasks.mjx_env import MjxGoalEnv
 
 HOST, PORT = "127.0.0.1", 8080  # of this machine alone; the next free port if it is taken
-_IDLE = 0.1  # s between looks for a visitor
-_SHOWN = 160  # px, side of an image on the page
+_IDLE = 0.1  # interval between checks for a visitor, s
+_SHOWN = 160  # side of an image on the page, px
 
 
 def require() -> Any:
     """Import viser.
 
     Raises:
-        RequestError: It is missing.
+        RequestError: viser is missing.
     """
     try:
         import viser  # pyright: ignore[reportMissingImports]
@@ -43,7 +43,7 @@ def require() -> Any:
 
 
 class Session:
-    """Policy in its environment, without end: an episode that is over goes on, and goals may change at any time.
+    """Endless rollout of a policy: episodes do not end, and goals may change at any time.
 
     Args:
         policy: The policy.
@@ -51,12 +51,12 @@ class Session:
 
     Attributes:
         state: State of the environment.
-        observation: Last observation, as the policy sees it.
-        goal: Goal in the same form.
+        observation: Last observation, the policy's input.
+        goal: Goal, in the same form.
         goal_data: Poses of the robot at its goal.
 
     Raises:
-        RequestError: The task has no poses to show.
+        RequestError: The task has no poses to be shown.
     """
 
     def __init__(self, policy: Policy, seed: int = 0):
@@ -88,7 +88,7 @@ class Session:
         return float(goals.goal_distance(self.state.achieved_state, self.state.goal_state))
 
     def reset(self) -> None:
-        """Put the robot at a start; the goal stays."""
+        """Reset the robot to a random start; the goal is kept."""
         goal_state = self.state.goal_state if hasattr(self, "state") else None
         self.state, _ = self._begin(next(self._keys))
         if goal_state is not None:
@@ -96,15 +96,15 @@ class Session:
         self.observation, _ = self._look(self.state.data)
 
     def new_goal(self) -> None:
-        """Draw a goal as an episode does; the robot stays where it is."""
+        """Sample a goal as at the start of an episode; the robot keeps its pose."""
         _, goal_data = self._begin(next(self._keys))
         self._aim(goal_data)
 
     def place_goal(self, point: np.ndarray) -> None:
-        """Show the robot a goal at a place of its choice.
+        """Set the goal to a given point.
 
         Args:
-            point: [3], m in the world; clipped to `MjxGoalEnv.goal_box`.
+            point: [3] (m, world frame); clipped to `MjxGoalEnv.goal_box`.
         """
         assert self.env.goal_box is not None
         low, high = self.env.goal_box
@@ -116,18 +116,18 @@ class Session:
         self.state = self.state.replace(goal_state=goal_state)
 
     def step(self) -> None:
-        """Let the policy act once."""
+        """Take one control step with the policy."""
         self.state, self.observation = self._step(self._policy.parameters, self.state, self.observation, self.goal)
 
 
 class Page:
-    """Page of a session.
+    """Web page of a session.
 
     Args:
         server: `viser.ViserServer`.
         session: The session.
         title: Name of the policy.
-        out: File for recorded episodes, .gif or .mp4; the second one is numbered.
+        out: File for recorded episodes, .gif or .mp4; further ones are numbered.
     """
 
     def __init__(self, server: Any, session: Session, title: str, out: Path):
@@ -160,7 +160,7 @@ class Page:
         self._show_goal()
 
     def run(self) -> None:
-        """Act in real time while somebody looks, until an exception such as Ctrl-C."""
+        """Step in real time while there are visitors, until an exception such as Ctrl-C."""
         period = self._session.env.control_period
         while True:
             due = time.monotonic() + period
@@ -171,7 +171,7 @@ class Page:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def advance(self) -> None:
-        """Do what was asked for, act once, and show it."""
+        """Process pending requests, take one step, and show it."""
         goal = self._session.goal
         with contextlib.suppress(queue.Empty):
             while True:
@@ -183,7 +183,7 @@ class Page:
         self._show()
 
     def _add_handle(self) -> Any:
-        """Add the arrows that move the goal."""
+        """Add a handle for dragging the goal; return it."""
         low, high = self._session.env.goal_box or (np.zeros(3), np.zeros(3))
         limits = tuple((float(a), float(b)) for a, b in zip(low, high))
         size = 0.8 * float(np.mean(high - low))
@@ -194,7 +194,7 @@ class Page:
         return handle
 
     def drag(self, point: np.ndarray) -> None:
-        """Ask for a goal at a point [3] (m, world); of several since the last step the latest counts."""
+        """Request a goal at a point [3] (m, world frame); the latest request since the last step counts."""
         self._dragged = point
         self._asked.put(self._place)
 
@@ -227,7 +227,7 @@ class Page:
         self._status.content = f"**{'Reached' if reached else 'On its way'}**: {shown} from the goal\n\n{self._note}"
 
     def _drawn(self, image: Any) -> np.ndarray:
-        """Draw an image [C, H, W], colours beside depth: [H', W', 3] uint8."""
+        """Convert the newest image of an observation [C, H, W] for display, colours beside depth: [H', W', 3] uint8."""
         channels = np.shape(image)[0] // self._session.env.frame_stack
         rows = videos.image_rows(np.asarray(image)[:channels], self._depth_range)
         return np.concatenate([np.asarray(videos.enlarge(row, _SHOWN)) for _, row in rows], axis=1)
@@ -237,7 +237,7 @@ class Page:
         self._recorded, self._note = [], "Recording ..."
 
     def _record(self) -> None:
-        """Keep what the robot sees while an episode is recorded, and write it at its end."""
+        """Append the observation if an episode is being recorded, and write the video at its end."""
         if self._recorded is None:
             return
         session = self._session
@@ -253,7 +253,7 @@ class Page:
         path = _unused(self._out)
         try:
             videos.write_video(shown, path, max(0.04, session.env.control_period))
-        except OSError as error:  # the page goes on
+        except OSError as error:  # shown on the page, which continues
             self._note = f"Cannot write `{path}`: {error.strerror or error}"
             return
         self._note = f"Recorded: `{path}`"
@@ -275,7 +275,7 @@ def play_live(policy: Policy, title: str, out: Path) -> None:
 
     Args:
         policy: The policy.
-        title: Its name.
+        title: Name of the policy.
         out: See `Page`.
 
     Raises:
@@ -284,7 +284,7 @@ def play_live(policy: Policy, title: str, out: Path) -> None:
     viser = require()
     session = Session(policy)
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it prints a banner, asked or not
+        with contextlib.redirect_stdout(io.StringIO()):  # viser always prints a banner
             server = viser.ViserServer(host=HOST, port=PORT, label=title, verbose=False)
     except OSError as error:
         raise RequestError(

@@ -1,4 +1,4 @@
-"""`play --aux`: episodes of a run with the predictions of its auxiliary tasks."""
+"""`play --aux`: video of a run's episodes with the predictions of its auxiliary tasks."""
 
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,13 @@ from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 from jaxrl_vis.types import Batch, Episodes, TrainState
 
 SHOWN = ("autoencoder", "optical_flow", "egomotion")
-"""Auxiliary tasks whose predictions can be drawn."""
+"""Auxiliary tasks whose predictions can be shown."""
 
 
 def play_auxiliary(
     run_dir: Path | str, out: Path | str, episodes: int = 6, trust: bool = False, checkpoint: Choice = None
 ) -> None:
-    """Play episodes with the first seed of a run's checkpoint, and draw the predictions of its auxiliary tasks.
+    """Roll out the first seed of a run's checkpoint, and write a video of episodes and auxiliary predictions.
 
     Observation, goal, reconstruction, true and predicted optical flow, and the rotated image with its angle are shown side by
     side, as far as the run has the tasks. Predictions are those of the critic's heads.
@@ -40,7 +40,7 @@ def play_auxiliary(
         checkpoint: The checkpoint.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, no auxiliary task to show, or no way to write ``out``.
+        RequestError: There is no run, no usable checkpoint, no auxiliary task to show, or ``out`` cannot be written.
     """
     out = Path(out)
     videos.check_output(out)

@@ -28,7 +28,7 @@ from jaxrl_vis_envs.base import GoalEnv
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Policy:
-    """Trained actor without exploration, including normalisation. Create it with `load_policy`; call it, vmap it, scan it.
+    """Trained actor without exploration, including normalisation, created by `load_policy`. Compatible with vmap and scan.
 
     Attributes:
         env: The environment of its training, with the image size and all other options of the run.
@@ -89,7 +89,7 @@ class Policy:
         return jax.jit(act)
 
     def _check(self, name: str, value: Any) -> None:
-        """Raise a RequestError unless ``value`` has the form of an observation."""
+        """Raise a RequestError unless ``value`` has the shape and dtype of an observation."""
         spec = self.observation_spec
         shape, wanted = np.shape(value), tuple(spec.shape)
         if shape != wanted:
@@ -114,9 +114,9 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: Choice
 
     Args:
         run_dir: The run folder, a folder of `jaxrl-vis push`, or the name of a policy that comes with the package.
-        seed: Seed, for a run with several; None: the first.
-        checkpoint: Iteration of an existing checkpoint; ``best``: the one that ``best_by`` keeps; None: the newest valid one.
-        trust: Allow the run's own code, which a task ``module:Name`` executes; not needed for runs that were trained here.
+        seed: Seed, for a run with several; None for the first.
+        checkpoint: Iteration of a checkpoint, ``best`` for the best one by ``best_by``, or None for the newest valid one.
+        trust: Allow execution of the run's custom code (``module:Name``); not needed for runs that were trained here.
 
     Raises:
         RequestError: There is no run, no such seed or checkpoint, or no usable one; or its task is not available here, or is

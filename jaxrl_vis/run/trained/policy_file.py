@@ -1,4 +1,4 @@
-"""A policy's weights in one file beside config.json: a folder of these two can be loaded as a run can."""
+"""Weights of a policy in one file beside config.json: a folder with these two files can be loaded like a run."""
 
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -33,16 +33,16 @@ class Source(NamedTuple):
 
 
 def holds_policy(folder: Path) -> bool:
-    """Return True if a folder holds the weights of a policy and no checkpoints of its run."""
+    """Return True if a folder contains the weights of a policy, but no checkpoints of its run."""
     return (folder / FILE_NAME).is_file() and not (folder / "checkpoints").exists()
 
 
 def check_whole(run_dir: Path | str, use: str) -> None:
-    """Raise a `RequestError` if a folder holds a policy alone.
+    """Raise a `RequestError` if a folder contains only a policy.
 
     Args:
         run_dir: The folder.
-        use: Use that needs the rest of the learner, for the message.
+        use: Purpose that requires the whole learner, for the message.
     """
     if holds_policy(find(run_dir)):
         raise RequestError(f"{run_dir} holds a policy alone, and {use} needs the whole run: name that which it was made of")
@@ -60,7 +60,7 @@ def write(folder: Path, parameters: PolicyParams, source: Source, bits: Literal[
         folder: The folder.
         parameters: The parameters, float32.
         source: Their origin.
-        bits: Bits of a number. Observation statistics always keep 32: their sums exceed float16.
+        bits: Bits per number. Observation statistics always keep 32, because their sums exceed the range of float16.
 
     Raises:
         OSError: The file cannot be written.
@@ -96,11 +96,11 @@ def _source(folder: Path, about: dict[str, Any]) -> Source:
 
 
 def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
-    """Read a policy as a learner of one seed, whose agent is the policy's parameters.
+    """Read a policy as a learner of one seed whose agent consists of the policy's parameters.
 
     Args:
-        folder: A folder of `write`.
-        trainer: Trainer of the configuration in the folder, for a policy alone (`make_trainer`).
+        folder: Folder written by `write`.
+        trainer: Trainer of the folder's configuration, from `make_trainer` with ``policy_alone``.
 
     Raises:
         RequestError: The file is damaged, or belongs to another configuration.
@@ -128,6 +128,6 @@ def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
 
 
 def check_source(source: Source, seed: int | None = None, checkpoint: int | str | None = None) -> None:
-    """Raise a `RequestError` if another seed or checkpoint is asked for than the folder holds."""
+    """Raise a `RequestError` if the requested seed or checkpoint is not that of the folder."""
     if seed not in (None, source.seed) or checkpoint not in (None, source.iteration):
         raise RequestError(f"the folder holds the policy of seed {source.seed} after iteration {source.iteration} alone")

@@ -1,4 +1,4 @@
-"""Episodes that a trained run plays, for other programs."""
+"""Recording of episodes of a trained run, for other programs."""
 
 from pathlib import Path
 
@@ -14,16 +14,16 @@ from jaxrl_vis.run.trained.shipped import find
 
 
 def record_run(run_dir: Path | str, episodes: int = 50, seed: int = 0, trust: bool = False) -> Recordings:
-    """Play episodes without exploration, with the first seed of a run's newest valid checkpoint.
+    """Record episodes without exploration, with the first seed of a run's newest valid checkpoint.
 
     Args:
         run_dir: The run folder.
         episodes: N, number of episodes.
-        seed: Seed of their starts and goals: equal seeds record equal episodes.
-        trust: As of `restored_run.open_run`.
+        seed: Seed of the starts and goals: equal seeds give equal episodes.
+        trust: As in `restored_run.open_run`.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, or its observations are no images of one to four channels.
+        RequestError: There is no run, no usable checkpoint, or its image observations do not have one to four channels.
     """
     trainer = open_run(run_dir, keep_programs=True, trust=trust)
     restored, programs, env = load(trainer, run_dir), trainer.programs, trainer.env

@@ -1,6 +1,6 @@
-"""Use of trained runs, and of policies alone: evaluating them again, and playing episodes.
+"""Use of trained runs and policies: evaluation, and videos of episodes.
 
-A run is named by its folder, or by the name of a policy that comes with the package (`shipped`).
+A run is given by its folder, or by the name of a policy that comes with the package (`shipped`).
 """
 
 from pathlib import Path
@@ -27,8 +27,8 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
     Args:
         run_dir: The run folder.
         keep_programs: As in `make_trainer`; programs traced by the training are reused.
-        trust: Allow the run's own code, if its task is not one of this project (`jaxrl_vis.run.trust`).
-        **changes: Fields of `Config`.
+        trust: Allow execution of the run's custom code (`jaxrl_vis.run.trust`).
+        **changes: New values of fields of `Config`.
 
     Raises:
         RequestError: There is no run, its code is not trusted, or its trainer cannot be created any more.
@@ -44,7 +44,7 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
 
 
 Choice = int | Literal["best"] | None
-"""Checkpoint of a run: its iteration; ``best``: the one that `RunOptions.best_by` keeps; None: the newest valid one."""
+"""Checkpoint of a run: its iteration, ``best`` for the best one by `RunOptions.best_by`, or None for the newest valid one."""
 
 
 def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Restored:
@@ -102,15 +102,15 @@ def evaluate_run(
 
     Args:
         run_dir: The run folder.
-        episodes: Number of episodes; None: as during training.
-        keep_programs, trust: As of `open_run`.
+        episodes: Number of episodes; None for that of the training.
+        keep_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Returns:
         ``eval/success``, ``eval/goal_distance`` etc.: one number per seed.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, or too little memory for so many episodes.
+        RequestError: There is no run, no usable checkpoint, or too little memory for this number of episodes.
     """
     trainer = open_run(run_dir, keep_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir, checkpoint)
@@ -128,7 +128,7 @@ def play_run(
     trust: bool = False,
     checkpoint: Choice = None,
 ) -> None:
-    """Play episodes with the first seed of a run's checkpoint, and write a video.
+    """Roll out the first seed of a run's checkpoint, and write a video.
 
     Args:
         run_dir: The run folder.
@@ -136,11 +136,11 @@ def play_run(
         episodes: Number of episodes.
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
             variants.
-        keep_programs, trust: As of `open_run`.
+        keep_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Raises:
-        RequestError: There is no run, nothing usable in it, no image to show, or no way to write ``out``.
+        RequestError: There is no run, no usable checkpoint, no image to show, or ``out`` cannot be written.
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)

@@ -1,4 +1,4 @@
-"""Presentation of a run: the curve, and at the end a video and a summary. Only the first process makes them."""
+"""Presentation of a run's results: the curve, and finally a video and a summary. Only the first process creates them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -36,11 +36,11 @@ class Results:
         self._programs, self._folder, self._loggers, self._say = programs, folder, loggers, say
 
     def show(self, done: int, progress_now: Callable[[], Progress], recorded: dict[str, Any]) -> None:
-        """Draw the results of a finished run, and print a summary.
+        """Write the curve and video of a finished run, and print a summary.
 
         Args:
             done: Iterations completed.
-            progress_now: Returns the progress, with times up to the call.
+            progress_now: Returns the current progress.
             recorded: Images of the last evaluation, see `evaluate.make_evaluate`; unused if there are none.
         """
         self.draw_curve(done)

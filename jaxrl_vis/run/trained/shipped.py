@@ -2,7 +2,7 @@
 
     config.json  of the run        policy.safetensors  see `policy_file`        README.md  see `jaxrl_vis.run.pushed.card`
 
-Such a folder is used as a run folder is, by its name. Imports no JAX, so that the command line can look names up at once.
+Such a folder is used like a run folder, by its name. Imports no JAX, so that the command line can look up names quickly.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ def find(run: Path | str) -> Path:
     """Return the folder of a run, or that of a policy that comes with the package.
 
     Args:
-        run: The run folder, which need not exist; or the name of a policy, unless there is a run folder called so.
+        run: The run folder, which need not exist; or the name of a policy, unless a folder of that name exists.
     """
     is_name = isinstance(run, str | Path) and str(run) in names()
     return FOLDER / run if is_name and not (Path(run) / "config.json").exists() else Path(run)
@@ -36,5 +36,5 @@ def check(run: Path | str) -> None:
 
 
 def workplace(folder: Path) -> Path:
-    """Return the folder for what is made of a run: its own, or, of a policy of the package, one of its name right here."""
+    """Return the output folder of a run: the run folder or, for a policy of the package, its name in the current folder."""
     return Path(folder.name) if folder.parent == FOLDER else folder

@@ -22,7 +22,7 @@ LOST = "resume/replay_lost_at"
 
 _PLAYED = ("play.gif", "play.mp4", "play.html", "play.png", "play_aux.gif")
 _ASIDE = {DAMAGED: "damaged", FOREIGN: "another run's"}
-_SHOWN = 5  # entries of a list that a message quotes
+_SHOWN = 5  # maximum number of list entries quoted in a message
 
 
 @dataclasses.dataclass
@@ -57,7 +57,7 @@ class Expected:
 
 
 def listed(values: Iterable[Any]) -> str:
-    """Format the first few values, and the number of the others."""
+    """Format the first few values, and the number of further ones."""
     words = [str(value) for value in values]
     return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
 
@@ -67,7 +67,7 @@ def _is_figure(value: Any) -> bool:
 
 
 def _read_line(line: bytes) -> dict[str, Any] | str:
-    """Parse a row, or describe what is wrong with it."""
+    """Parse a row, or describe its fault."""
     try:
         row = json.loads(line.decode("utf-8"))
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors

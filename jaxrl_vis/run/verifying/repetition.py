@@ -232,7 +232,7 @@ def _compared(row: Mapping[str, Any]) -> Row:
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield names whose values are not written identically, with both values."""
+    """Yield the names of values that differ as JSON text, with both values."""
     compared = _compared(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
@@ -241,7 +241,7 @@ def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tu
 
 
 def _relative(value: Any, again: Any) -> float:
-    """Return the difference of two numbers relative to the larger one; infinite if one is not a number."""
+    """Return the difference of two numbers relative to the larger one; infinite if either value is not numeric."""
     if not (isinstance(value, int | float) and isinstance(again, int | float)):
         return math.inf
     return abs(value - again) / max(abs(value), abs(again)) if value != again else 0.0
