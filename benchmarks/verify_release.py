@@ -37,9 +37,10 @@ SMOKE = (
     ("jaxrl-vis push runs/smoke --to policy", "policy"),
     ("python -c \"import jaxrl_vis; print(jaxrl_vis.load_policy('policy').env_name)\"", "VisualReacher"),
     ("jaxrl-vis play fetch --episodes 1", "fetch/play.gif"),
-    ("python -c 'import jaxrl_vis.weighting as w; print(w.__name__)'", "jaxrl_vis.weighting"),
+    ("python ten_lines.py", "['depth', 'edges'] True"),
 )
-"""Commands of the smoke test, and the text that the output of each must contain."""
+"""Commands of the smoke test, and the text that the output of each must contain; ten_lines.py is the first example of
+docs/weighting.md."""
 
 
 def commit_time(checkout: Path) -> int:
@@ -129,8 +130,14 @@ def bill_of_materials(python: Path, checkout: Path, path: Path) -> None:
     path.write_text(json.dumps(bill, indent=1) + "\n")
 
 
+def first_example(page: Path) -> str:
+    """Return the first Python block of a page."""
+    return page.read_text().partition("```python\n")[2].partition("```")[0]
+
+
 def smoke_test(shell: Shell, wheel: Path) -> None:
     """Install a wheel into a new environment, and run the commands of `SMOKE`."""
+    (shell.folder / "ten_lines.py").write_text(first_example(CHECKOUT / "docs" / "weighting.md"))
     shell.type("python3 -m venv venv")
     shell.activate(shell.folder / "venv")
     shell.type(f"pip install --quiet {wheel}")
