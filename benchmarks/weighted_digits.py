@@ -138,7 +138,7 @@ def make_training(problem: Problem, weighting: jw.Weighting) -> Callable[[jax.Ar
     def run(rate: jax.Array, seed: jax.Array) -> dict[str, jax.Array]:
         params_key, state_key, data_key = jax.random.split(jax.random.key(seed), 3)
         params = initialize(params_key, problem)
-        state = weighting.init(tuple(problem.classes), params["trunk"], params)
+        state = weighting.init(tuple(problem.classes), params["trunk"], *([params] if weighting.hold else []))
         state = state if state.key is None else state.replace(key=state_key)
 
         def step(carry: Any, key: jax.Array) -> tuple[Any, None]:
