@@ -49,7 +49,11 @@ def shows_images(shape: Sequence[int]) -> bool:
 
 
 def first_seed(images: dict[str, Any]) -> EpisodeImages:
-    """Return the first seed's images of an evaluation, [S, K, ...] arrays on any device, on the host."""
+    """Copy the first seed's images of an evaluation to the host.
+
+    Args:
+        images: ``frames``, ``goals`` and ``success`` as in `EpisodeImages`, with a leading axis of seeds, on any device.
+    """
     first = {name: np.asarray(values)[0] for name, values in images.items()}
     return EpisodeImages(first["frames"], first["goals"], first["success"])
 

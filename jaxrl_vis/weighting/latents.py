@@ -97,7 +97,13 @@ class Through:
 
 
 def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], picked: Params, *args: Any) -> Through:
-    """Compute latents of the shared parameters ``picked``; ``functions`` as in `gradients.weighted_grad`."""
+    """Compute latents and their pullbacks to the shared parameters.
+
+    Args:
+        functions: ``encode`` of `gradients.weighted_grad`.
+        picked: Shared parameters.
+        *args: Further arguments of ``functions``.
+    """
     has_names = isinstance(functions, Mapping)
     named = functions if isinstance(functions, Mapping) else {_ALL: functions}
     of_picked = {group: (lambda picked, encode=encode: encode(picked, *args)) for group, encode in named.items()}

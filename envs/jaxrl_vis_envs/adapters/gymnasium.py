@@ -15,7 +15,8 @@ Observations are dictionaries:
     goal_pixels     [H, W, C] uint8, goal image (image tasks only)
 
 Goals are states, not images, so that ``compute_reward`` is vectorised and correct for goals substituted by a learner (hindsight
-relabelling). To restrict an agent to images, select those two keys with `gymnasium.wrappers.FilterObservation`.
+relabelling). To restrict an agent to images, select ``pixels`` and ``goal_pixels`` with
+`gymnasium.wrappers.FilterObservation`.
 
 All episodes have the same length and end by truncation, never by termination.
 """

@@ -201,7 +201,7 @@ def make_layout(config: Config) -> Layout:
         config: Configuration of the run, of which ``devices``, ``data_devices`` and ``seeds`` are used.
 
     Raises:
-        RequestError: There are too few devices.
+        RequestError: There are too few devices, or a run of several processes would leave some of them unused.
     """
     if config.run.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE

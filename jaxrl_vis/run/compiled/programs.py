@@ -250,7 +250,8 @@ class Programs:
         return self._rollout.evaluate(self.compiled("play"), train, keys, self.config.run.eval_episodes, self.env.frame_stack)
 
     def record(self, train: TrainState, key: jax.Array, count: int) -> list[Any]:
-        """Roll out episodes without noise, with the program of training rollouts; return their parts (`rollout_parts.Played`).
+        """Roll out episodes without exploration noise, with the program of training rollouts; return their parts
+        (`rollout_parts.Played`).
 
         Args:
             train: The learner, [S, ...].

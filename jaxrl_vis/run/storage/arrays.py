@@ -120,7 +120,11 @@ def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
 
 
 def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
-    """Return the restore target for orbax: an array on the first device, or one on the host to be distributed later."""
+    """Return orbax's restore target for an array that was saved with ``shape``.
+
+    This is ``expected`` if it has that shape and lies on a single device, else a NumPy array of the saved shape, which is
+    restored on the host and distributed later.
+    """
     if tuple(shape) == expected.shape and isinstance(expected.sharding, jax.sharding.SingleDeviceSharding):
         return expected
     return np.broadcast_to(np.zeros((), expected.dtype), tuple(shape))

@@ -23,7 +23,7 @@ def record_run(run_dir: Path | str, episodes: int = 50, seed: int = 0, trust: bo
         trust: As in `restored_run.open_run`.
 
     Raises:
-        RequestError: There is no run, no usable checkpoint, or its image observations do not have one to four channels.
+        RequestError: There is no run or no usable checkpoint, or the task's images do not have 1, 3 or 4 channels per frame.
     """
     trainer = open_run(run_dir, keep_programs=True, trust=trust)
     restored, programs, env = load(trainer, run_dir), trainer.programs, trainer.env

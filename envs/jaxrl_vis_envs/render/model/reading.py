@@ -309,7 +309,8 @@ def lights(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return arrays and static properties of the active lights. Keys as in `Scene`.
 
-    Image lights, which MuJoCo's renderer does not support, are ignored; so are point lights unless ``points``.
+    Image lights, which MuJoCo's renderer does not support, are ignored; so are point lights unless ``points``. At most
+    `MAX_LIGHTS` are used, the headlight first, then the model's in order.
     """
     head = mj_model.vis.headlight
     known = mj_model.light_type != mujoco.mjtLightType.mjLIGHT_IMAGE

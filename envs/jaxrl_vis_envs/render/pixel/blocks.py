@@ -88,7 +88,7 @@ def _half_count(pixels: int) -> int:
 
 
 def scan(function: Callable, *pixels: Any) -> Any:
-    """Apply ``function``, from pytrees of arrays [P] to pytrees of arrays [P], block by block to pytrees of [blocks, P]."""
+    """Apply ``function``, which takes and returns pytrees of arrays [P], to each block of pytrees of [blocks, P]; stack results."""
     if _shape(pixels)[0] == 1:
         first = jax.tree.map(lambda plane: plane[0], pixels)
         return jax.tree.map(lambda plane: plane[None], function(*first))

@@ -38,7 +38,8 @@ class UnitShapes(NamedTuple):
 
     Attributes:
         origin: [G, 3] float32, position of the camera in the shape's frame.
-        axes: [G, 3, 3] float32, 1/metres (rotation from the camera's frame, then division by the half-sizes).
+        axes: [G, 3, 3] float32, rotation from the camera's frame (the identity for untextured spheres), then division by the
+            half-sizes: 1/metres, but unitless for meshes and height fields, which are not scaled.
         extra: [G] float32. Sphere: radius in metres. Capsule: half-length over radius. Otherwise unused.
         extra_square: [G] float32. Sphere and capsule: squared radius in square metres. Otherwise unused.
         ball: [G, 4] float32, metres: bounding sphere, centre in the camera's frame and radius. Unused for a mesh.

@@ -29,7 +29,7 @@ class StalkSegments:
     """Chords of stalks in one pair or in several.
 
     Attributes:
-        middle: [N, 3] float64, centre of the stalk at each chord, m.
+        middle: [N, 3] float64, centre of the stalk at each chord in the robot's frame (`cloud`), m.
         thickness: [N] float64, diameter of the stalk, m.
         frame: [N] int, index of the pair.
         piece: [N] int, number of the piece: chords of one pair that are connected from row to row.

@@ -32,7 +32,10 @@ class Cone(NamedTuple):
     is_stuck: Any
 
     def curvature(self) -> Matrix:
-        """Return the cost's second derivatives with respect to the rows' residuals; 0 outside the middle zone."""
+        """Return second derivatives of the middle zone's cost with respect to the rows' residuals; 0 in the other zones.
+
+        The caller adds the stiffness of the bottom zone.
+        """
         friction, safe = self.friction, jnp.maximum(self.tangent, TINY)
         gap = self.normal - friction * self.tangent
         units = [part / safe for part in self.scaled[1:]]
