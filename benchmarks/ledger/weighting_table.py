@@ -74,7 +74,7 @@ def digits_table(results: Path) -> str | None:
         return None
     record = json.loads(path.read_text())
     columns = {title: _of_problem(rows) for title, rows in record["problems"].items()}
-    names = list(dict.fromkeys(name for column in columns.values() for name in column))
+    names = list(dict.fromkeys(row["method"] for rows in record["problems"].values() for row in rows))
     lines = ["| method | " + " | ".join(f"`{title}`" for title in columns) + " |", "|---|" + "---|" * len(columns)]
     lines += [f"| `{name}` | " + " | ".join(column.get(name, "") for column in columns.values()) + " |" for name in names]
     seeds = len(next(iter(record["problems"].values()))[0]["test"])

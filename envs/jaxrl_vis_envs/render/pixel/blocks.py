@@ -88,7 +88,12 @@ def _half_count(pixels: int) -> int:
 
 
 def scan(function: Callable, *pixels: Any) -> Any:
-    """Apply ``function``, which takes and returns pytrees of arrays [P], to each block of pytrees of [blocks, P]; stack results."""
+    """Apply ``function`` to each block of pytrees [blocks, P], one after another, and stack the results.
+
+    Args:
+        function: Takes and returns pytrees of arrays [P].
+        *pixels: Pytrees of arrays [blocks, P].
+    """
     if _shape(pixels)[0] == 1:
         first = jax.tree.map(lambda plane: plane[0], pixels)
         return jax.tree.map(lambda plane: plane[None], function(*first))
