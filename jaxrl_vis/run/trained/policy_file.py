@@ -45,7 +45,7 @@ def check_whole(run_dir: Path | str, use: str) -> None:
         use: Purpose that requires the whole learner, for the message.
     """
     if holds_policy(find(run_dir)):
-        raise RequestError(f"{run_dir} holds a policy alone, and {use} needs the whole run: name that which it was made of")
+        raise RequestError(f"{run_dir} holds a policy alone, and {use} needs the whole run: name the run folder")
 
 
 def _named(parameters: PolicyParams) -> dict[str, Any]:
