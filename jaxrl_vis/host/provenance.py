@@ -25,8 +25,8 @@ NOT_INSTALLED = "not installed"
 CHECKOUT = Path(__file__).resolve().parents[2]
 """Folder that holds both packages: the checkout, or site-packages for an installed copy."""
 
-# Files that can affect results. Changed records and run folders do not make a checkout dirty.
-_CODE = ("jaxrl_vis", "envs", "benchmarks", "pyproject.toml", ":!benchmarks/results")
+# Files that can affect results. Changed records, run folders and shipped policies do not make a checkout dirty.
+_CODE = ("jaxrl_vis", "envs", "benchmarks", "pyproject.toml", ":!benchmarks/results", ":!jaxrl_vis/pretrained")
 
 
 def git(*arguments: str, folder: Path = CHECKOUT) -> str | None:

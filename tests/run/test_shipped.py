@@ -144,7 +144,7 @@ def test_policies_of_the_package_are_small_and_their_cards_true(name: str) -> No
     for figure in (
         f"{row[1]} steps",
         f"{row[2]} ({low.strip()} to {high.strip()})",
-        f"of {row[3]} fresh",
+        f"of {int(row[3]):,} fresh",
         config.environment.env,
     ):
         assert figure in described
