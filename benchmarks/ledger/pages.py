@@ -49,7 +49,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/phenotyping.md": {"lenses": stalks_table.lens_table, "coverage": stalks_table.coverage_table},
-    "docs/pixels.md": {"tasks": pixels_table.tasks_table},
+    "docs/pixels.md": {"tasks": pixels_table.tasks_table, "training": pixels_table.training_table},
     "docs/where_it_ran.md": {"platforms": platforms_table.platforms_table, "not run": platforms_table.not_run_table},
     "docs/weighting.md": {
         "digits": weighting_table.digits_table,

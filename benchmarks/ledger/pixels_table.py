@@ -1,4 +1,4 @@
-"""Table of docs/pixels.md: MuJoCo Playground's tasks, written from the records of `benchmarks.pixels`."""
+"""Tables of docs/pixels.md: MuJoCo Playground's tasks and training from their images, from the records of `benchmarks.pixels`."""
 
 import json
 from pathlib import Path
@@ -9,6 +9,7 @@ from jaxrl_vis.bench.record import load
 
 _PARITY = "pixels_parity.json"
 _SPEED = {"two cores": "pixels-amd-epyc-2-cores.json", "H100": "pixels-nvidia-h100-80gb-hbm3-x1.json"}
+_TARGET = "pixels/speed_to_"
 _MEASURES = (
     ("segmentation", "segmentation, %", 100.0, 2),
     ("matched", "worst match", 1.0, 3),
@@ -28,6 +29,31 @@ def tasks_table(results: Path) -> str | None:
     for row in rows:
         cells = [row["task"], f"`{row['camera']}`", *(_cell(row, *measure) for measure in _MEASURES)]
         cells += [speed.get(row["task"], "") for speed in speeds.values()]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def training_table(results: Path) -> str | None:
+    """Write environment steps and times of `benchmarks.pixels.train` up to the targets, as Markdown; None without records."""
+    records = [record for record in load(results / _SPEED["H100"]) if record["name"].startswith(_TARGET)]
+    if not records:
+        return None
+    head = ["task", "target", "reached", "steps", "training, s", "with evaluations, s", "last evaluation", "revision"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for record in records:
+        details, target = record["details"], float(record["name"].removeprefix(_TARGET))
+        measure = next(name for name in details["evaluations"][0] if name not in ("env_steps", "wall_s", "training_s"))
+        last = details["evaluations"][-1]
+        cells = [
+            record["config"]["task"],
+            f"{measure} {target:g}",
+            f"{details[measure]:g}",
+            f"{details['env_steps']:,}",
+            f"{details['training_s']:.0f}",
+            f"{details['wall_s']:.0f}",
+            f"{last[measure]:g} after {last['env_steps']:,}",
+            record["revision"],
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
