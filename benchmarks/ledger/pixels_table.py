@@ -1,4 +1,4 @@
-"""Tables of docs/pixels.md: MuJoCo Playground's tasks and training from their images, from the records of `benchmarks.pixels`."""
+"""Tables of docs/pixels.md: Playground's tasks and training from their images, from the records of `benchmarks.pixels`."""
 
 import json
 from pathlib import Path
