@@ -28,6 +28,8 @@ TARGETS = 16
 """Output size of each head."""
 PASSES = 10
 """Calls of the function per timing."""
+BUDGET = 1.0
+"""Time limit for the timings of a function, s; TorchJD's solvers on the host take up to a second a call."""
 METHODS = tuple(name for name in jw.WEIGHTINGS if name not in ("none", "none_log", "fixed", "ol_aux_ablation"))
 
 
@@ -81,11 +83,13 @@ def losses_of(params: Any, features: jax.Array, batch: dict[str, jax.Array]) -> 
 
 
 def time_call(function: Callable[..., Any], arguments: tuple[Any, ...], repeats: int) -> float:
-    """Return the median time of a call, s, without compilation."""
+    """Return the median time of a call, s, without compilation, of up to ``repeats`` timings within about `BUDGET`."""
     call = jax.jit(function)
     jax.block_until_ready(call(*arguments))
-    seconds = []
-    for _ in range(repeats):
+    seconds, end = [], time.perf_counter() + BUDGET
+    for count in range(repeats):
+        if count >= 3 and time.perf_counter() > end:
+            break
         started = time.perf_counter()
         result = None
         for _ in range(PASSES):
@@ -119,27 +123,49 @@ def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
 
 
 def measure_all(size: Size, python: Path | None, results: Path) -> int:
-    """Time all methods on both sides, print a table and write the record; return the exit status."""
+    """Time all methods on both sides, print a table and update the record after each number of losses; return the exit status.
+
+    The record keeps numbers of losses that are not measured again, if device, versions and sizes are the same.
+    """
+    path = results_path("weighting_cost", results)
+    for count in size.losses:
+        theirs = time_peer(size, count, python)
+        rows: list[dict[str, Any]] = []
+        for name in METHODS:
+            rows += (measured := time_method(name, size, count))
+            print(
+                *(f"{row['method']:16}{count:4} {row['what']:16}{1e6 * row['seconds']:10.0f} us" for row in measured), sep="\n"
+            )
+        for row in theirs["rows"]:
+            print(f"TorchJD {row['method']:16}{count:4} {row['what']:16}{1e6 * row['seconds']:10.0f} us", flush=True)
+        update(path, size, {"ours": rows, "torchjd": theirs["rows"]}, {**provenance.versions(), **theirs["versions"]})
+    return 0
+
+
+def time_peer(size: Size, count: int, python: Path | None) -> dict[str, Any]:
+    """Return TorchJD's rows for K losses and its versions; none without its interpreter."""
     from benchmarks.peers.torchjd.__main__ import run_peer
 
+    if python is None:
+        return {"rows": [], "versions": {}}
+    settings = {**dataclasses.asdict(size), "losses": [count], "targets": TARGETS, "passes": PASSES, "budget": BUDGET}
     with tempfile.TemporaryDirectory() as folder:
-        found = Path(folder) / "cost.json"
-        theirs: dict[str, Any] = {"rows": [], "versions": {}}
-        if python is not None:
-            settings = {**dataclasses.asdict(size), "targets": TARGETS, "passes": PASSES}
-            run_peer(python, "peer_cost.py", json.dumps(settings), str(found))
-            theirs = json.loads(found.read_text())
-    rows = []
-    for count in size.losses:
-        for name in METHODS:
-            rows += time_method(name, size, count)
-            print(
-                *(f"{row['method']:16}{row['losses']:4} {row['what']:16}{1e6 * row['seconds']:10.0f} us" for row in rows[-3:]),
-                sep="\n",
-            )
-    for row in theirs["rows"]:
-        print(f"TorchJD {row['method']:16}{row['losses']:4} {row['what']:16}{1e6 * row['seconds']:10.0f} us")
-    record = {"device": provenance.device_name(), "versions": {**provenance.versions(), **theirs["versions"]}}
-    record |= {"size": dataclasses.asdict(size), "ours": rows, "torchjd": theirs["rows"]}
-    write_atomically(results_path("weighting_cost", results), json.dumps(record, indent=1) + "\n")
-    return 0
+        path = Path(folder) / "cost.json"
+        run_peer(python, "peer_cost.py", json.dumps(settings), str(path))
+        return json.loads(path.read_text())
+
+
+def update(path: Path, size: Size, rows: dict[str, list[dict[str, Any]]], versions: dict[str, Any]) -> None:
+    """Replace the rows of the numbers of losses in ``rows`` in the record, or start it anew if its conditions differ."""
+    sizes = {**dataclasses.asdict(size), "losses": []}
+    empty = {"device": provenance.device_name(), "versions": versions, "size": sizes, "ours": [], "torchjd": []}
+    record = json.loads(path.read_text()) if path.exists() else empty
+    if any(record[name] != empty[name] for name in ("device", "versions")) or {**record["size"], "losses": []} != sizes:
+        record = empty
+    fresh = {row["losses"] for side in rows.values() for row in side}
+    for side, measured in rows.items():
+        remaining = [row for row in record[side] if row["losses"] not in fresh]
+        record[side] = sorted(remaining + measured, key=lambda row: row["losses"])
+    record["size"]["losses"] = sorted({*record["size"]["losses"], *fresh})
+    record["revision"] = provenance.revision()
+    write_atomically(path, json.dumps(record, indent=1) + "\n")

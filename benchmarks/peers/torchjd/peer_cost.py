@@ -44,12 +44,14 @@ def wait() -> None:
         torch.cuda.synchronize()
 
 
-def time_call(function: Callable[[], Any], repeats: int, passes: int) -> float:
-    """Return the median time of a call, s."""
+def time_call(function: Callable[[], Any], repeats: int, passes: int, budget: float) -> float:
+    """Return the median time of a call, s, of up to ``repeats`` timings, at least three, within about ``budget`` seconds."""
     function()
     wait()
-    seconds = []
-    for _ in range(repeats):
+    seconds, end = [], time.perf_counter() + budget
+    for count in range(repeats):
+        if count >= 3 and time.perf_counter() > end:
+            break
         started = time.perf_counter()
         for _ in range(passes):
             function()
@@ -91,7 +93,7 @@ def make_step(
 def main() -> None:
     """Time all methods and write the rows."""
     settings = json.loads(sys.argv[1])
-    repeats, passes, rows = settings["repeats"], settings["passes"], []
+    timing, rows = (settings["repeats"], settings["passes"], settings["budget"]), []
     for count in settings["losses"]:
         trunk, heads, inputs, targets = problem(settings, count)
 
@@ -102,8 +104,8 @@ def main() -> None:
             aggregator, weighting = make(count)
             alone = functools.partial(aggregator, jacobian) if weighting is None else functools.partial(weighting, gramian)
             row = {"method": name, "losses": count}
-            rows.append(row | {"what": "alone", "seconds": time_call(alone, repeats, passes)})
-            rows.append(row | {"what": "step", "seconds": time_call(functools.partial(step, aggregator), repeats, passes)})
+            rows.append(row | {"what": "alone", "seconds": time_call(alone, *timing)})
+            rows.append(row | {"what": "step", "seconds": time_call(functools.partial(step, aggregator), *timing)})
     versions = {"torchjd": version("torchjd"), "torch": torch.__version__}
     with open(sys.argv[2], "w") as file:
         json.dump({"device": str(DEVICE), "versions": versions, "rows": rows}, file)
