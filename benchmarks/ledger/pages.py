@@ -8,6 +8,7 @@ from benchmarks.claims import pages as claims
 from benchmarks.ledger import (
     ablations,
     comparison_table,
+    exported_table,
     pixels_table,
     platforms_table,
     render_table,
@@ -49,6 +50,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/phenotyping.md": {"lenses": stalks_table.lens_table, "coverage": stalks_table.coverage_table},
+    "docs/export.md": {"policies": exported_table.exported_table},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table, "training": pixels_table.training_table},
     "docs/where_it_ran.md": {"platforms": platforms_table.platforms_table, "not run": platforms_table.not_run_table},
     "docs/weighting.md": {
