@@ -7,7 +7,7 @@ processes.jsonl has one line per process that has trained the run:
 This process resumed from iteration 35 with the replay, and has begun 48 more iterations. The line is overwritten in place at
 each iteration, without waiting for the disk: data written by a process survives its end, and a power cut loses only the last
 seconds. An iteration counts as begun when its gradient steps are dispatched to the device, so the goodput reported for a killed
-run is an upper bound.
+run is a lower bound.
 """
 
 import dataclasses
