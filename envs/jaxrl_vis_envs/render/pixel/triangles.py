@@ -51,7 +51,7 @@ def nearest_triangle(
         nearer = met < best
         number = jax.lax.bitcast_convert_type(met, jnp.int32) & _NUMBER
         best, best_index = jnp.where(nearer, met, best), jnp.where(nearer, cluster * meshes.CLUSTER + number, best_index)
-        cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32), dtype=jnp.int32), last)
+        cluster = jnp.minimum(_kth(counts, step), last)
         met = jnp.where(step < counts[last], _intersect_cluster(scene, unit, cluster, rays), far)
         return step + 1, best, best_index, met, cluster
 
@@ -75,6 +75,19 @@ def _candidates(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Ar
         return candidates & (owner == only)
     opaque = np.array(scene.transparent) == reading.SOLID
     return candidates & jnp.asarray(opaque)[owner]
+
+
+def _kth(counts: jax.Array, step: jax.Array) -> jax.Array:
+    """Return the index of the first of the cumulative ``counts`` [K] that exceeds ``step``, K if there is none; [] int32.
+
+    A bisection: a count of all that do not exceed it would read the whole array for every cluster.
+    """
+    low, size = jnp.zeros((), jnp.int32), counts.shape[0]
+    for bit in reversed(range(size.bit_length())):
+        probe = low + (1 << bit)
+        below = counts.at[jnp.minimum(probe, size) - 1].get(mode="promise_in_bounds") <= step
+        low = jnp.where((probe <= size) & below, probe, low)
+    return low
 
 
 def next_triangle(
@@ -104,7 +117,7 @@ def next_triangle(
 
     def advance(state: tuple) -> tuple:
         step, depths, rows = state
-        cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32), dtype=jnp.int32), last)
+        cluster = jnp.minimum(_kth(counts, step), last)
         first = scene.cluster_places[cluster][1]
         # Clusters are in the order of their triangles: one found in an earlier cluster precedes all in this one.
         crossings = zip(
