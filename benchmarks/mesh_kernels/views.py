@@ -187,7 +187,7 @@ def tile_lists(views: Views, size: int, tile: tuple[int, int], most: int, interp
     outs = [jax.ShapeDtypeStruct((images, tiles, most + CHUNK), jnp.int32), jax.ShapeDtypeStruct((images, tiles), jnp.int32)]
 
     def kernel(near_ref: Any, rectangle_ref: Any, list_ref: Any, count_ref: Any) -> None:
-        tile_index = pl.program_id(1)
+        tile_index = pl.program_id(0)
         top, left = jax.lax.div(tile_index, np.int32(across)) * high, jax.lax.rem(tile_index, np.int32(across)) * wide
         lane = jax.lax.broadcasted_iota(jnp.int32, (CHUNK,), 0)
 
@@ -213,11 +213,11 @@ def tile_lists(views: Views, size: int, tile: tuple[int, int], most: int, interp
     return kernel_call(
         kernel,
         out_shape=outs,
-        grid=(images, tiles),
-        in_specs=[pl.BlockSpec((None, count), lambda image, _: (image, 0))] * 2,
+        grid=(tiles, images),
+        in_specs=[pl.BlockSpec((None, count), lambda _, image: (image, 0))] * 2,
         out_specs=[
-            pl.BlockSpec((None, None, most + CHUNK), lambda image, tile: (image, tile, 0)),
-            pl.BlockSpec((None, None), lambda image, tile: (image, tile)),
+            pl.BlockSpec((None, None, most + CHUNK), lambda tile, image: (image, tile, 0)),
+            pl.BlockSpec((None, None), lambda tile, image: (image, tile)),
         ],
         compiler_params=plgpu.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,

@@ -13,7 +13,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
 from benchmarks.mesh_kernels.structure import Structure
-from benchmarks.mesh_kernels.views import FAR, Views, tile_lists
+from benchmarks.mesh_kernels.views import Views, tile_lists
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 _TINY = 1e-20
@@ -68,7 +68,7 @@ def tile_pixels(size: int, tile: tuple[int, int], half: float) -> tuple[Any, Any
     """Return row, column and index [P] int32 of a tile's pixels, and their rays' u and v [P] float32 at 1 m."""
     high, wide = tile
     across = np.int32(size // wide)
-    index = pl.program_id(1)
+    index = pl.program_id(0)
     lane = jax.lax.broadcasted_iota(jnp.int32, (high * wide,), 0)
     row = jax.lax.div(index, across) * high + jax.lax.div(lane, np.int32(wide))
     column = jax.lax.rem(index, across) * wide + jax.lax.rem(lane, np.int32(wide))
@@ -130,7 +130,6 @@ def _lane_kernel(*refs: Any, structure: Structure, settings: Settings, size: int
     _, _, pixel, u, v = tile_pixels(size, settings.tile, half)
     row, column = jax.lax.div(pixel, np.int32(size)), jax.lax.rem(pixel, np.int32(size))
     lanes = pixel.shape
-    ones = jnp.ones(lanes, bool)
     end, leaf_size = structure.steps, structure.leaf
     count = jnp.minimum(ins.count[...], settings.most)
     zero, izero = jnp.zeros(lanes, jnp.float32), jnp.zeros(lanes, jnp.int32)
@@ -198,7 +197,7 @@ def _lane_kernel(*refs: Any, structure: Structure, settings: Settings, size: int
     begin_state = (izero, izero + end, izero, (*(zero,) * 12, izero, izero), best, izero - 1, izero)
     state = jax.lax.while_loop(going, advance, begin_state)
     best, hit_slot, hit_row = state[4:]
-    shade(ins, outs, pixel, ones, best, hit_slot, [hit_row, None])
+    shade(ins, outs, pixel, best, hit_slot, hit_row)
 
 
 def _block_kernel(*refs: Any, structure: Structure, settings: Settings, size: int, half: float, znear: float) -> None:
@@ -246,25 +245,28 @@ def _block_kernel(*refs: Any, structure: Structure, settings: Settings, size: in
         return (state[0] < count) & (ins.near[jnp.where(state[0] < count, ins.list[place], 0)] < jnp.max(state[1]))
 
     state = jax.lax.while_loop(going, one_instance, (jnp.int32(0), best, izero - 1, izero))
-    shade(ins, outs, pixel, jnp.ones(lanes, bool), *state[1:3], [state[3], None])
+    shade(ins, outs, pixel, *state[1:])
 
 
-def shade(ins: Any, outs: Any, pixel: jax.Array, inside: jax.Array, depth: jax.Array, slot: jax.Array, row: list) -> None:
+def shade(
+    ins: Refs, outs: Any, pixel: jax.Array, depth: jax.Array, slot: jax.Array, row: jax.Array, by_row: bool = False
+) -> None:
     """Store depth, geom and a colour: that of the geom, darker the more its normal is turned away from the camera's axis.
 
     Args:
         ins: Blocks of memory.
         outs: Depth, geom and colour.
         pixel: [P] int32.
-        inside: [P] bool.
         depth: [P] float32, m.
         slot: [P] int32, instance in ``ins``, -1 for the floor and the sky.
-        row: [P] int32, row of the triangle in ``ins.maps``; and None.
+        row: [P] int32, triangle in ``ins.maps``.
+        by_row: ``ins.maps`` has a row, not a column, for each triangle.
     """
     hit = slot >= 0
-    place = jnp.where(hit, slot, 0)
+    place, row = jnp.where(hit, slot, 0), jnp.where(hit, row, 0)
     pose = gather_pose(ins, place, hit)
-    height = [gather(ins.maps, jnp.where(hit, row[0], 0), hit, column) for column in (8, 9, 10)]
+    entries = [jnp.full(row.shape, entry, jnp.int32) for entry in (8, 9, 10)]
+    height = [plgpu.load(ins.maps.at[(row, e) if by_row else (e, row)], mask=hit, other=0.0) for e in entries]
     normal = [sum(pose[3 * i + j] * height[i] for i in range(3)) for j in range(3)]
     length = jax.lax.rsqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] + 1e-20)
     facing = jnp.where(hit, jnp.abs(normal[2]) * length, 1.0)
@@ -306,30 +308,46 @@ def draw(
         The images, and the largest number of instances in a tile's list.
     """
     lists, counts = tile_lists(views, size, settings.tile, settings.most, interpret)
-    images, padded = views.near.shape
-    tiles, pixels = lists.shape[1], size * size
-    inputs = Refs(
-        views.near, views.rectangle, views.pose, views.mesh, views.octant, views.ids, views.depth, views.floor, lists, counts,
-        arrays["nodes"], arrays["maps"], arrays["rgba"],
-    )  # fmt: skip
-
-    def own(*shape: int) -> pl.BlockSpec:
-        return pl.BlockSpec((None, *shape), lambda image, tile: (image, *(0,) * len(shape)))
-
-    def whole(array: jax.Array) -> pl.BlockSpec:
-        return pl.BlockSpec(array.shape, lambda image, tile: (0,) * array.ndim)
-
-    specs = Refs(
-        own(padded), own(padded), own(padded, 12), own(padded), own(padded), own(padded), own(pixels), own(pixels),
-        pl.BlockSpec((None, None, lists.shape[2]), lambda image, tile: (image, tile, 0)),
-        pl.BlockSpec((None, None), lambda image, tile: (image, tile)),
-        whole(inputs.nodes), whole(inputs.maps), whole(inputs.rgba),
-    )  # fmt: skip
+    inputs, specs = inputs_and_specs(views, lists, counts, (arrays["nodes"], arrays["maps"], arrays["rgba"]), size)
+    chosen = _block_kernel if by_block else _lane_kernel
 
     def kernel(*refs: Any) -> None:
-        chosen = _block_kernel if by_block else _lane_kernel
         chosen(*refs, structure=structure, settings=settings, size=size, half=half, znear=znear)
 
+    name = "block_walk" if by_block else "lane_walk"
+    return launch(kernel, inputs, specs, lists, size, settings.warps, interpret, name), jnp.max(counts)
+
+
+def own(*shape: int) -> pl.BlockSpec:
+    """Return a block: an image's part of an array [I, *shape]."""
+    return pl.BlockSpec((None, *shape), lambda tile, image: (image, *(0,) * len(shape)))
+
+
+def whole(array: jax.Array) -> pl.BlockSpec:
+    """Return a block: all of an array."""
+    return pl.BlockSpec(array.shape, lambda tile, image: (0,) * array.ndim)
+
+
+def inputs_and_specs(
+    views: Views, lists: jax.Array, counts: jax.Array, tables: tuple, size: int
+) -> tuple[list[jax.Array], list[pl.BlockSpec]]:
+    """Return the arrays of `Refs`, and their blocks; ``tables`` are ``nodes``, ``maps`` and ``rgba``."""
+    padded, pixels = views.near.shape[1], size * size
+    kept = (views.near, views.rectangle, views.pose, views.mesh, views.octant, views.ids, views.depth, views.floor)
+    listed = [
+        pl.BlockSpec((None, None, lists.shape[2]), lambda tile, image: (image, tile, 0)),
+        pl.BlockSpec((None, None), lambda tile, image: (image, tile)),
+    ]
+    specs = [own(padded), own(padded), own(padded, 12), own(padded), own(padded), own(padded), own(pixels), own(pixels)]
+    return [*kept, lists, counts, *tables], [*specs, *listed, *map(whole, tables)]
+
+
+def launch(
+    kernel: Any, inputs: list, specs: list, lists: jax.Array, size: int, warps: int, interpret: bool, name: str
+) -> Images:
+    """Run one program per tile and image."""
+    images, tiles = lists.shape[:2]
+    pixels = size * size
     outs = kernel_call(
         kernel,
         out_shape=[
@@ -337,14 +355,11 @@ def draw(
             jax.ShapeDtypeStruct((images, pixels), jnp.int32),
             jax.ShapeDtypeStruct((images, 3, pixels), jnp.uint8),
         ],
-        grid=(images, tiles),
-        in_specs=list(specs),
+        grid=(tiles, images),
+        in_specs=specs,
         out_specs=[own(pixels), own(pixels), own(3, pixels)],
-        compiler_params=plgpu.CompilerParams(num_warps=settings.warps, num_stages=1),
+        compiler_params=plgpu.CompilerParams(num_warps=warps, num_stages=1),
         interpret=interpret,
-        name="block_walk" if by_block else "lane_walk",
+        name=name,
     )(*inputs)
-    return Images(*outs), jnp.max(counts)
-
-
-__all__ = ["FAR", "Images", "Settings", "draw"]
+    return Images(*outs)
