@@ -220,17 +220,23 @@ def _scatter_cluster(corners: Any, cluster: Any, frame: tuple, slot: Any, keys: 
         rest = 1.0 - first - second
         inside = (left > 0.0) & (jnp.minimum(jnp.minimum(first, second), rest) >= -1e-5)
         depth = 1.0 / (rest * weights[0] + first * weights[1] + second * weights[2])
-        key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~_SLOTS) | slot
+        key = _key(depth, slot)
         pixel = jnp.where(inside, (size - 1 - line.astype(jnp.int32)) * size + column.astype(jnp.int32), 0)
         if interpret:  # atomics have no masks there
-            keys[...] = keys[...].at[pixel].min(jnp.where(inside, key, np.iinfo(np.int32).max))
+            keys[...] = keys[...].at[pixel].min(jnp.where(inside, key, np.inf))
         else:
-            inside &= key < plgpu.load(keys.at[pixel], mask=inside, other=0)
+            inside &= key < plgpu.load(keys.at[pixel], mask=inside, other=0.0)
             plgpu.atomic_min(keys, (pixel,), key, mask=inside)
         wraps = column >= highs[0]
         return left - 1.0, jnp.where(wraps, lows[0], column + 1.0), jnp.where(wraps, line + 1.0, line)
 
     jax.lax.while_loop(lambda state: jnp.max(state[0]) > 0.0, one_pixel, (number, lows[0], lows[1]))
+
+
+def _key(depth: jax.Array, slot: Any) -> jax.Array:
+    """Return depths whose lowest nine bits hold an instance. They are floats, for which Pallas has an atomic minimum of vectors."""
+    bits = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~_SLOTS) | slot
+    return jax.lax.bitcast_convert_type(bits, jnp.float32)
 
 
 def _scatter(
@@ -243,12 +249,12 @@ def _scatter(
     settings: Settings,
     interpret: bool,
 ) -> jax.Array:
-    """Return keys [I, P] int32: the bits of the nearest depth, whose lowest nine hold the instance."""
+    """Return the smallest `_key` of each pixel, [I, P] float32."""
     images, padded = views.near.shape
     assert padded <= _SLOTS + 1
     clusters = structure.cones.shape[1] // len(structure.radius)
     frames = jnp.asarray(np.concatenate([structure.low, structure.cell * CELLS / FINE], axis=1), jnp.float32)
-    background = (jax.lax.bitcast_convert_type(views.depth, jnp.int32) & ~_SLOTS) | _SLOTS
+    background = _key(views.depth, np.int32(_SLOTS))
 
     def kernel(*refs: Any) -> None:
         _scatter_kernel(*refs, size=size, half=half, znear=znear, clusters=clusters, interpret=interpret)
@@ -256,7 +262,7 @@ def _scatter(
     inputs = (views.near, views.mesh, views.back, arrays["cones"], arrays["corners"], frames, background)
     return kernel_call(
         kernel,
-        out_shape=jax.ShapeDtypeStruct(background.shape, jnp.int32),
+        out_shape=jax.ShapeDtypeStruct(background.shape, jnp.float32),
         grid=(padded, images),
         in_specs=[
             *(walk.own(padded), walk.own(padded), walk.own(padded, 12)),
@@ -273,7 +279,8 @@ def _scatter(
 
 def _resolve(views: Views, arrays: dict[str, jax.Array], size: int, half: float, keys: jax.Array) -> walk.Images:
     """Convert keys to images; normals are those of the depth's slope, which suffices to time one colour."""
-    slot, near = keys & _SLOTS, jax.lax.bitcast_convert_type(keys & ~_SLOTS, jnp.float32)
+    bits = jax.lax.bitcast_convert_type(keys, jnp.int32)
+    slot, near = bits & _SLOTS, jax.lax.bitcast_convert_type(bits & ~_SLOTS, jnp.float32)
     hit = slot != _SLOTS
     depth = jnp.where(hit, near, views.depth)
     place = jnp.where(hit, slot, 0)
