@@ -109,7 +109,8 @@ def warp_row(name: str, setting: Setting, repeats: int) -> Row:
     draws[0]()
     wp.synchronize()
     pixels = setting.size**2
-    depth = context.depth_data.numpy().reshape(setting.images, pixels)[:COMPARED]
+    # Copies: without a GPU these are views of buffers that the timing overwrites.
+    depth = np.array(context.depth_data.numpy().reshape(setting.images, pixels)[:COMPARED])
     geom = context.seg_data.numpy().reshape(setting.images, pixels, -1)[:COMPARED, :, 0].astype(np.int32)
     timing = measure_time(alternate(lambda draw: draw(), draws), repeats, wait=lambda _: wp.synchronize())
     del datas
