@@ -117,7 +117,9 @@ def warp_row(name: str, setting: Setting, repeats: int) -> Row:
     return Row(name, setting.images / timing.median_s, timing.spread, compile_s, np.where(depth > 0, depth, np.inf), geom)
 
 
-def our_row(name: str, setting: Setting, draw: Callable[[Any], tuple[walk.Images, jax.Array]], tables: Any, repeats: int) -> Row:
+def our_row(
+    name: str, setting: Setting, draw: Callable[[Any], tuple[walk.Images, jax.Array]], tables: Any, repeats: int
+) -> Row:
     """Measure one of our kernels, from world poses to images.
 
     Args:

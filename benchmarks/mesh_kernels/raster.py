@@ -75,9 +75,7 @@ def _tile_kernel(*refs: Any, settings: Settings, size: int, half: float, znear: 
 
         def one_chunk(chunk: Any, state: tuple) -> tuple:
             first = mesh * clusters + chunk * 32
-            x, y, z, radius = (
-                plgpu.load(balls.at[jnp.full((32,), number, jnp.int32), first + lane]) for number in range(4)
-            )
+            x, y, z, radius = (plgpu.load(balls.at[jnp.full((32,), number, jnp.int32), first + lane]) for number in range(4))
             middle = [turn[3 * i] * x + turn[3 * i + 1] * y + turn[3 * i + 2] * z + turn[9 + i] for i in range(3)]
             ahead = -middle[2]
             meets = (radius >= 0.0) & (ahead + radius > znear) & (ahead - radius < jnp.max(state[0]))
@@ -106,7 +104,7 @@ def _tile_kernel(*refs: Any, settings: Settings, size: int, half: float, znear: 
         return (state[0] < count) & (ins.near[jnp.where(state[0] < count, ins.list[state[0]], 0)] < jnp.max(state[1]))
 
     state = jax.lax.while_loop(going, one_instance, (jnp.int32(0), best, none, none + 1))
-    walk.shade(ins, outs, pixel, state[1], state[2], state[3], by_row=True)
+    walk.shade(ins, outs, pixel, state[1], state[2], state[3])
 
 
 def _draw_tiles(

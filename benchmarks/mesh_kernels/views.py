@@ -168,7 +168,9 @@ def _product(left: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.sum(left[..., :, :, None] * right[..., None, :, :], -2)
 
 
-def tile_lists(views: Views, size: int, tile: tuple[int, int], most: int, interpret: bool = False) -> tuple[jax.Array, jax.Array]:
+def tile_lists(
+    views: Views, size: int, tile: tuple[int, int], most: int, interpret: bool = False
+) -> tuple[jax.Array, jax.Array]:
     """List the instances whose rectangles meet a tile, from front to back.
 
     Args:

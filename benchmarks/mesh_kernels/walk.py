@@ -83,11 +83,11 @@ def gather(ref: Any, index: jax.Array, mask: jax.Array, *before: int) -> jax.Arr
     return plgpu.load(ref.at[(*place, index)], mask=mask, other=0.0 if ref.dtype == jnp.float32 else 0)
 
 
-def gather_pose(refs: Refs, slot: jax.Array, mask: jax.Array) -> list[jax.Array]:
-    """Load the twelve numbers of each pixel's pose."""
-    return [
-        plgpu.load(refs.pose.at[slot, jnp.full(slot.shape, column, jnp.int32)], mask=mask, other=0.0) for column in range(12)
-    ]
+def gather_row(ref: Any, index: jax.Array, mask: jax.Array, columns: Any) -> list[jax.Array]:
+    """Load some columns of the rows ``index`` where ``mask`` is set, 0 elsewhere."""
+    other = 0.0 if ref.dtype == jnp.float32 else 0
+    places = [(index, jnp.full(index.shape, column, jnp.int32)) for column in columns]
+    return [plgpu.load(ref.at[place], mask=mask, other=other) for place in places]
 
 
 def box_test(words: tuple, begin: tuple, inverse: tuple, best: jax.Array, znear: float) -> jax.Array:
@@ -155,7 +155,7 @@ def _lane_kernel(*refs: Any, structure: Structure, settings: Settings, size: int
             place = jnp.where(wants, jnp.where(nearer, place + 1, count), place)
 
         def begin() -> tuple:
-            pose = gather_pose(ins, slot, fresh)
+            pose = gather_row(ins.pose, slot, fresh, range(12))
             mesh, octant = gather(ins.mesh, slot, fresh), gather(ins.octant, slot, fresh)
             direction, inverse, start = to_mesh(pose, u, v)
             new = (*pose[9:], *direction, *inverse, *start, (mesh * 8 + octant) * end, mesh * structure.triangles)
@@ -175,7 +175,7 @@ def _lane_kernel(*refs: Any, structure: Structure, settings: Settings, size: int
         for _ in range(settings.steps):
             active = (node < end) & (leaf < 0)
             address = jnp.where(active, base + node, 0)
-            low, high, link = (gather(ins.nodes, address, active, word) for word in range(3))
+            low, high, link = gather_row(ins.nodes, address, active, range(3))
             meets = active & box_test((low, high), begin, inverse, best, znear)
             number = (link >> 16) & 0xFFFF
             leaf = jnp.where(meets & (number > 0), number - 1, leaf)
@@ -185,7 +185,7 @@ def _lane_kernel(*refs: Any, structure: Structure, settings: Settings, size: int
             nearest, triangle = best, hit_row
             for corner in range(leaf_size):
                 place = jnp.where(leaf >= 0, rows + leaf * leaf_size + corner, 0)
-                numbers = [gather(ins.maps, place, leaf >= 0, column) for column in range(12)]
+                numbers = gather_row(ins.maps, place, leaf >= 0, range(12))
                 t, meets = triangle_test(numbers, start, direction, nearest, znear)
                 meets &= leaf >= 0
                 nearest, triangle = jnp.where(meets, t, nearest), jnp.where(meets, place, triangle)
@@ -219,7 +219,7 @@ def _block_kernel(*refs: Any, structure: Structure, settings: Settings, size: in
 
         def visit(state: tuple) -> tuple:
             node, best, hit_slot, hit_row = state
-            low, high, link = (ins.nodes[word, base + node] for word in range(3))
+            low, high, link = (ins.nodes[base + node, word] for word in range(3))
             meets = jnp.max(box_test((low, high), begin, inverse, best, znear).astype(jnp.int32)) > 0
             number = (link >> 16) & 0xFFFF
 
@@ -227,7 +227,9 @@ def _block_kernel(*refs: Any, structure: Structure, settings: Settings, size: in
                 nearest, row = best, hit_row
                 for corner in range(leaf_size):
                     place = rows + (number - 1) * leaf_size + corner
-                    t, inside = triangle_test([ins.maps[column, place] for column in range(12)], start, direction, nearest, znear)
+                    t, inside = triangle_test(
+                        [ins.maps[place, column] for column in range(12)], start, direction, nearest, znear
+                    )
                     nearest, row = jnp.where(inside, t, nearest), jnp.where(inside, place, row)
                 return nearest, row
 
@@ -248,9 +250,7 @@ def _block_kernel(*refs: Any, structure: Structure, settings: Settings, size: in
     shade(ins, outs, pixel, *state[1:])
 
 
-def shade(
-    ins: Refs, outs: Any, pixel: jax.Array, depth: jax.Array, slot: jax.Array, row: jax.Array, by_row: bool = False
-) -> None:
+def shade(ins: Refs, outs: Any, pixel: jax.Array, depth: jax.Array, slot: jax.Array, row: jax.Array) -> None:
     """Store depth, geom and a colour: that of the geom, darker the more its normal is turned away from the camera's axis.
 
     Args:
@@ -260,13 +260,11 @@ def shade(
         depth: [P] float32, m.
         slot: [P] int32, instance in ``ins``, -1 for the floor and the sky.
         row: [P] int32, triangle in ``ins.maps``.
-        by_row: ``ins.maps`` has a row, not a column, for each triangle.
     """
     hit = slot >= 0
     place, row = jnp.where(hit, slot, 0), jnp.where(hit, row, 0)
-    pose = gather_pose(ins, place, hit)
-    entries = [jnp.full(row.shape, entry, jnp.int32) for entry in (8, 9, 10)]
-    height = [plgpu.load(ins.maps.at[(row, e) if by_row else (e, row)], mask=hit, other=0.0) for e in entries]
+    pose = gather_row(ins.pose, place, hit, range(12))
+    height = gather_row(ins.maps, row, hit, (8, 9, 10))
     normal = [sum(pose[3 * i + j] * height[i] for i in range(3)) for j in range(3)]
     length = jax.lax.rsqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2] + 1e-20)
     facing = jnp.where(hit, jnp.abs(normal[2]) * length, 1.0)
