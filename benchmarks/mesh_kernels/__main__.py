@@ -266,6 +266,8 @@ def main(arguments: list[str] | None = None) -> int:
             continue
         show(rows[-1], rows[0])
     print(verdict(rows) if rows else "nothing was measured")
+    if options.interpret:
+        print("without a GPU: the images count, the speed does not")
     return 0
 
 

@@ -224,7 +224,11 @@ def _scatter_cluster(corners: Any, cluster: Any, frame: tuple, slot: Any, keys: 
             keys[...] = keys[...].at[pixel].min(jnp.where(inside, key, np.inf))
         else:
             inside &= key < plgpu.load(keys.at[pixel], mask=inside, other=0.0)
-            plgpu.atomic_min(keys, (pixel,), key, mask=inside)
+
+            @pl.when(jnp.max(inside.astype(jnp.int32)) > 0)
+            def _() -> None:  # an atomic waits for all of the program's memory, and most triangles are hidden
+                plgpu.atomic_min(keys, (pixel,), key, mask=inside)
+
         wraps = column >= highs[0]
         return left - 1.0, jnp.where(wraps, lows[0], column + 1.0), jnp.where(wraps, line + 1.0, line)
 

@@ -17,7 +17,7 @@ from jaxrl_vis.report.outputs import check_writable
 _OPTIONS: dict[str, dict[str, Any]] = {
     "env": {"help": "environment (VisualFetchReach if not given)"},
     "preset": {"choices": ("paper", "fast", "cpu", "debug"), "help": "preset of the networks and gradient steps"},
-    "scene": {"help": "finger, fetch_reach, primitives or the path of an MJCF file; all three if not given"},
+    "scene": {"help": "finger, fetch_reach, primitives (all three if not given), clutter, fetch_mesh, shadow_hand, aloha or an MJCF file"},
     "envs": {"type": int, "nargs": "+", "help": "batch sizes, with one measurement for each"},
     "image_size": {"type": int, "help": "height and width of images"},
     "pixels": {"choices": ("rgbd", "rgb", "depth"), "help": "channels of images"},
