@@ -1,7 +1,7 @@
 """Design (a): rasterisation over bins.
 
-`tiles`: a program per tile of pixels goes through its list of instances, tests their clusters of eight triangles against the tile,
-32 at a time, and the triangles of those that pass against every pixel.
+`tiles`: a program per tile of pixels goes through its list of instances, tests their clusters of eight triangles against the
+tile, 32 at a time, and the triangles of those that pass against every pixel.
 `scatter`: a program per instance and image tests clusters of 64 triangles (facing away, out of view, between the pixels), then
 gives every triangle a lane, which puts the few pixels that it covers into the image by an atomic minimum.
 """
@@ -236,7 +236,7 @@ def _scatter_cluster(corners: Any, cluster: Any, frame: tuple, slot: Any, keys: 
 
 
 def _key(depth: jax.Array, slot: Any) -> jax.Array:
-    """Return depths whose lowest nine bits hold an instance. They are floats, for which Pallas has an atomic minimum of vectors."""
+    """Return depths whose lowest nine bits hold an instance: floats, since Pallas has an atomic minimum of vectors for them."""
     bits = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~_SLOTS) | slot
     return jax.lax.bitcast_convert_type(bits, jnp.float32)
 

@@ -21,9 +21,9 @@ class Structure(NamedTuple):
     """Structures of M meshes with the same numbers of rows, padded.
 
     Attributes:
-        nodes: [M * 8 * S, 4] int32: low and high corner of a node's box (ten bits an axis), and its link: index of the next node
-            if the box is missed (16 bits), and 1 + number of the leaf in the upper 16 bits, 0 for an inner node; and 0.
-            Nodes of a mesh are stored in eight orders, near child first, one for each octant of directions. After a hit, the
+        nodes: [M * 8 * S, 4] int32: low and high corner of a node's box (ten bits an axis); its link, which is the index of the
+            next node if the box is missed (16 bits), and 1 + number of the leaf in the upper 16 bits, 0 for an inner node; and
+            0. Nodes of a mesh are stored in eight orders, near child first, one for each octant of directions. After a hit, the
             next node follows.
         maps: [M * T, 12] float32, affine maps of the mesh's frame to each unit triangle, see `render.model.meshes`, by leaf.
         leaf: Triangles per leaf.
@@ -31,7 +31,7 @@ class Structure(NamedTuple):
         middle, radius: [M, 3] and [M] float64, m, bounding sphere in the frame of the geom.
         steps: S, nodes of a mesh in one order.
         triangles: T, triangles of a mesh.
-        balls: [4, M * K] float32: bounding spheres of clusters of `SMALL` consecutive rows of ``small_maps``, frame of the geom.
+        balls: [4, M * K] float32: bounding spheres of clusters of `SMALL` consecutive rows of ``small_maps``, geom's frame.
         small_maps: [M * K * SMALL, 12] float32 as ``maps``, grouped.
         cones: [8, M * C] float32: bounding sphere (4) and cone of normals (axis, and cosine of the cutoff, see `clusters`).
         corners: [9, M * C * CLUSTER] int16, corners of the triangles in 1/65535 of the mesh's box, less 32768.
@@ -65,7 +65,7 @@ def build(mj_model: mujoco.MjModel, leaf: int = 2) -> Structure:
     cell = np.maximum(np.array([box[1] for box in boxes]) - low, 1e-6) / CELLS
     middle = np.array([0.5 * (box[0] + box[1]) for box in boxes])
     radius = np.array([np.linalg.norm(c - m, axis=2).max() for c, m in zip(meshes, middle, strict=True)])
-    trees = [_Tree((corners - l) / s, leaf) for corners, l, s in zip(meshes, low, cell, strict=True)]
+    trees = [_Tree((corners - origin) / unit, leaf) for corners, origin, unit in zip(meshes, low, cell, strict=True)]
     steps, rows = max(len(tree.boxes) for tree in trees), max(tree.leaves * leaf for tree in trees)
     nodes = np.zeros((4, len(meshes), 8, steps), np.int32)
     maps = np.zeros((12, len(meshes), rows), np.float32)

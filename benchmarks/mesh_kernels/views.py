@@ -181,7 +181,8 @@ def tile_lists(
         interpret: Run without a GPU.
 
     Returns:
-        Places of the instances in ``views``, [I, tiles, most + `CHUNK`] int32, and their numbers [I, tiles] int32 (also beyond ``most``).
+        Places of the instances in ``views``, [I, tiles, most + `CHUNK`] int32, and their numbers [I, tiles] int32, which
+        also count those that were cut.
     """
     images, count = views.near.shape
     high, wide = tile

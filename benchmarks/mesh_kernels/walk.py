@@ -1,6 +1,6 @@
 """Design (b): rays walk bounding volume hierarchies without a stack, by skip pointers, in one program per tile.
 
-`lane_walk`: every pixel walks the instances of its tile's list on its own, so no pixel waits for a neighbour to finish an instance.
+`lane_walk`: every pixel walks the instances of its tile's list on its own, and waits for no neighbour to finish an instance.
 `block_walk`: all pixels of a tile visit the same node at the same time, and a node is missed if all of them miss it.
 """
 

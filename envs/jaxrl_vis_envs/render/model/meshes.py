@@ -165,7 +165,7 @@ def _clustered(
 
 
 def _cones(normals: np.ndarray) -> np.ndarray:
-    """Return cones [K, 4] around unit normals [K, N, 3]: axis, and sine of the half-angle, 2 if that is a right angle or more."""
+    """Return cones [K, 4] around unit normals [K, N, 3]: axis, and sine of the half-angle, 2 for a right angle or more."""
     axes = normals.sum(1)
     axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-30)
     cosines = np.einsum("knj,kj->kn", normals, axes).min(1)
