@@ -2,9 +2,9 @@
 
     XLA_PYTHON_CLIENT_MEM_FRACTION=.5 python -m benchmarks.mesh_kernels --worlds 2048
 
-All draw depth, geom and a colour of four 64x64 images per world from world poses, and the work on these is timed, too. A row says
-how many pixels agree with the first renderer that drew: depth within 1 cm or 1 %, and the geom. `--interpret` tries everything
-without a GPU, slowly: `--worlds 1 --instances 24 --image-size 16`.
+All draw depth, geom and a colour of four 64x64 images per world from world poses, and the work on these is timed. A row says how
+many pixels agree with the first renderer that drew: depth within 1 cm or 1 %, and the geom. `--interpret` tries everything without
+a GPU, slowly: `--worlds 1 --instances 24 --image-size 16`.
 """
 
 import argparse
