@@ -2,9 +2,9 @@
 
     XLA_PYTHON_CLIENT_MEM_FRACTION=.5 python -m benchmarks.mesh_kernels --worlds 2048
 
-All draw depth, geom and a colour of four 64x64 images per world from world poses, and the work on these is timed. A row says how
-many pixels agree with the first renderer that drew: depth within 1 cm or 1 %, and the geom. `--interpret` tries everything without
-a GPU, slowly: `--worlds 1 --instances 24 --image-size 16`.
+All draw depth, geom and a colour of four 64x64 images per world from world poses, and the work on these is timed. A row says
+how many pixels agree with the first renderer that drew: depth within 1 cm or 1 %, and the geom. `--interpret` tries all
+without a GPU, slowly: `--worlds 1 --instances 24 --image-size 16`.
 """
 
 import argparse
@@ -168,7 +168,7 @@ def variants(setting: Setting, interpret: bool) -> Iterator[tuple[str, Callable[
         return prepared
 
     def walking(tile: tuple[int, int], warps: int, steps: int = 4, scan: int = 2, by_block: bool = False) -> Callable:
-        shape = walk.Settings(tile, warps, steps, scan, most=96 if tile[0] * tile[1] <= 64 else 160)
+        shape = walk.Settings(tile, warps, steps, scan, most={32: 96, 64: 128, 128: 192}[tile[0] * tile[1]])
         return lambda *inputs: walk.draw(*inputs, shape, by_block, interpret)
 
     def binning(design: str, tile: tuple[int, int] = (8, 8), warps: int = 2) -> Callable:
