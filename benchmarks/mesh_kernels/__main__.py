@@ -265,9 +265,10 @@ def main(arguments: list[str] | None = None) -> int:
             traceback.print_exc(limit=-3)
             continue
         show(rows[-1], rows[0])
-    print(verdict(rows) if rows else "nothing was measured")
     if options.interpret:
-        print("without a GPU: the images count, the speed does not")
+        print("no verdict without a GPU: only whether the images agree counts")
+    else:
+        print(verdict(rows) if rows else "nothing was measured")
     return 0
 
 
