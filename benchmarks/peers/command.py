@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxrl_vis import bench
 from jaxrl_vis.bench.record import user_folder
+from jaxrl_vis.bench.scenes import models
 from jaxrl_vis.bench.settings import Settings
 from jaxrl_vis.cli.checks import check_counts, check_env
 from jaxrl_vis.errors import RequestError
@@ -17,7 +18,7 @@ from jaxrl_vis.report.outputs import check_writable
 _OPTIONS: dict[str, dict[str, Any]] = {
     "env": {"help": "environment (VisualFetchReach if not given)"},
     "preset": {"choices": ("paper", "fast", "cpu", "debug"), "help": "preset of the networks and gradient steps"},
-    "scene": {"help": "finger, fetch_reach, primitives or the path of an MJCF file; all three if not given"},
+    "scene": {"help": f"{', '.join(models.SCENES)} (all if not given), {', '.join(models.MESH_SCENES)} or an MJCF file"},
     "envs": {"type": int, "nargs": "+", "help": "batch sizes, with one measurement for each"},
     "image_size": {"type": int, "help": "height and width of images"},
     "pixels": {"choices": ("rgbd", "rgb", "depth"), "help": "channels of images"},

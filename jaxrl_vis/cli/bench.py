@@ -50,7 +50,8 @@ class Bench:
     weighting: WeightingName = "none"
     """Weighting of the auxiliary losses (update, train)."""
     scene: str | None = None
-    """finger, fetch_reach, primitives or the path of an MJCF file: render this instead of an environment (render)."""
+    """finger, fetch_reach, primitives, clutter, fetch_mesh, shadow_hand, aloha or the path of an MJCF file: render this
+    instead of an environment (render)."""
     json: Path | None = None
     """Additional file for the records of this run."""
     results: Path | None = None

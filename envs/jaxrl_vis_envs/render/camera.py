@@ -16,6 +16,9 @@ from jaxrl_vis_envs.render.viewpoint import barrier as barrier
 from jaxrl_vis_envs.render.viewpoint import camera_pose as camera_pose
 from jaxrl_vis_envs.render.viewpoint import lens as lens
 
+INFINITE = 1e9
+"""Bound of what has no end, see `sphere_sides`."""
+
 
 class Rays(NamedTuple):
     """Pixel rays, by their intersection with the plane at depth 1 m (at any depth, if orthographic). Float32 arrays of one
@@ -96,6 +99,35 @@ def in_view(scene: Scene, middle: jax.Array, radius: jax.Array, rays: Rays, dept
             touching &= middle[:, axis] - high * ahead <= radius * jnp.sqrt(1.0 + high * high)
             touching &= low * ahead - middle[:, axis] <= radius * jnp.sqrt(1.0 + low * low)
     return touching
+
+
+def sphere_sides(scene: Scene, middle: jax.Array, radius: jax.Array) -> jax.Array:
+    """Return the bounds in the image of spheres: [K, 4] float32, minimum and maximum u, minimum and maximum v.
+
+    Args:
+        scene: The scene.
+        middle: [K, 3] float32, centres in the camera's frame, m.
+        radius: [K] float32, m.
+
+    Returns:
+        The bounds; infinite (`INFINITE`) around the camera, and inverted behind it, so that nothing lies between them.
+    """
+    x, y, depth = middle[:, 0], middle[:, 1], -middle[:, 2]
+    radius = radius * (1.0 + 1e-4) + 1e-6
+    if scene.projection == "orthographic":
+        sides = [x - radius, x + radius, y - radius, y + radius]
+        behind, around = depth < -radius, jnp.zeros(depth.shape, bool)
+    else:
+        square = depth * depth - radius * radius
+        safe = jnp.where(square > 0.0, square, 1.0)
+        sides = []
+        for along in (x, y):
+            root = radius * jnp.sqrt(jnp.maximum(along * along + square, 0.0))
+            sides += [(along * depth - root) / safe, (along * depth + root) / safe]
+        behind, around = depth <= -radius, depth <= radius
+    low, high = jnp.where(around, -INFINITE, 0.0), jnp.where(around, INFINITE, 0.0)
+    sides = [jnp.where(around, high if i % 2 else low, side) for i, side in enumerate(sides)]
+    return jnp.stack([jnp.where(behind, -INFINITE if i % 2 else INFINITE, side) for i, side in enumerate(sides)], axis=1)
 
 
 def multiply(matrix: Any, vector: tuple) -> tuple:

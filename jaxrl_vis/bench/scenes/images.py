@@ -26,7 +26,8 @@ from jaxrl_vis_envs.render import Scene, quantize, render_planes
 
 CPU_COUNTS = (64,)
 ACCELERATOR_COUNTS = (4096,)
-SCENE_ACCELERATOR_COUNTS = {"primitives": (8192,)}
+SCENE_CPU_COUNTS = {"clutter": (1,)}  # a single image takes seconds
+SCENE_ACCELERATOR_COUNTS = {"primitives": (8192,), "clutter": (16,)}
 OUTPUTS = ("rgbd", "rgbd8", "depth")
 _SAMPLE = 32  # number of poses over which the needed tests are averaged
 _DEPTH_RANGE = 10.0  # range of an 8-bit depth in metres
@@ -39,7 +40,8 @@ SCENE_VARIANTS = {
         *VARIANTS,
         *({**variant, "poses": "start"} for variant in VARIANTS),
         {"poses": "start", "textures": False, "highlights": False},
-    )
+    ),
+    "clutter": VARIANTS[:1],  # it has no textures
 }
 
 
@@ -70,7 +72,8 @@ def cases(scene: str, settings: Settings, sizes: tuple[int, ...], min_poses: int
     for variant in SCENE_VARIANTS.get(scene, VARIANTS):
         mj_model = models.load(scene, variant["textures"], variant["highlights"])
         spread = models.SPREADS[variant["poses"]]
-        for count in settings.counts(CPU_COUNTS, SCENE_ACCELERATOR_COUNTS.get(scene, ACCELERATOR_COUNTS)):
+        counts = (SCENE_CPU_COUNTS.get(scene, CPU_COUNTS), SCENE_ACCELERATOR_COUNTS.get(scene, ACCELERATOR_COUNTS))
+        for count in settings.counts(*counts):
             batches = [models.random_poses(mj_model, max(count, min_poses), seed, spread) for seed in (1, 2)]
             for size in sizes:
                 yield Case({"scene": scene, **variant, "image_size": size, "images": count}, mj_model, batches)

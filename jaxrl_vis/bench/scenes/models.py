@@ -8,9 +8,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from jaxrl_vis.bench.scenes import clutter, packaged
 from jaxrl_vis.errors import RequestError
 
 SCENES = ("finger", "fetch_reach", "primitives")
+MESH_SCENES = ("clutter", *packaged.PACKAGED)
+"""Scenes of meshes, measured only if named."""
 POSES = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir")
 POSES += ("xpos", "xmat", "xipos")
 FREE_METRES, FREE_RADIANS, BALL_RADIANS, SLIDE_METRES = 0.2, 0.5, 1.0, 0.3
@@ -23,7 +26,8 @@ def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.M
 
     Args:
         scene: ``finger`` (from the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
-            over a table), or the path of an MJCF file with a camera.
+            over a table), ``clutter`` (500 meshes), one of `packaged.PACKAGED` (robots with the meshes of their packages), or
+            the path of an MJCF file with a camera.
         textures: Whether to keep the textures of materials and sky.
         highlights: Whether to keep the specular component of lights.
 
@@ -34,6 +38,10 @@ def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.M
         warnings.simplefilter("ignore")  # MuJoCo's warnings about third-party models
         if scene == "primitives":
             mj_model = mujoco.MjModel.from_xml_string(primitives_xml())
+        elif scene == "clutter":
+            mj_model = clutter.clutter_spec().compile()
+        elif scene in packaged.PACKAGED:
+            mj_model = packaged.packaged_spec(scene).compile()
         else:
             path = _scene_path(scene)
             try:
@@ -67,7 +75,7 @@ def _scene_path(scene: str) -> Path:
 
         return Path(jaxrl_vis_envs.__file__).parent / "tasks" / "assets" / "fetch_reach.xml"
     if not Path(scene).is_file():
-        raise RequestError(f"no scene {scene!r}: choose {', '.join(SCENES)} or the path of an MJCF file")
+        raise RequestError(f"no scene {scene!r}: choose {', '.join((*SCENES, *MESH_SCENES))} or the path of an MJCF file")
     return Path(scene)
 
 

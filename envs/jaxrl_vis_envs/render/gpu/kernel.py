@@ -28,7 +28,6 @@ from jaxrl_vis_envs.render.scene import Scene
 # Tuned on an H200: pixels per tile (a power of two, some of which may be idle), and launch parameters.
 _PIXELS = 128
 _COMPILER = plgpu.CompilerParams(num_warps=4, num_stages=1)
-_INFINITE = 1e9
 # Indices of the camera's parameters in the vector that the kernel reads.
 _LENS, _CLIP, _ROTATION, _SKY_TOP, _SKY_BOTTOM, _FOVY = range(4), range(4, 6), range(6, 15), range(15, 18), range(18, 21), 21
 _PROBE = """
@@ -76,25 +75,9 @@ def tile_shape(height: int, width: int) -> tuple[int, int]:
 
 def rectangles(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
     """Return bounds [G, 4] float32 (min u, max u, min v, max v) of each object's bounding sphere; infinite for planes."""
-    x, y, depth, radius = unit.ball[:, 0], unit.ball[:, 1], -unit.ball[:, 2], unit.ball[:, 3]
-    radius = radius * (1.0 + 1e-4) + 1e-6
-    if scene.projection == "orthographic":
-        sides = [x - radius, x + radius, y - radius, y + radius]
-        behind, around = depth < -radius, jnp.zeros(depth.shape, bool)
-    else:
-        square = depth * depth - radius * radius
-        safe = jnp.where(square > 0.0, square, 1.0)
-        sides = []
-        for along in (x, y):
-            root = radius * jnp.sqrt(jnp.maximum(along * along + square, 0.0))
-            sides += [(along * depth - root) / safe, (along * depth + root) / safe]
-        behind, around = depth <= -radius, depth <= radius
     is_infinite = np.array(scene.object_types) == shapes.PLANE
-    low, high = jnp.where(around, -_INFINITE, 0.0), jnp.where(around, _INFINITE, 0.0)
-    sides = [jnp.where(around, high if i % 2 else low, side) for i, side in enumerate(sides)]
-    # Objects behind the camera get inverted bounds, so that no tile intersects them.
-    sides = [jnp.where(behind, -_INFINITE if i % 2 else _INFINITE, side) for i, side in enumerate(sides)]
-    return jnp.stack([jnp.where(is_infinite, _INFINITE if i % 2 else -_INFINITE, side) for i, side in enumerate(sides)], axis=1)
+    endless = np.array([-camera.INFINITE, camera.INFINITE] * 2, np.float32)
+    return jnp.where(is_infinite[:, None], endless, camera.sphere_sides(scene, unit.ball[:, :3], unit.ball[:, 3]))
 
 
 def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[jax.Array, np.ndarray]:

@@ -36,14 +36,15 @@ def build_triangles(mj_model: mujoco.MjModel, ids: np.ndarray, types: np.ndarray
             blended; triangles of other objects are grouped by position.
 
     Returns:
-        ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows per cluster; ``clusters`` [K, 4]
-        float32, centre and radius (m) of the bounding sphere of each rendered cluster, in the same frame; ``cluster_places``
+        ``triangles`` [R, 36] float32, metres, in the frame of their geom, `CLUSTER` rows per cluster; ``clusters`` [K, 8]
+        float32 of each rendered cluster, in the same frame: centre and radius (m) of its bounding sphere, and the cone of its
+        normals: axis (unit vector) and sine of the half-angle, 2 if that is a right angle or more; ``cluster_places``
         [K, 2] int32, index of the cluster's object in ``ids``, and first row of its triangles. If several geoms share a mesh,
         its triangles are stored once, and its clusters once per geom.
     """
     rows: list[np.ndarray] = []
     built: dict[tuple[int, int, bool], tuple[int, np.ndarray]] = {}
-    clusters, places = [np.zeros((0, 4))], [np.zeros((0, 2), np.int64)]
+    clusters, places = [np.zeros((0, 8))], [np.zeros((0, 2), np.int64)]
     for row, index in enumerate(ids):
         if types[row] not in (_HFIELD, _MESH):
             continue
@@ -131,7 +132,7 @@ def _clustered(
     corners: np.ndarray, normals: np.ndarray, coordinates: np.ndarray, ordered: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drop triangles without area and group the others; return rows [K * CLUSTER, COLUMNS] by cluster, and bounding spheres
-    [K, 4].
+    with cones [K, 8].
     """
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     longest = np.max(np.sum(np.square(corners - np.roll(corners, 1, axis=1)), axis=2), axis=1)
@@ -151,7 +152,7 @@ def _clustered(
     rows = np.zeros((len(groups), CLUSTER, COLUMNS))
     rows[:, :, 11] = 1.0
     if not groups:
-        return rows.reshape(-1, COLUMNS), np.zeros((0, 4))
+        return rows.reshape(-1, COLUMNS), np.zeros((0, 8))
     full = np.arange(CLUSTER) < np.array([len(group) for group in groups])[:, None]
     # Incomplete groups repeat their first triangle to compute the bounding spheres.
     members = np.repeat(np.array([group[:1] for group in groups]), CLUSTER, axis=1)
@@ -160,7 +161,16 @@ def _clustered(
     points = corners[members].reshape(-1, CLUSTER * 3, 3)
     middles = 0.5 * (points.min(1) + points.max(1))
     radii = np.linalg.norm(points - middles[:, None], axis=2).max(1)
-    return rows.reshape(-1, COLUMNS), np.concatenate([middles, radii[:, None]], axis=1)
+    return rows.reshape(-1, COLUMNS), np.concatenate([middles, radii[:, None], _cones(unit[members])], axis=1)
+
+
+def _cones(normals: np.ndarray) -> np.ndarray:
+    """Return cones [K, 4] around unit normals [K, N, 3]: axis, and sine of the half-angle, 2 for a right angle or more."""
+    axes = normals.sum(1)
+    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-30)
+    cosines = np.einsum("knj,kj->kn", normals, axes).min(1)
+    sines = np.where(cosines > 1e-3, np.sqrt(np.maximum(1.0 - cosines**2, 0.0)) + 1e-4, 2.0)
+    return np.concatenate([axes, sines[:, None]], axis=1)
 
 
 def _grouped(middles: np.ndarray, members: np.ndarray) -> list[np.ndarray]:

@@ -158,8 +158,14 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
     if not scene.clusters.shape[-2]:
         return Nearest(key, row, None)
 
+    # Not differentiated: the derivatives come from `surface.meet`.
+    unit = jax.lax.stop_gradient(unit)
+    bounds = jax.lax.optimization_barrier(triangles.opaque_bounds(jax.lax.stop_gradient(scene), unit))
+
     def add_triangles(rays: Rays, key: jax.Array, row: jax.Array | None) -> Nearest:
-        depth, triangle, owner = triangles.nearest_triangle(scene, unit, rays, raycast.decode(scene, key, row)[0])
+        depth, triangle, owner = triangles.nearest_triangle(
+            scene, unit, rays, raycast.decode(scene, key, row)[0], bounds=bounds
+        )
         mask = raycast.code_mask(scene)
         triangle_key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
         is_triangle = triangle >= 0
@@ -167,6 +173,4 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
             jnp.where(is_triangle, triangle_key, key), None if row is None else jnp.where(is_triangle, owner, row), triangle
         )
 
-    # Not differentiated: the derivatives come from `surface.meet`.
-    unit = jax.lax.stop_gradient(unit)
     return scan(add_triangles, rays, key, row)

@@ -5,6 +5,7 @@ and a loop runs up to that count. Under `jax.vmap` it runs up to the largest cou
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +22,64 @@ _SEAM = 1e-5
 # Horizontal and vertical offset of a second ray in `next_triangle`, relative to half the image's height. Few edges have that
 # direction, and it is far larger than the rounding error of an edge.
 _OFFSET = (2e-5, -6e-6)
+# Part of a pixel by which the bounds of a cluster are rounded outwards, more than the rounding error of a large image.
+_ROUNDING = 1e-2
 _NUMBER = meshes.CLUSTER - 1  # mask of the lowest bits of a depth, which hold a triangle's index in its cluster
 
 
+class Bounds(NamedTuple):
+    """Pixels that clusters may cover, once per image.
+
+    Attributes:
+        sides: [K, 4] float32: minimum and maximum u, minimum and maximum v, of the rays through the middles of pixels that may
+            meet a cluster's front; inverted if there is none.
+        near: [K] float32, metres, depth in front of which nothing of the cluster lies.
+    """
+
+    sides: jax.Array
+    near: jax.Array
+
+
+def opaque_bounds(scene: Scene, unit: shapes.UnitShapes) -> Bounds:
+    """Return the bounds of all clusters of opaque objects; those of others are inverted."""
+    middle, facing = _in_camera(scene, unit)
+    radius, sine = scene.clusters[:, 3], scene.clusters[:, 7]
+    seen = camera.sphere_sides(scene, middle, radius)
+    # Most clusters of a fine mesh lie between the middles of pixels: their bounds are rounded to those.
+    middles = camera.lens(scene)
+    sides = []
+    for axis, (count, pitch) in enumerate(zip((scene.width, scene.height), camera.pixel_pitch(scene), strict=True)):
+        first = middles[axis] - 0.5 * (count - 1) * pitch
+        low = jnp.ceil((seen[:, 2 * axis] - first) / pitch - _ROUNDING)
+        high = jnp.floor((seen[:, 2 * axis + 1] - first) / pitch + _ROUNDING)
+        sides += [jnp.where(low <= high, first + low * pitch, camera.INFINITE), first + high * pitch]
+    if scene.projection == "orthographic":
+        is_front = -facing[:, 2] < sine
+    else:
+        distance = jnp.sqrt(jnp.sum(jnp.square(middle), axis=1))
+        is_front = jnp.sum(middle * facing, axis=1) < sine * distance + radius * 1.001
+    is_front &= jnp.asarray(np.array(scene.transparent) == reading.SOLID)[scene.cluster_places[:, 0]]
+    is_front &= radius - middle[:, 2] > scene.znear
+    sides[0] = jnp.where(is_front, sides[0], camera.INFINITE)
+    sides[1] = jnp.where(is_front, sides[1], -camera.INFINITE)
+    return Bounds(jnp.stack(sides, axis=1), -middle[:, 2] - radius)
+
+
+def _in_camera(scene: Scene, unit: shapes.UnitShapes) -> tuple[jax.Array, jax.Array]:
+    """Return the centres (m) and the axes of the cones of all clusters in the camera's frame, [K, 3] each."""
+    owner = scene.cluster_places[:, 0]
+    axes = unit.axes[owner]  # of a mesh, a rotation
+    offset = scene.clusters[:, :3] - unit.origin[owner]
+    return jnp.sum(axes * offset[:, :, None], axis=1), jnp.sum(axes * scene.clusters[:, 4:7, None], axis=1)
+
+
 def nearest_triangle(
-    scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, only: int | None = None
+    scene: Scene,
+    unit: shapes.UnitShapes,
+    rays: Rays,
+    depth: jax.Array,
+    only: int | None = None,
+    bounds: Bounds | None = None,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Find the nearest triangle in front of ``depth``.
 
@@ -34,14 +88,20 @@ def nearest_triangle(
         unit: Rendered objects.
         rays: [P]. The pixels should be close together.
         depth: [P] float32, metres, maximum depth.
-        only: Row of the only object to test; None for all opaque objects.
+        only: Row of the only object to test; None for all opaque objects, whose ``bounds`` are then needed.
+        bounds: From `opaque_bounds`. The rays are then those through the middles of pixels.
 
     Returns:
         Depth [P] float32 of the triangle, or ``depth`` if there is none; its row in `Scene.triangles` and the row of its
         object, [P] int32 each, -1 if there is none.
     """
     # Index of the k-th candidate cluster = number of cumulative counts that are at most k.
-    counts = jnp.cumsum(_candidates(scene, unit, rays, depth, only).astype(jnp.int32), dtype=jnp.int32)
+    if bounds is None:
+        assert only is not None
+        candidates = _candidates(scene, unit, rays, depth, only)
+    else:
+        candidates = _bounded(scene, bounds, rays, depth)
+    counts = jnp.cumsum(candidates.astype(jnp.int32), dtype=jnp.int32)
     last = counts.shape[0] - 1
     far = jnp.asarray(np.inf, jnp.float32)
 
@@ -51,7 +111,7 @@ def nearest_triangle(
         nearer = met < best
         number = jax.lax.bitcast_convert_type(met, jnp.int32) & _NUMBER
         best, best_index = jnp.where(nearer, met, best), jnp.where(nearer, cluster * meshes.CLUSTER + number, best_index)
-        cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32), dtype=jnp.int32), last)
+        cluster = jnp.minimum(_kth(counts, step), last)
         met = jnp.where(step < counts[last], _intersect_cluster(scene, unit, cluster, rays), far)
         return step + 1, best, best_index, met, cluster
 
@@ -64,17 +124,32 @@ def nearest_triangle(
     return best, row, jnp.where(best_index >= 0, places[:, 0], -1)
 
 
-def _candidates(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, only: int | None) -> jax.Array:
-    """Return the mask [K] of clusters that the rays may intersect in front of ``depth``."""
-    owner = scene.cluster_places[:, 0]
-    axes, origin = unit.axes[owner], unit.origin[owner]
-    offset = scene.clusters[:, :3] - origin
-    middle = jnp.sum(axes * offset[:, :, None], axis=1)  # to the camera's frame: the axes of a mesh are a rotation
-    candidates = camera.in_view(scene, middle, scene.clusters[:, 3], rays, depth)
-    if only is not None:
-        return candidates & (owner == only)
-    opaque = np.array(scene.transparent) == reading.SOLID
-    return candidates & jnp.asarray(opaque)[owner]
+def _bounded(scene: Scene, bounds: Bounds, rays: Rays, depth: jax.Array) -> jax.Array:
+    """Return the mask [K] of clusters of opaque objects that the rays may intersect in front of ``depth``."""
+    candidates = bounds.near < jnp.max(depth)
+    for axis, (coordinate, pitch) in enumerate(zip(rays, camera.pixel_pitch(scene), strict=True)):
+        candidates &= bounds.sides[:, 2 * axis] <= jnp.max(coordinate) + 0.25 * pitch
+        candidates &= bounds.sides[:, 2 * axis + 1] >= jnp.min(coordinate) - 0.25 * pitch
+    return candidates
+
+
+def _candidates(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, only: int) -> jax.Array:
+    """Return the mask [K] of clusters of the object ``only`` that the rays may intersect in front of ``depth``."""
+    middle, _ = _in_camera(scene, unit)
+    return camera.in_view(scene, middle, scene.clusters[:, 3], rays, depth) & (scene.cluster_places[:, 0] == only)
+
+
+def _kth(counts: jax.Array, step: jax.Array) -> jax.Array:
+    """Return the index of the first of the cumulative ``counts`` [K] that exceeds ``step``, K if there is none; [] int32.
+
+    A bisection: a count of all that do not exceed it would read the whole array for every cluster.
+    """
+    low, size = jnp.zeros((), jnp.int32), counts.shape[0]
+    for bit in reversed(range(size.bit_length())):
+        probe = low + (1 << bit)
+        below = counts.at[jnp.minimum(probe, size) - 1].get(mode="promise_in_bounds") <= step
+        low = jnp.where((probe <= size) & below, probe, low)
+    return low
 
 
 def next_triangle(
@@ -104,7 +179,7 @@ def next_triangle(
 
     def advance(state: tuple) -> tuple:
         step, depths, rows = state
-        cluster = jnp.minimum(jnp.sum((counts <= step).astype(jnp.int32), dtype=jnp.int32), last)
+        cluster = jnp.minimum(_kth(counts, step), last)
         first = scene.cluster_places[cluster][1]
         # Clusters are in the order of their triangles: one found in an earlier cluster precedes all in this one.
         crossings = zip(
