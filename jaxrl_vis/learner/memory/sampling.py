@@ -64,6 +64,7 @@ class Sampler:
             have the form of goals.
         auxiliary: Auxiliary tasks whose targets are added to batches.
         shards: Shards of the learner. ``replay`` and batches are those of one shard; the configured batch size is the total.
+        mask: Mask of the elements that indicators compare (`rewards.make_reward`); None for all.
     """
 
     config: Config
@@ -73,6 +74,7 @@ class Sampler:
     as_goal: Callable[[jax.Array], jax.Array] | None = None
     auxiliary: Auxiliary | None = None
     shards: Shards = ONE
+    mask: Callable[[jax.Array], jax.Array] | None = None
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
         """Sample B transitions and their goals; every shard samples those of the whole learner and keeps its own part.
@@ -189,7 +191,7 @@ class Sampler:
 
     @functools.cached_property
     def _reward(self) -> RewardFunction:
-        return make_reward(self.config, self.resolved.method)
+        return make_reward(self.config, self.resolved.method, self.mask)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
         """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""
