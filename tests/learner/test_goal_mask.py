@@ -10,8 +10,8 @@ from jaxrl_vis import preset
 from jaxrl_vis.config.methods import METHODS
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner import train_step
-from jaxrl_vis.learner.memory.rewards import make_reward
 from jaxrl_vis.learner.memory.replay import Indices
+from jaxrl_vis.learner.memory.rewards import make_reward
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.types import Batch, Episodes
 from jaxrl_vis_envs import goals

@@ -8,8 +8,8 @@ outside. With ``depth_encoding="zbuffer"`` it is the content of OpenGL's depth b
 states are stored as joint positions (`State.history`) and rendered again: rendering is cheaper than the physics, and the state
 contains no images.
 
-If an object is marked, the lowest bit of the first channel is 1 in its pixels and 0 elsewhere (`object_mask`). An observation thus
-keeps its shape, and a replay its size, for at most one grey level.
+If an object is marked, the lowest bit of the first channel is 1 in its pixels and 0 elsewhere (`object_mask`). The shape of an
+observation and the size of a replay thus stay the same, and no pixel changes by more than one grey level.
 """
 
 import dataclasses
@@ -141,7 +141,7 @@ def mark_object(image: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def object_mask(image: jax.Array) -> jax.Array:
-    """Read the mask that `mark_object` wrote: images [..., C, H, W] uint8 to [..., 1, H, W] bool. Of a stack, the newest image's."""
+    """Read the mask that `mark_object` wrote, of a stack the newest image's: [..., C, H, W] uint8 -> [..., 1, H, W] bool."""
     return (image[..., :1, :, :] & 1).astype(bool)
 
 

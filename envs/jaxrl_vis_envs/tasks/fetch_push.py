@@ -87,8 +87,8 @@ class VisualFetchPushConfig(PixelsConfig, FetchPushConfig):
     depth_range: tuple[float, float] = (0.4, 1.8)
     """Depths encoded as 0 and 255, m: 5.5 mm per step, from in front of the nearest gripper to behind the robot."""
     goal_mask: Literal["none", "object"] = "none"
-    """Part of the images that indicator rewards compare: all (none), or the box's pixels by segmentation (object), which the lowest
-    bit of the first channel then marks."""
+    """Part of the images that indicator rewards compare: all (none), or the box's pixels by segmentation (object), which the
+    lowest bit of the first channel then marks."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

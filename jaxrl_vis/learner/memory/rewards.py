@@ -62,8 +62,8 @@ def make_reward(config: Config, method: Method, mask: Callable[[jax.Array], jax.
     Args:
         config: Configuration with the tolerance and the encoder.
         method: The method.
-        mask: Function from observations to the mask of the elements that matter, [B, ...] bool, broadcastable to them. Indicators
-            compare the elements that matter in the achieved observation or in the goal; None for all elements.
+        mask: Function from observations to the mask of the elements that matter, [B, ...] bool, broadcastable to them.
+            Indicators compare those that matter in the achieved observation or in the goal; None for all elements.
 
     Raises:
         RequestError: The frozen encoder is missing or unreadable.
