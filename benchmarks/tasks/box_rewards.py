@@ -2,8 +2,8 @@
 
     python -m benchmarks.tasks.box_rewards [--episodes 32]
 
-Episodes are those of the scripted pusher. Prints the share of images in which the gripper hides the box, and, by the distance of
-the box from where it is in the goal, the share of positive rewards.
+Episodes are those of the scripted pusher. Prints the share of images in which the gripper hides the box and, by the distance
+of the box from where it is in the goal, the share of positive rewards.
 """
 
 import argparse
