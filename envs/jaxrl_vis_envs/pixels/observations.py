@@ -104,15 +104,17 @@ class ImageObserver:
     def _draw(self, scene: Scene, data: mjx.Data) -> jax.Array:
         """Render one image [channels, H, W]."""
         wants_colour, wants_depth = self._config.pixels != "depth", self._config.pixels != "rgb"
-        is_marked = self._marked is not None
-        planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth, segmentation=is_marked, quantized=True)
+        marks = self._marked is not None
+        planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth, segmentation=marks, quantized=True)
         channels = []
         if planes.rgb is not None:
             channels.append(planes.rgb)
         if planes.depth is not None:
             channels.append(self._encode(planes.depth)[None])
         image = jnp.concatenate(channels)
-        return image if self._marked is None else mark_object(image, jnp.isin(planes.segmentation, self._marked))
+        if planes.segmentation is None:
+            return image
+        return mark_object(image, jnp.isin(planes.segmentation, jnp.asarray(self._marked)))
 
     def _encode(self, depth: jax.Array) -> jax.Array:
         if self._config.depth_encoding == "zbuffer":
