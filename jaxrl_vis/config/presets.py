@@ -138,8 +138,8 @@ TASKS: Mapping[tuple[str, str], TaskValues] = {
         images={"random_shift": 1, "relabel_probability": 0.8},
         images_and_oracle={"balance_probability": 0.3},
     ),
-    # A box that the gripper never touches has met all its relabelled goals: keeping few of them makes the policy seek the box. Images
-    # take longer per gradient step and need more of them, so rollouts are larger and updates fewer.
+    # As many sampled transitions per environment step as in the literature, or more. Until the gripper meets the box, all relabelled
+    # goals are already reached: few of these are kept. Images need more steps, so rollouts are larger and updates fewer.
     ("fast", "FetchPush"): TaskValues(
         always={
             "num_envs": 200,
