@@ -138,8 +138,8 @@ TASKS: Mapping[tuple[str, str], TaskValues] = {
         images={"random_shift": 1, "relabel_probability": 0.8},
         images_and_oracle={"balance_probability": 0.3},
     ),
-    # As many sampled transitions per environment step as in the literature, or more. Until the gripper meets the box, all relabelled
-    # goals are already reached: few of these are kept. Images need more steps, so rollouts are larger and updates fewer.
+    # As many sampled transitions per environment step as in the literature, or more. Until the gripper meets the box, all
+    # relabelled goals are already reached: few of these are kept. Images need more steps: larger rollouts, fewer updates.
     ("fast", "FetchPush"): TaskValues(
         always={
             "num_envs": 200,
