@@ -66,6 +66,7 @@ def indicator_reward(
     num_axes: int = 3,
     tolerance: float = 0.0,
     share: float = 1.0,
+    compared: jax.Array | None = None,
 ) -> jax.Array:
     """Compute the indicator reward (thesis, equation 5.4): ``positive`` if observation and goal are equal, else ``negative``.
 
@@ -77,13 +78,21 @@ def indicator_reward(
         num_axes: Number of axes of one observation: 3 for images, 1 for state vectors.
         tolerance: Difference up to which two elements count as equal, in their unit (grey levels for images).
         share: Fraction of the elements that must be equal.
+        compared: bool, broadcastable to ``goal``, True for the elements to compare; None for all. If none is, the reward is
+            negative.
 
     Returns:
         [...] float32.
     """
     numpy = _namespace(observation, goal)
     axes = tuple(range(-num_axes, 0))
-    if tolerance == 0.0 and share == 1.0:
+    if compared is not None:
+        compared = numpy.broadcast_to(compared, goal.shape)
+        count = numpy.sum(compared, axis=axes)
+        difference = numpy.abs(observation.astype(numpy.float32) - goal.astype(numpy.float32))
+        differing = numpy.sum(compared & (difference > tolerance), axis=axes)
+        equal = (count > 0) & (differing <= numpy.floor((1.0 - share) * count + 1e-6))
+    elif tolerance == 0.0 and share == 1.0:
         equal = numpy.all(observation == goal, axis=axes)
     else:
         difference = numpy.abs(observation.astype(numpy.float32) - goal.astype(numpy.float32))

@@ -133,9 +133,9 @@ class GoalOptions:
     future_goals: Literal["even", "geometric"] = "even"
     """Distribution of relabelled goals over the rest of the episode: uniform (even), or proportional to gamma^k after k further
     steps (geometric)."""
-    trivial_goals: Annotated[Share, NEEDS_STATES] = 1.0
-    """Fraction of the relabelled goals already reached before the action that is kept; the rest are replaced by observations
-    from other episodes."""
+    trivial_goals: Share = 1.0
+    """Fraction of the relabelled goals already reached before the action, as the oracle or an indicator judges, that is kept;
+    the rest are replaced by observations from other episodes."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config, validate
+from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import contrastive, td3
 from jaxrl_vis.learner import iteration as iterations
@@ -40,6 +41,7 @@ from jaxrl_vis.learner.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, Statistics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_default_device
+from jaxrl_vis_envs.pixels import object_mask
 
 JIT_OPTIONS: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "learn": {"donate_argnums": 0}}
 """Further arguments of `jaxrl_vis_envs.jit`, by program."""
@@ -179,6 +181,24 @@ class TrainStep:
         )
 
 
+def _object_mask(env: GoalEnv, config: Config, resolved: Resolved) -> Callable[[jax.Array], jax.Array] | None:
+    """Return the function that reads the object's mask from images, if the environment marks one, for indicators.
+
+    Raises:
+        RequestError: No reward reads the mask, or noise hides it.
+    """
+    if not env.marks_object:
+        return None
+    reward = resolved.method.reward
+    if reward not in ("indicator", "indicator_tolerance") and not callable(reward):
+        raise RequestError(
+            f"goal_mask=object is for indicator rewards, and this is --method {config.reward.method}: leave it out"
+        )
+    if config.environment.observation_noise:
+        raise RequestError("goal_mask=object and observation_noise exclude each other: the mask is the lowest bit of an image")
+    return object_mask
+
+
 def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, policy_alone: bool = False) -> TrainStep:
     """Build the programs of a run. Nothing is compiled or allocated yet.
 
@@ -208,7 +228,8 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
     replay = replay._replace(num_envs=config.run.num_envs // shards.count)
     stored = auxiliary.stored_spec(env.observation_spec, env.horizon)
     replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, stored)
-    sampler = Sampler(config, resolved, replay, env.threshold, env.as_goal if env.converts_goals else None, auxiliary, shards)
+    as_goal, mask = env.as_goal if env.converts_goals else None, _object_mask(env, config, resolved)
+    sampler = Sampler(config, resolved, replay, env.threshold, as_goal, auxiliary, shards, mask)
     insert = iterations.make_insert(config, sampler, auxiliary)
     with tracing_for_default_device():
         plays_any = targets_cpu() and layout.mesh is None and shards.count == 1

@@ -187,7 +187,14 @@ def test_a_threshold_needs_a_method_that_filters() -> None:
         resolve(Config().replace(method="indicator_balance_filter", filter_threshold=1000.0), 50)
 
 
-@pytest.mark.parametrize("option", [{"n_step": 3}, {"trivial_goals": 0.5}])
+@pytest.mark.parametrize("method", ["autoencoder", "features"])
+def test_trivial_goals_need_a_reward_that_tells_what_is_reached(method: MethodName) -> None:
+    with pytest.raises(RequestError, match=f"trivial_goals needs the oracle or an indicator.*{method}"):
+        validate(Config().replace(method=method, trivial_goals=0.5))
+    assert validate(Config().replace(method="indicator", trivial_goals=0.5))
+
+
+@pytest.mark.parametrize("option", [{"n_step": 3}, {"reward_noise": 0.5}])
 @pytest.mark.parametrize("method", [name for name in METHODS if METHODS[name].reward != "oracle"])
 def test_what_reads_true_states_is_refused_where_there_are_none(option: dict[str, Any], method: MethodName):
     with pytest.raises(RequestError, match=next(iter(option))):

@@ -318,7 +318,8 @@ def test_a_target_sums_the_rewards_of_several_steps():
     np.testing.assert_allclose(values(program, train, [-3.0, -2.0, -1.0], [0.0] * 3), expected, atol=0.3)
 
 
-def test_goals_that_are_reached_already_give_way():
+@pytest.mark.parametrize("method", ["oracle", "indicator"])
+def test_goals_that_are_reached_already_give_way(method):
     """To what other episodes observed: points that stay where they are, each elsewhere, have reached all their own goals."""
 
     class Elsewhere(probes.AlwaysThere):
@@ -328,7 +329,7 @@ def test_goals_that_are_reached_already_give_way():
 
     shares = {}
     for kept in (1.0, 0.25, 0.0):
-        config = preset("debug", num_envs=16, batch_size=512, relabel_probability=1.0, trivial_goals=kept)
+        config = preset("debug", num_envs=16, batch_size=512, relabel_probability=1.0, trivial_goals=kept, method=method)
         program = make_train_step(Elsewhere(), config)
         _, metrics = program.update_many(*experienced(program, KEYS[0]))
         shares[kept] = float(metrics["train/positive_share"][0])

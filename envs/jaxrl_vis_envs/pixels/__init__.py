@@ -20,6 +20,7 @@ from jaxrl_vis_envs.pixels.observations import (
     encode_depth,
     encode_zbuffer,
     image_observer,
+    object_mask,
 )
 from jaxrl_vis_envs.pixels.views import OUTPUTS, Views
 from jaxrl_vis_envs.pixels.wrapping import PixelEnv, wrap
@@ -37,5 +38,6 @@ __all__ = [
     "encode_depth",
     "encode_zbuffer",
     "image_observer",
+    "object_mask",
     "wrap",
 ]

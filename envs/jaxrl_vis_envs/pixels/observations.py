@@ -7,6 +7,9 @@ outside. With ``depth_encoding="zbuffer"`` it is the content of OpenGL's depth b
 ``frame_stack`` images, of this control step and the preceding ones, can be stacked along the channels, newest first. Past
 states are stored as joint positions (`State.history`) and rendered again: rendering is cheaper than the physics, and the state
 contains no images.
+
+If an object is marked, the lowest bit of the first channel is 1 in its pixels and 0 elsewhere (`object_mask`). The shape of an
+observation and the size of a replay thus stay the same, and no pixel changes by more than one grey level.
 """
 
 import dataclasses
@@ -16,6 +19,7 @@ from typing import Literal, get_args
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from jaxrl_vis_envs import checks
 from jaxrl_vis_envs.physics import mjx_model
@@ -68,13 +72,14 @@ class ImageObserver:
         spec: Shape and dtype of an observation.
     """
 
-    def __init__(self, mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> None:
+    def __init__(self, mj_model: mujoco.MjModel, camera: str, config: PixelsConfig, marked: str | None = None) -> None:
         """Build the scene; see `image_observer`."""
         size = config.image_size
         self.scene = Scene.from_mjmodel(mj_model, camera=camera, height=size, width=size)
         self.spec = jax.ShapeDtypeStruct((config.frame_stack * CHANNELS[config.pixels], size, size), jnp.uint8)
         self._config = config
         self._model = mjx_model.put_model(mj_model)
+        self._marked = None if marked is None else np.flatnonzero(mj_model.geom_bodyid == mj_model.body(marked).id)
 
     def __call__(self, data: mjx.Data, history: jax.Array | None = None, domain: Domain | None = None) -> jax.Array:
         """Render an observation.
@@ -99,13 +104,17 @@ class ImageObserver:
     def _draw(self, scene: Scene, data: mjx.Data) -> jax.Array:
         """Render one image [channels, H, W]."""
         wants_colour, wants_depth = self._config.pixels != "depth", self._config.pixels != "rgb"
-        planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth, quantized=True)
+        marks = self._marked is not None
+        planes = render_planes(scene, data, rgb=wants_colour, depth=wants_depth, segmentation=marks, quantized=True)
         channels = []
         if planes.rgb is not None:
             channels.append(planes.rgb)
         if planes.depth is not None:
             channels.append(self._encode(planes.depth)[None])
-        return jnp.concatenate(channels)
+        image = jnp.concatenate(channels)
+        if planes.segmentation is None:
+            return image
+        return mark_object(image, jnp.isin(planes.segmentation, jnp.asarray(self._marked)))
 
     def _encode(self, depth: jax.Array) -> jax.Array:
         if self._config.depth_encoding == "zbuffer":
@@ -113,18 +122,29 @@ class ImageObserver:
         return encode_depth(depth, self._config.depth_range)
 
 
-def image_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) -> ImageObserver:
+def image_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig, marked: str | None = None) -> ImageObserver:
     """Build the observer of an image task, for `MjxGoalEnv`.
 
     Args:
         mj_model: MuJoCo model.
         camera: Name of one of its cameras.
         config: Size, channels, depth range, frame stack.
+        marked: Name of the body whose pixels are marked (`object_mask`); None for none.
 
     Raises:
         ValueError: There is no such camera, or something in its view cannot be rendered.
     """
-    return ImageObserver(mj_model, camera, config)
+    return ImageObserver(mj_model, camera, config, marked)
+
+
+def mark_object(image: jax.Array, mask: jax.Array) -> jax.Array:
+    """Write a mask [H, W] bool into the lowest bit of the first channel of an image [C, H, W] uint8."""
+    return image.at[0].set(image[0] & 0xFE | mask.astype(jnp.uint8))
+
+
+def object_mask(image: jax.Array) -> jax.Array:
+    """Read the mask that `mark_object` wrote, of a stack the newest image's: [..., C, H, W] uint8 -> [..., 1, H, W] bool."""
+    return (image[..., :1, :, :] & 1).astype(bool)
 
 
 def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Array:

@@ -12,7 +12,7 @@ State: middle of the box in the world, m. Action: as in FetchReach.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +86,13 @@ class VisualFetchPushConfig(PixelsConfig, FetchPushConfig):
 
     depth_range: tuple[float, float] = (0.4, 1.8)
     """Depths encoded as 0 and 255, m: 5.5 mm per step, from in front of the nearest gripper to behind the robot."""
+    goal_mask: Literal["none", "object"] = "none"
+    """Part of the images that indicator rewards compare: all (none), or the box's pixels by segmentation (object), which the
+    lowest bit of the first channel then marks."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.choice(self, "goal_mask", ("none", "object"))
 
 
 class FetchPush(FetchArm):
@@ -109,6 +116,10 @@ class FetchPush(FetchArm):
         self._box_velocity = int(mj_model.joint("box").dofadr[0])
         super().__init__(config, mj_model, observer)
         self._goal_pose, self._goal_grip = self._lifted(mj_model)
+
+    @classmethod
+    def select_marked(cls, config: Any) -> str | None:
+        return "box" if getattr(config, "goal_mask", "none") == "object" else None
 
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
         """Return the original's start, in which the fingers still penetrate the table by 2.5 mm."""

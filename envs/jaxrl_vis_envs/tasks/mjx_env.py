@@ -58,6 +58,7 @@ class MjxGoalEnv(GoalEnv):
         self.mj_model = mj_model
         self._model = mjx_model.put_model(mj_model)
         self._draw = observer(mj_model) if observer is not None else None
+        self.marks_object = self._draw is not None and self.select_marked(config) is not None
         self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
         self._scene: Scene | None = getattr(self._draw, "scene", None)
         if self._randomization.varies_appearance and self._scene is None:
@@ -68,6 +69,12 @@ class MjxGoalEnv(GoalEnv):
         """Return the name of the model camera that the visual task uses with these settings."""
         del config
         return cls.camera
+
+    @classmethod
+    def select_marked(cls, config: Any) -> str | None:
+        """Return the name of the body that images mark with these settings (`pixels.object_mask`); None for none."""
+        del config
+        return None
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
@@ -184,7 +191,8 @@ def register_task(task: type[MjxGoalEnv], config_class: type, visual_config_clas
     build: Any = task  # subclasses build the model themselves and take no `mj_model`
 
     def build_visual(config: Any) -> MjxGoalEnv:
-        return build(config, lambda mj_model: image_observer(mj_model, task.select_camera(config), config))
+        camera, marked = task.select_camera(config), task.select_marked(config)
+        return build(config, lambda mj_model: image_observer(mj_model, camera, config, marked))
 
     name = task.__name__
     register(name, lambda config: build(config, None), config_class)

@@ -56,8 +56,14 @@ def features_method(encode: Callable[[jax.Array], jax.Array]) -> Method:
     return Method(reward=features_reward(encode), filter=False, reward_positive=1.0, reward_negative=0.0)
 
 
-def make_reward(config: Config, method: Method) -> RewardFunction:
+def make_reward(config: Config, method: Method, mask: Callable[[jax.Array], jax.Array] | None = None) -> RewardFunction:
     """Build the reward function of a method: (Batch, reached [B, ...], R+, R-) -> [B] float32.
+
+    Args:
+        config: Configuration with the tolerance and the encoder.
+        method: The method.
+        mask: Function from observations to the mask of the elements that matter, [B, ...] bool, broadcastable to them.
+            Indicators compare those that matter in the achieved observation or in the goal; None for all elements.
 
     Raises:
         RequestError: The frozen encoder is missing or unreadable.
@@ -74,6 +80,7 @@ def make_reward(config: Config, method: Method) -> RewardFunction:
 
     def indicator(batch: Any, reached: jax.Array, positive: float, negative: float) -> jax.Array:
         values = {"positive": positive, "negative": negative, "num_axes": reached.ndim - 1}
-        return goals.indicator_reward(reached, batch.goal, tolerance=tolerance, share=share, **values)
+        compared = None if mask is None else mask(reached) | mask(batch.goal)
+        return goals.indicator_reward(reached, batch.goal, tolerance=tolerance, share=share, compared=compared, **values)
 
     return indicator

@@ -41,6 +41,8 @@ class Choice(NamedTuple):
         shift: [B, 2] int32, see `Batch`; or None.
         target_key: [] a typed key, for targets of auxiliary tasks; or None.
         clutter_end: [] float32, see `reward_errors`; or None.
+        gives_way: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached; None
+            if none is, or if true states have decided that (``goal_episode``).
     """
 
     indices: Indices
@@ -49,6 +51,7 @@ class Choice(NamedTuple):
     shift: jax.Array | None = None
     target_key: jax.Array | None = None
     clutter_end: jax.Array | None = None
+    gives_way: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +67,7 @@ class Sampler:
             have the form of goals.
         auxiliary: Auxiliary tasks whose targets are added to batches.
         shards: Shards of the learner. ``replay`` and batches are those of one shard; the configured batch size is the total.
+        mask: Mask of the elements that indicators compare (`rewards.make_reward`); None for all.
     """
 
     config: Config
@@ -73,6 +77,7 @@ class Sampler:
     as_goal: Callable[[jax.Array], jax.Array] | None = None
     auxiliary: Auxiliary | None = None
     shards: Shards = ONE
+    mask: Callable[[jax.Array], jax.Array] | None = None
 
     def choose(self, state: ReplayState, key: jax.Array, iteration: jax.Array) -> Choice:
         """Sample B transitions and their goals; every shard samples those of the whole learner and keeps its own part.
@@ -87,9 +92,7 @@ class Sampler:
         goal_slot = self.goal_slots(goal_key, indices.time)
         choice = Choice(indices, goal_slot)
         if self.config.goals.trivial_goals < 1.0:
-            is_replaced = self._replaced(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
-            # Transitions are sampled at random, so the next transition's episode is a random one.
-            choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
+            choice = self._without_trivial(state, choice, jax.random.fold_in(key, _TRIVIAL))
         if self.config.network.random_shift:
             most, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
@@ -117,18 +120,34 @@ class Sampler:
         discount = self.resolved.discount if self.config.goals.future_goals == "geometric" else None
         return choose_goal_slots(key, time, self.replay.horizon, *shares, discount)
 
-    def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
-        """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
+    def _without_trivial(self, state: ReplayState, choice: Choice, key: jax.Array) -> Choice:
+        """Have most of the relabelled goals that are already reached replaced by another episode's.
 
         They are not replaced by original goals. If these look different from observations in episodes (VisualFingerTurn's
         finger always hangs down in them), rarely reached goals would all share that look, and the critic could infer rewards
         from it.
         """
-        episode, time = indices
+        (episode, time), goal_slot = choice.indices, choice.goal_slot
+        gives_way = ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
+        gives_way &= goal_slot <= self.replay.horizon
+        if self.resolved.method.reward != "oracle":  # observations decide, which are not read yet
+            return choice._replace(gives_way=gives_way)
         states = state.episodes.states
-        is_trivial = goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
-        is_trivial &= goal_slot <= self.replay.horizon
-        return is_trivial & ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
+        gives_way &= goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
+        # Transitions are sampled at random, so the next transition's episode is a random one.
+        return choice._replace(goal_episode=jnp.where(gives_way, jnp.roll(episode, 1), episode))
+
+    def _with_goals_of_others(self, batch: Batch, gives_way: jax.Array) -> Batch:
+        """Replace the goals that ``gives_way`` [B] allows, and that are reached before the action, by the next transition's."""
+        before = batch.observation_t if self.as_goal is None else jax.vmap(self.as_goal)(batch.observation_t)
+        gives_way = gives_way & (self._reward(batch, before, 1.0, 0.0) > 0.0)
+
+        def replaced(values: jax.Array) -> jax.Array:
+            chosen = gives_way.reshape(-1, *(1,) * (values.ndim - 1))
+            return jnp.where(chosen, jnp.roll(values, 1, axis=0), values)
+
+        observations = batch.observations.at[1].set(replaced(batch.goal))
+        return batch.replace(observations=observations, goal_state=replaced(batch.goal_state))
 
     def batch(self, state: ReplayState, choice: Choice) -> Batch:
         """Read the chosen transitions, with goals at rest, and compute their rewards.
@@ -152,6 +171,8 @@ class Sampler:
             batch = batch.replace(reached=reached)
             if batch.goal.ndim == 2:  # of states; the replay repeats a goal's newest image itself
                 batch = batch.replace(observations=batch.observations.at[1].set(jax.vmap(self.as_goal)(batch.goal)))
+        if choice.gives_way is not None:
+            batch = self._with_goals_of_others(batch, choice.gives_way)
         if self.config.study.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
@@ -189,7 +210,7 @@ class Sampler:
 
     @functools.cached_property
     def _reward(self) -> RewardFunction:
-        return make_reward(self.config, self.resolved.method)
+        return make_reward(self.config, self.resolved.method, self.mask)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
         """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""
