@@ -30,7 +30,7 @@ MOST_BYTES = 2 * 1024**2
 
 def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, episodes: int) -> Score:
     """Evaluate one seed of a run, or a policy alone, on fresh episodes."""
-    trainer = open_run(run_dir, keep_programs=True, eval_episodes=episodes)
+    trainer = open_run(run_dir, cache_programs=True, eval_episodes=episodes)
     metrics = trainer.evaluate(load(trainer, run_dir, checkpoint).train, jax.random.key(FRESH_KEY))
     row = {name: float(values[trainer.seeds.index(seed)]) for name, values in metrics.items()}
     return score({**row, "env_steps": iteration * trainer.program.steps_per_iteration}, episodes)

@@ -176,7 +176,7 @@ def run(options: Train) -> int:
         resume=options.resume,
         overwrite=options.overwrite,
         log=options.log or None,
-        keep_programs=True,
+        cache_programs=True,
     )
     for _ in run_trainer.run():
         pass

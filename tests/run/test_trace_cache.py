@@ -204,7 +204,7 @@ def test_commands_find_what_training_has_traced(command, tmp_path, monkeypatch, 
     assert asked == [True] and "enough" in capsys.readouterr().err
 
 
-def test_commands_keep_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys):
+def test_commands_cache_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys):
     asked = []
 
     def remember(config, program, keep=False):

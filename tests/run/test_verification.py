@@ -310,7 +310,7 @@ def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, run
 
 def test_the_command_says_what_it_found(copy, verified, monkeypatch, capsys):
     monkeypatch.setattr(
-        verification, "verify_run", lambda path, iterations, keep_programs, say, trust: verified(path, iterations, say)
+        verification, "verify_run", lambda path, iterations, cache_programs, say, trust: verified(path, iterations, say)
     )
     assert cli.main(["verify", str(copy)]) == 0
     out = capsys.readouterr().out

@@ -37,7 +37,7 @@ def run(options: Eval) -> int:
         check_writable(options.json, "--json")
     from jaxrl_vis.run.trained.restored_run import evaluate_run
 
-    figures = evaluate_run(run_dir, episodes=options.episodes, keep_programs=True, trust=trust, checkpoint=checkpoint)
+    figures = evaluate_run(run_dir, episodes=options.episodes, cache_programs=True, trust=trust, checkpoint=checkpoint)
     for name, per_seed in figures.items():
         print(f"{name:28}" + "".join(f" {value:9.4f}" for value in per_seed))
     if options.json is not None:

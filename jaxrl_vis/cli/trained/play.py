@@ -56,7 +56,7 @@ def run(options: Play) -> int:
             out,
             episodes=options.episodes,
             three_dimensional=options.html,
-            keep_programs=True,
+            cache_programs=True,
             trust=trust,
             checkpoint=checkpoint,
         )

@@ -21,12 +21,12 @@ from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
 
 
-def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
+def open_run(run_dir: Path | str, cache_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
     """Create the trainer of a run on one device, with changed fields of its configuration; its folder is not modified.
 
     Args:
         run_dir: The run folder.
-        keep_programs: As in `make_trainer`; programs traced by the training are reused.
+        cache_programs: As in `make_trainer`; programs traced by the training are reused.
         trust: Allow execution of the run's custom code (`jaxrl_vis.run.trust`).
         **changes: New values of fields of `Config`.
 
@@ -40,7 +40,7 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
     alone = policy_file.holds_policy(folder)
     if alone:
         config = config.replace(seed=policy_file.read_source(folder).seed, seeds=1)
-    return make_trainer(config, keep_programs=keep_programs, policy_alone=alone)
+    return make_trainer(config, cache_programs=cache_programs, policy_alone=alone)
 
 
 Choice = int | Literal["best"] | None
@@ -94,7 +94,7 @@ def _load_best(trainer: Trainer, run_dir: Path | str, checkpoints: Checkpoints) 
 def evaluate_run(
     run_dir: Path | str,
     episodes: int | None = None,
-    keep_programs: bool = False,
+    cache_programs: bool = False,
     trust: bool = False,
     checkpoint: Choice = None,
 ) -> dict[str, list[float]]:
@@ -103,7 +103,7 @@ def evaluate_run(
     Args:
         run_dir: The run folder.
         episodes: Number of episodes; None for that of the training.
-        keep_programs, trust: As in `open_run`.
+        cache_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Returns:
@@ -112,7 +112,7 @@ def evaluate_run(
     Raises:
         RequestError: There is no run, no usable checkpoint, or too little memory for this number of episodes.
     """
-    trainer = open_run(run_dir, keep_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
+    trainer = open_run(run_dir, cache_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir, checkpoint)
     check_compiled(trainer.programs.of_evaluation(), already_there=True)
     values = jax.device_get(trainer.evaluate(restored.train))
@@ -124,7 +124,7 @@ def play_run(
     out: Path | str,
     episodes: int = 6,
     three_dimensional: bool = False,
-    keep_programs: bool = False,
+    cache_programs: bool = False,
     trust: bool = False,
     checkpoint: Choice = None,
 ) -> None:
@@ -136,7 +136,7 @@ def play_run(
         episodes: Number of episodes.
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
             variants.
-        keep_programs, trust: As in `open_run`.
+        cache_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Raises:
@@ -144,7 +144,7 @@ def play_run(
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)
-    trainer = open_run(run_dir, keep_programs, trust, eval_episodes=num_recorded(max(1, episodes)))
+    trainer = open_run(run_dir, cache_programs, trust, eval_episodes=num_recorded(max(1, episodes)))
     programs = trainer.programs
     if not (programs.shows_images or three_dimensional):
         raise RequestError(

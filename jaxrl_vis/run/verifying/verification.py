@@ -51,7 +51,7 @@ EVALUATIONS = 2
 def verify_run(
     run_dir: Path | str,
     iterations: int | None = None,
-    keep_programs: bool = False,
+    cache_programs: bool = False,
     say: Callable[[str], None] = lambda line: None,
     trust: bool = False,
 ) -> Verification:
@@ -60,7 +60,7 @@ def verify_run(
     Args:
         run_dir: The run folder; the run may still be in progress.
         iterations: Number of iterations to repeat from each start; None: up to the second evaluation.
-        keep_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
+        cache_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
         say: Called with a line about each step.
         trust: Allow the run's own code, if its task is module:Name and was trained by another user.
 
@@ -81,7 +81,7 @@ def verify_run(
     if config.run.devices > devices:
         findings.elsewhere.append(f"the run was on {config.run.devices} devices, and is repeated on one")
         config = config.replace(devices=1, data_devices=None)
-    trainer = make_trainer(config, keep_programs=keep_programs)
+    trainer = make_trainer(config, cache_programs=cache_programs)
     return verify(trainer, path, record, iterations, findings, say)
 
 
