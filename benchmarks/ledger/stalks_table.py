@@ -29,7 +29,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
     for factor, lens in lenses.items():
         errors = lens["errors_mm"]
         beside = [errors[stalk] - usual[stalk] for stalk in errors.keys() & usual.keys()]
-        tried = lens["density"] >= TRIED.density and lens["view"] >= TRIED.view
+        tried = lens["density"] >= TRIED.pixels_per_metre and lens["view"] >= TRIED.view
         cells = (
             f"x {factor}",
             f"{lens['density']:.0f}",

@@ -67,9 +67,9 @@ def draw(folder: Path, part: str, family: str, number: int) -> Path:
         thinned = np.asarray(instance[::4, ::4]), np.asarray(depth[::4, ::4])
         stalks, kinds, _ = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         arrays |= {f"image_{place}": np.asarray(image), f"stalks_{place}": stalks, f"kinds_{place}": kinds}
-    density = sequence.drive.stated.focal / sequence.plot.family.rig.distance
+    pixels_per_metre = sequence.drive.stated.focal / sequence.plot.family.rig.distance
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez(path, density=density, **arrays)
+    np.savez(path, pixels_per_metre=pixels_per_metre, **arrays)
     return path
 
 
@@ -79,10 +79,10 @@ def plain_measures(image: np.ndarray) -> tuple[float, float]:
     return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
 
 
-def see(finder: Finder, image: np.ndarray, density: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def see(finder: Finder, image: np.ndarray, pixels_per_metre: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Detect stalks in an image: return detections [N, 6] in its own coordinates, their scores, and the pooled features."""
     frame = find_frame(image)
-    stalks, scores, pooled = finder.look(fill_borders(image, frame), density)
+    stalks, scores, pooled = finder.look(fill_borders(image, frame), pixels_per_metre)
     over, down = frame.columns[0], frame.lines[0]
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
 

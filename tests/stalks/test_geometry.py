@@ -39,14 +39,14 @@ def sample() -> tuple[np.ndarray, np.ndarray, Calibration]:
 def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
     settings = Settings()
     whole = np.zeros((845, 1055, 3), np.uint8)
-    density = 677.5 / 0.8
-    assert resize(whole, settings, density)[0].shape[:2] == resize(whole, settings, None)[0].shape[:2] == (676, 844)
-    assert resize(whole[:, 600:900], settings, density)[0].shape[:2] == (676, 240)
-    assert resize(np.pad(whole, ((0, 0), (500, 555), (0, 0))), settings, density)[0].shape[:2] == (676, 1688)
-    assert resize(whole, settings, 0.6 * density)[0].shape[:2] == (1127, 1407)  # a wider lens: enlarged
-    assert resize(whole, settings, 1.66 * density)[0].shape[:2] == (407, 508)
-    # Networks that learned from images of unknown cameras know no density.
-    assert resize(whole[:, :900], dataclasses.replace(settings, density=0.0), density)[0].shape[1] == 844
+    pixels_per_metre = 677.5 / 0.8
+    assert resize(whole, settings, pixels_per_metre)[0].shape[:2] == resize(whole, settings, None)[0].shape[:2] == (676, 844)
+    assert resize(whole[:, 600:900], settings, pixels_per_metre)[0].shape[:2] == (676, 240)
+    assert resize(np.pad(whole, ((0, 0), (500, 555), (0, 0))), settings, pixels_per_metre)[0].shape[:2] == (676, 1688)
+    assert resize(whole, settings, 0.6 * pixels_per_metre)[0].shape[:2] == (1127, 1407)  # a wider lens: enlarged
+    assert resize(whole, settings, 1.66 * pixels_per_metre)[0].shape[:2] == (407, 508)
+    # Networks that learned from images of unknown cameras have no resolution.
+    assert resize(whole[:, :900], dataclasses.replace(settings, pixels_per_metre=0.0), pixels_per_metre)[0].shape[1] == 844
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
         assert fault is None
     else:
         assert fault is not None and told in fault and "that were tried: use" in fault and "\n" not in fault
-        assert f"{TRIED.density:.0f}" in fault or f"{TRIED.view:.2f} m" in fault
+        assert f"{TRIED.pixels_per_metre:.0f}" in fault or f"{TRIED.view:.2f} m" in fault
 
 
 def test_widths_do_not_depend_on_crops_borders_and_lenses():
@@ -144,9 +144,9 @@ def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, 
     left, right, finds = stalks_at(disparity)
     asked = []
 
-    def find(image: np.ndarray, density: float | None) -> list[Detection]:
-        assert density is not None
-        asked.append(CAMERA.focal / density)
+    def find(image: np.ndarray, pixels_per_metre: float | None) -> list[Detection]:
+        assert pixels_per_metre is not None
+        asked.append(CAMERA.focal / pixels_per_metre)
         return finds if abs(asked[-1] * disparity / 54.2 - 1.0) < 0.12 else []
 
     view = view_pair(find, left, right, CAMERA)

@@ -22,7 +22,7 @@ SIZE = (120, 100)
 
 @pytest.fixture
 def leaning() -> tuple[Detection, np.ndarray]:
-    """A find of a leaning strip of 9 pixels, whose snip goes on beyond its box, and its mask within the box."""
+    """A find of a leaning strip of 9 pixels, whose crop goes on beyond its box, and its mask within the box."""
     mask = np.zeros(SIZE, bool)
     for line in range(SIZE[0]):
         mask[line, 40 + line // 5 : 49 + line // 5] = True
@@ -69,7 +69,7 @@ def test_label_writes_beside_the_images_and_keeps_what_is_there(tmp_path, capsys
     weights, images = tmp_path / "tiny.safetensors", tmp_path / "images"
     write_weights(weights, params, TINY, {"origin": "nothing"})
     images.mkdir()
-    words = ["phenotype", "label", str(images), "--weights", str(weights), "--least-score", "0"]
+    words = ["phenotype", "label", str(images), "--weights", str(weights), "--min-score", "0"]
     assert cli.main(words) == 2
     assert "there are no images in" in capsys.readouterr().err
     for name in ("a.png", "b.png"):

@@ -22,14 +22,14 @@ class Label:
     LabelMe .json beside each image."""
     weights: Path | None = None
     """Weights from `phenotype train`; the shipped ones if not given."""
-    least_score: float = 0.3
+    min_score: float = 0.3
     """Minimum score of a proposal, 0 to 1; low, as deleting a false one is quicker than drawing a missing one."""
 
 
 def label(options: Label) -> int:
     """Write the proposals, and return the exit status: 3 if images were skipped."""
-    if not 0.0 <= options.least_score <= 1.0:
-        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    if not 0.0 <= options.min_score <= 1.0:
+        raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_extra("phenotyping")
     from jaxrl_vis.stalks.phenotyping.io.folders import image_files
     from jaxrl_vis.stalks.phenotyping.report.proposals import write_coco, write_labelme
@@ -55,7 +55,7 @@ def label(options: Label) -> int:
     from jaxrl_vis.stalks.phenotyping.io.images import read_image, rgb8
 
     weights = resolve_weights(options.weights)
-    find = load_finder(weights, options.least_score)
+    find = load_finder(weights, options.min_score)
     found, skipped = [], 0
     for place, path in enumerate(paths, start=1):
         try:

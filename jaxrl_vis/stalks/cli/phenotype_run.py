@@ -34,7 +34,7 @@ class Run(CameraOptions):
     """Source of masks: the networks, or the ground truth of synthetic plots, to evaluate everything downstream of the masks."""
     method: Literal["strip", "ellipse"] = "strip"
     """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
-    least_score: float = 0.5
+    min_score: float = 0.5
     """Minimum score of a detection that counts as a stalk, 0 to 1."""
     disparity_scale: float = 256.0
     """Scale of 16-bit disparity files (disparity_000.png beside the images): their values divided by it are pixels. 256 for
@@ -53,8 +53,8 @@ class Run(CameraOptions):
 
 def run(options: Run) -> int:
     """Process the plots, write tables, the page and overlays, and return the exit status: 3 if pairs were skipped."""
-    if not 0.0 <= options.least_score <= 1.0:
-        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    if not 0.0 <= options.min_score <= 1.0:
+        raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_speed(options.speed)
     if not options.disparity_scale > 0:
         raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
@@ -92,19 +92,17 @@ def run(options: Run) -> int:
         from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, find_stalks, load_finder, resolve_weights
 
         weights = resolve_weights(options.weights)
-        gate = load_finder(weights, options.least_score).gate  # reports what is wrong with the weights
-        name = f"{detector_name(weights)}, least score {options.least_score:g}"
+        gate = load_finder(weights, options.min_score).gate  # reports what is wrong with the weights
+        name = f"{detector_name(weights)}, least score {options.min_score:g}"
         if gate is None:
             print(
                 "these weights have no gate: nothing tells whether your images are like those that they know", file=sys.stderr
             )
-        find = functools.partial(find_stalks, weights, options.least_score)
+        find = functools.partial(find_stalks, weights, options.min_score)
 
     tried = TRIED if options.masks == "network" else None
-    most_doubt = None if gate is None else gate.threshold
-    request = Request(
-        options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried, most_doubt
-    )
+    max_doubt = None if gate is None else gate.threshold
+    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried, max_doubt)
     for plot in plots:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)

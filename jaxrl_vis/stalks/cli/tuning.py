@@ -60,7 +60,7 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
         steps=options.steps or _STEPS,
         minutes=options.minutes,
         batch=options.batch,
-        snips=options.snips if masks or start is None else 0,
+        crops=options.crops if masks or start is None else 0,
         rate=options.rate or (_RATE_FROM_RANDOM if start is None else _RATE),
         seed=options.seed,
     )
@@ -168,10 +168,10 @@ def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Sett
         return None, settings_for(folder, Settings(), options.label), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
     fitting = settings_for(folder, settings, options.label)
-    if not 0.5 <= fitting.band_lines / settings.band_lines <= 2.0:
+    if not 0.5 <= fitting.band_height / settings.band_height <= 2.0:
         why = (
-            f"boxes of {folder} are {fitting.band_lines:.0f} pixels tall in images of {fitting.width}, and those that "
-            f"the weights `{start}` find {settings.band_lines:.0f}"
+            f"boxes of {folder} are {fitting.band_height:.0f} pixels tall in images of {fitting.width}, and those that "
+            f"the weights `{start}` find {settings.band_height:.0f}"
         )
         if options.start is not None:
             raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
@@ -181,7 +181,7 @@ def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Sett
     # candidates is not: training adapts the head to new ones.
     settings = dataclasses.replace(
         fitting,
-        band_lines=settings.band_lines,
+        band_height=settings.band_height,
         anchor_widths=settings.anchor_widths,
         candidates=Settings().candidates,
     )

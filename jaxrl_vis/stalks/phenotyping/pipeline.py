@@ -74,7 +74,7 @@ class Request:
         speed: Speed of the robot, m/s, for odometry with times only; None if unknown.
         disparity_scale: Divisor of disparities in 16-bit images.
         tried: Range of lenses on which the detector was validated; None to accept any.
-        most_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
+        max_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
     """
 
     out: Path
@@ -84,7 +84,7 @@ class Request:
     speed: float | None = None
     disparity_scale: float = 256.0
     tried: LensRange | None = None
-    most_doubt: float | None = None
+    max_doubt: float | None = None
 
 
 def run(
@@ -133,8 +133,8 @@ def run(
     if request.tried is not None:
         about.append(
             "Counting and measuring was tried on synthetic rows of sorghum in the light of a flash alone, seen from aside with "
-            f"{request.tried.density:.0f} pixels or more per metre of the row and {request.tried.view:.2f} m of it from top to "
-            "bottom; on no real row."
+            f"{request.tried.pixels_per_metre:.0f} pixels or more per metre of the row and {request.tried.view:.2f} m of it "
+            "from top to bottom; on no real row."
         )
     with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
         return _run(plots, find, request, driven, page, done, say, run_all)
@@ -249,7 +249,12 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
     except Unusable as problem:
         return {"skipped": str(problem)}
     view = view_pair(
-        lambda image, density: find(image, density, plot, pair), left, right, calibration, request.method, disparity
+        lambda image, pixels_per_metre: find(image, pixels_per_metre, plot, pair),
+        left,
+        right,
+        calibration,
+        request.method,
+        disparity,
     )
     wrong = None
     if calibration is not None and disparity is None:
@@ -263,7 +268,7 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
         "columns": list(view.frame.columns),
         "doubt": None if doubt is None else round(doubt, 4),
         "camera_height_m": None if view.ground is None else round(view.ground.camera_height, 4),
-        "sightings": [dataclasses.asdict(sighting) for sighting in view.sightings],
+        "sightings": [sighting.json_values() for sighting in view.sightings],
     }
 
 
@@ -307,14 +312,14 @@ def _finish(
 def _strange(request: Request, records: list[dict[str, Any]]) -> str:
     """Return a warning if more than half of the pairs of a plot are unfamiliar to the networks; else an empty string."""
     doubts = [record["doubt"] for record in records if record.get("doubt") is not None]
-    if request.most_doubt is None or not doubts:
+    if request.max_doubt is None or not doubts:
         return ""
-    unlike = sum(doubt > request.most_doubt for doubt in doubts)
+    unlike = sum(doubt > request.max_doubt for doubt in doubts)
     if unlike <= len(doubts) / 2:
         return ""
     return (
         f"{unlike} of {len(doubts)} pairs are unlike the images that the networks read rightly (the median of their doubts is "
-        f"{np.median(doubts):.2f}, the limit {request.most_doubt:.2f}): look at the overlays before you trust a number"
+        f"{np.median(doubts):.2f}, the limit {request.max_doubt:.2f}): look at the overlays before you trust a number"
     )
 
 

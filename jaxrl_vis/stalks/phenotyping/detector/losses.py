@@ -59,7 +59,7 @@ def detector_loss(
     """
     network = settings.detector(dtype)
     shape = (images.shape[1], images.shape[2])
-    anchors = jnp.asarray(make_anchors(shape, settings.band_lines, settings.anchor_widths))
+    anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
     features = network.apply(params, normalise(images), method="features")
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
@@ -103,17 +103,17 @@ def _distance(codes: jax.Array, wanted: jax.Array, shows: jax.Array) -> jax.Arra
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 
 
-def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
+def segmenter_loss(params: Any, crops: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
     """Compute the cross-entropy and Dice loss of the segmentation of stalk crops.
 
     Args:
         params: Parameters of the segmentation network.
-        snips: Stalk crops [N, h, w, 3] uint8.
+        crops: Stalk crops [N, h, w, 3] uint8.
         masks: True masks [N, h, w] bool.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
     """
-    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(snips))
+    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(crops))
     assert isinstance(logits, jax.Array)
     return mask_loss(logits, masks)
 

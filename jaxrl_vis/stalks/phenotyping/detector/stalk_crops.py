@@ -1,4 +1,4 @@
-"""Stalk crops ("snips"): full-resolution crops of an image, sheared so that the stalk stands upright in the centre.
+"""Stalk crops: full-resolution crops of an image, sheared so that the stalk stands upright in the centre.
 
 Each row of a crop is a part of an image row, shifted by a whole number of pixels: there is no interpolation, edges stay where
 they are, and a mask of the crop can be pasted back exactly.
@@ -15,7 +15,7 @@ _ALONG = 15  # rows of a full-size stalk crop that are averaged
 _EXPONENT = 0.35
 
 
-def snip_shape(full: tuple[int, int], share: float) -> tuple[int, int]:
+def crop_shape(full: tuple[int, int], share: float) -> tuple[int, int]:
     """Return the height and width of stalk crops, multiples of 8 and at least 16.
 
     Args:
@@ -67,26 +67,26 @@ def _cut(image: jax.Array, top: jax.Array, left: jax.Array, across: int) -> jax.
     return jnp.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), taken, jnp.zeros((), image.dtype))
 
 
-def smoothed(snips: jax.Array) -> jax.Array:
+def smoothed(crops: jax.Array) -> jax.Array:
     """Preprocess stalk crops [N, h, w, 3] for segmentation: float32 in [-1, 1], smoothed along the stalk.
 
     Values are averaged over 15 rows, as edges run along a stalk and texture mostly does not, and bright tones are compressed.
     On textures not seen in training, this removes most of the bias towards narrow masks.
 
     Args:
-        snips: Stalk crops, uint8 or float from 0 to 255.
+        crops: Stalk crops, uint8 or float from 0 to 255.
     """
     beside = _ALONG // 2
-    values = jnp.pad(snips.astype(jnp.float32) / 255.0, ((0, 0), (beside, beside), (0, 0), (0, 0)), mode="edge")
+    values = jnp.pad(crops.astype(jnp.float32) / 255.0, ((0, 0), (beside, beside), (0, 0), (0, 0)), mode="edge")
     sums = jax.lax.reduce_window(values, 0.0, jax.lax.add, (1, _ALONG, 1, 1), (1, 1, 1, 1), "VALID")
     return 2.0 * jnp.maximum(sums / _ALONG, 0.0) ** _EXPONENT - 1.0
 
 
-def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
+def put_back(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
     """Paste a stalk crop back to its position in the image.
 
     Args:
-        snip: Values [height, width] float32 of the crop, such as a mask.
+        crop: Values [height, width] float32 of the crop, such as a mask.
         stalk: [6], stalk that the crop was cut along; see `crop_places`.
         size: Height and width of the image.
 
@@ -94,9 +94,9 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
         Part of the image [h, w] float32, 0 outside the crop, and the image row and column of its first pixel; empty if the crop
         lies outside the image.
     """
-    top, left = (edge[0] for edge in crop_places(stalk[None], (snip.shape[0], snip.shape[1])))
-    columns = snip.shape[1]
-    used = np.flatnonzero((top + np.arange(snip.shape[0]) >= 0) & (top + np.arange(snip.shape[0]) < size[0]))
+    top, left = (edge[0] for edge in crop_places(stalk[None], (crop.shape[0], crop.shape[1])))
+    columns = crop.shape[1]
+    used = np.flatnonzero((top + np.arange(crop.shape[0]) >= 0) & (top + np.arange(crop.shape[0]) < size[0]))
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])
     if not used.size or end <= begin:
         return np.zeros((0, 0), np.float32), (0, 0)
@@ -108,5 +108,5 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
         place = int(places[first])
         low, high = max(place, 0), min(place + columns, end - begin)
         if high > low:
-            whole[first:last, low:high] = snip[used[first] : used[last - 1] + 1, low - place : high - place]
+            whole[first:last, low:high] = crop[used[first] : used[last - 1] + 1, low - place : high - place]
     return whole, (int(top + used[0]), begin)

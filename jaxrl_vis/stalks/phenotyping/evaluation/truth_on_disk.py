@@ -15,12 +15,12 @@ from jaxrl_vis_envs.documents import read_json
 _FARTHEST = 1e6  # pixels
 
 
-def find_truth(image: np.ndarray, density: float | None, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
+def find_truth(image: np.ndarray, pixels_per_metre: float | None, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
     """Return the ground-truth detections in the left image of a pair of a synthetic plot, with a detector's signature.
 
     Args:
         image: The image, of which only the size is used.
-        density: Ignored.
+        pixels_per_metre: Ignored.
         plot: The plot.
         pair: The pair.
 

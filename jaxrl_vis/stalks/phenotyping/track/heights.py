@@ -85,7 +85,7 @@ class _Value:
         mm, deviation: Diameter and its standard error, mm.
         height: Height of the measurement above the ground, m.
         confidence: Weight of the measurement.
-        hidden: True if an edge may be occluded.
+        occluded: True if an edge may be occluded.
         pixel: Size of a pixel at the stalk, mm; 0 if unknown.
     """
 
@@ -93,14 +93,14 @@ class _Value:
     deviation: float | None
     height: float
     confidence: float
-    hidden: bool
+    occluded: bool
     pixel: float
 
 
 def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     known = [
         _Value(
-            e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.hidden, _pixel(e.diameter_mm, e.width_px)
+            e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.occluded, _pixel(e.diameter_mm, e.width_px)
         )
         for e in sightings
         if e.diameter_mm is not None and e.height_m is not None
@@ -111,7 +111,7 @@ def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
             e.upper_deviation_mm,
             e.upper_height_m,
             e.upper_confidence * _facing(e),
-            e.upper_hidden,
+            e.upper_occluded,
             _pixel(e.upper_mm, None if e.upper_place is None else e.upper_place[2]),
         )
         for e in sightings
@@ -152,7 +152,7 @@ def robust_width(sightings: list[Sighting]) -> Width | None:
     """Estimate the diameter of a stalk from sightings at any height; None if it was never measured."""
     return _robust(
         [
-            _Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.hidden, _pixel(e.diameter_mm, e.width_px))
+            _Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.occluded, _pixel(e.diameter_mm, e.width_px))
             for e in sightings
             if e.diameter_mm is not None
         ]
@@ -165,7 +165,7 @@ def _robust(values: list[_Value]) -> Width | None:
     If there are too few of these, all measurements are used, and the 0.85 quantile instead of the median, as measurements with
     an occluded edge are lower bounds.
     """
-    clear = [value for value in values if not value.hidden]
+    clear = [value for value in values if not value.occluded]
     some, share = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
     if not some:
         return None

@@ -27,7 +27,7 @@ _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is foun
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
 _AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
-_HIDDEN = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
+_OCCLUDED = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
 _BEHIND = 0.003  # m: a stalk further behind occludes nothing
 _TOUCHING = 0.1  # of half a stalk's width: distance within which edges touch
 _SAME_DEPTH = 0.06  # m: change of depth over 12 inches of a stalk that leans by 10 degrees
@@ -54,7 +54,7 @@ class Sighting:
             of the measurement around 24 inches above the ground.
         upper_place: Column, row and width of that measurement, pixels.
         confidence: Confidence of the measurement, 0 to 1.
-        hidden, upper_hidden: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches it,
+        occluded, upper_occluded: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches it,
             or, for the lower measurement, the edges are not visible around the row itself.
         ray_deg: Horizontal angle between the left camera's axis and the ray to the stalk, degrees, positive to the right.
         reason: Reason why the stalk was not measured; empty if it was.
@@ -78,23 +78,24 @@ class Sighting:
     upper_confidence: float = 0.0
     upper_place: tuple[float, float, float] | None = None
     confidence: float = 0.0
-    hidden: bool = False
-    upper_hidden: bool = False
+    occluded: bool = False
+    upper_occluded: bool = False
     ray_deg: float | None = None
     reason: str = ""
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> "Sighting":
-        """Build a sighting from the JSON object of its `dataclasses.asdict`.
+        """Build a sighting from its `json_values`.
 
         Raises:
             ValueError: A field is missing, unknown, or of the wrong type or length.
         """
         parts: dict[str, Any] = {}
         for name, (kind, optional, length) in _KINDS.items():
-            if name not in values:
+            key = _KEYS.get(name, name)
+            if key not in values:
                 continue
-            value = parts[name] = tuple(values[name]) if isinstance(values[name], list) else values[name]
+            value = parts[name] = tuple(values[key]) if isinstance(values[key], list) else values[key]
             if value is None and optional:
                 continue
             several = value if isinstance(value, tuple) else (value,)
@@ -103,6 +104,14 @@ class Sighting:
         if len(parts) != len(values) or not {"box", "axis", "score", "line", "column"} <= parts.keys():
             raise ValueError("something is missing or too many")
         return cls(**parts)
+
+    def json_values(self) -> dict[str, Any]:
+        """Return the fields as JSON values by their keys in files."""
+        return {_KEYS.get(name, name): value for name, value in dataclasses.asdict(self).items()}
+
+
+# Keys in files of the fields that have another name there.
+_KEYS = {"occluded": "hidden", "upper_occluded": "upper_hidden"}
 
 
 def _field_kind(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
@@ -244,14 +253,14 @@ def measure_pair(
             upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((got, upper))
     measured = _without_strangers(measured, calibration, find_frame(grey_right).columns[0])
-    hidden = _hidden_edges([got for got, _ in measured])
-    above = _hidden_edges([upper or Measurement() for _, upper in measured])
-    hidden = [behind or not got.here for behind, (got, _) in zip(hidden, measured)]
+    occluded = _occluded_edges([got for got, _ in measured])
+    above = _occluded_edges([upper or Measurement() for _, upper in measured])
+    occluded = [behind or not got.here for behind, (got, _) in zip(occluded, measured)]
     sightings = []
-    for detection, (got, upper), *behind in zip(detections, measured, hidden, above):
-        less = dataclasses.replace(got, confidence=got.confidence * _HIDDEN) if behind[0] else got
+    for detection, (got, upper), *behind in zip(detections, measured, occluded, above):
+        less = dataclasses.replace(got, confidence=got.confidence * _OCCLUDED) if behind[0] else got
         sighting = _sighting(detection, less, upper, calibration)
-        sightings.append(dataclasses.replace(sighting, hidden=behind[0], upper_hidden=behind[1]))
+        sightings.append(dataclasses.replace(sighting, occluded=behind[0], upper_occluded=behind[1]))
     return sightings
 
 
@@ -280,15 +289,15 @@ def _without_strangers(
     return kept
 
 
-def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
+def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
     """Return True for stalks with an edge at another stalk that is not behind them.
 
     Such an edge may be that of the other stalk, and the width too small.
     """
-    hidden = []
+    occluded = []
     for measurement in measurements:
         half = 0.5 * measurement.width / math.cos(measurement.lean) if measurement.diameter_mm is not None else math.nan
-        hidden.append(False)
+        occluded.append(False)
         for other in measurements:
             if (
                 measurement.diameter_mm is None
@@ -299,8 +308,8 @@ def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
                 continue
             middle = other.column + math.tan(other.lean) * (other.line - measurement.line)
             reach = 0.5 * other.width / math.cos(other.lean) + _TOUCHING * half
-            hidden[-1] |= any(abs(measurement.column + side * half - middle) < reach for side in (-1.0, 1.0))
-    return hidden
+            occluded[-1] |= any(abs(measurement.column + side * half - middle) < reach for side in (-1.0, 1.0))
+    return occluded
 
 
 def _in_pixels(detection: Detection) -> Sighting:

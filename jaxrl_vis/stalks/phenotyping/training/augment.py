@@ -117,20 +117,20 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Arr
     return jnp.round((upper * (1 - down) + lower * down) * inside[..., None]).astype(jnp.uint8)
 
 
-def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def augment_crops(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Augment stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool: width, texture, contrast, mirroring and lighting."""
     light, side, marks, size, contrast, along = jax.random.split(key, 6)
-    snips, masks = _stretched(snips, masks, size)
-    snips = _striped(_set_off(_textured(snips, marks), masks, contrast), masks, along)
-    mirror = jax.random.bernoulli(side, 0.5, (snips.shape[0],))
-    snips = jnp.where(mirror[:, None, None, None], snips[:, :, ::-1], snips)
+    crops, masks = _stretched(crops, masks, size)
+    crops = _striped(_set_off(_textured(crops, marks), masks, contrast), masks, along)
+    mirror = jax.random.bernoulli(side, 0.5, (crops.shape[0],))
+    crops = jnp.where(mirror[:, None, None, None], crops[:, :, ::-1], crops)
     masks = jnp.where(mirror[:, None, None], masks[:, :, ::-1], masks)
-    return relight(snips, light), masks
+    return relight(crops, light), masks
 
 
-def _stretched(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _stretched(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Stretch crops and masks horizontally about their centre by a factor from exp(-0.3) to exp(0.3)."""
-    count, _, width = snips.shape[:3]
+    count, _, width = crops.shape[:3]
     wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
     place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], source of each column
     place = jnp.clip(place, 0.0, width - 1.0)
@@ -140,15 +140,15 @@ def _stretched(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.
     def columns(values: jax.Array, at: jax.Array) -> jax.Array:
         return jnp.take_along_axis(values, at.reshape(count, 1, width, *(1,) * (values.ndim - 3)), axis=2)
 
-    values = snips.astype(jnp.float32)
+    values = crops.astype(jnp.float32)
     mixed = columns(values, left) * (1 - share[..., None]) + columns(values, left + 1) * share[..., None]
     inside = masks.astype(jnp.float32)
     return jnp.round(mixed).astype(jnp.uint8), columns(inside, left) * (1 - share) + columns(inside, left + 1) * share >= 0.5
 
 
-def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
+def _textured(crops: jax.Array, key: jax.Array) -> jax.Array:
     """Add random speckles, fibres along the stalk and shading to crops, to cover more than the textures of a family."""
-    count, height, width = snips.shape[:3]
+    count, height, width = crops.shape[:3]
     spots, fibres, shades, amounts = jax.random.split(key, 4)
     amount = jax.random.uniform(amounts, (4, count, 1, 1))
 
@@ -158,15 +158,15 @@ def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
 
     dark = jnp.where(noise(spots, 6, 3) > 2.2 - 1.4 * amount[0], 1.0 - 0.6 * amount[1], 1.0)
     grain = jnp.exp(0.25 * amount[2] * noise(fibres, 160, 2) + 0.35 * amount[3] * noise(shades, 80, 10))
-    return jnp.round(jnp.clip(snips * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
+    return jnp.round(jnp.clip(crops * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
-def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+def _striped(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     """Add light and dark stripes along the stalk to 70 % of the crops, as of ribs and folded sheaths, varying by internode.
 
     A dark stripe looks like a gap between two stalks, but the stalk continues on its other side.
     """
-    count, height, width = snips.shape[:3]
+    count, height, width = crops.shape[:3]
     keys = jax.random.split(key, 5)
     # Index of the internode, out of four, that each row belongs to.
     nodes = jnp.sort(jax.random.uniform(keys[0], (3, count)), axis=0) * height
@@ -179,17 +179,17 @@ def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
         stripes += weight[:, None, None] * jnp.take_along_axis(across, internode[..., None], axis=1)
     amount, chance = jax.random.uniform(keys[4], (2, count, 1, 1))
     factor = jnp.where(masks & (chance < 0.7), jnp.exp(amount * jnp.tanh(4.0 * stripes)), 1.0)
-    return jnp.round(jnp.clip(snips * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
+    return jnp.round(jnp.clip(crops * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
-def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+def _set_off(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     """Randomise the contrast of stalks to the background, and their shading towards the edges, in half of the crops.
 
     The shading of a round stalk towards its edges depends on its surface and on the light. A network that overfits to it
     misplaces the edges of other stalks. The change is multiplicative, so black remains black and no edge appears where none was
     visible.
     """
-    count, _, width = snips.shape[:3]
+    count, _, width = crops.shape[:3]
     keys = jax.random.split(key, 6)
     inside = masks.astype(jnp.float32)
     own = jnp.exp(0.3 * jax.random.normal(keys[0], (count, 1, 1, 1)) + 0.15 * jax.random.normal(keys[1], (count, 1, 1, 3)))
@@ -206,4 +206,4 @@ def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     # Half of the crops are unchanged: in real images, the original contrast is the only cue.
     changed = jax.random.bernoulli(keys[5], 0.5, (count, 1, 1, 1)) & masks[..., None]
     factor = jnp.where(changed, own * shade[..., None], 1.0)
-    return jnp.round(jnp.clip(snips * factor, 0.0, 255.0)).astype(jnp.uint8)
+    return jnp.round(jnp.clip(crops * factor, 0.0, 255.0)).astype(jnp.uint8)

@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precisi
 from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
-_SNIPS = 8  # stalk crops per batch
+_CROPS = 8  # stalk crops per batch
 LEAST_SCORE = 0.5
 """Minimum score of a detection to be counted."""
 
@@ -115,11 +115,11 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
     """
     overlaps = []
     for example in examples:
-        for first in range(0, len(example.snips), _SNIPS):
-            snips, masks = (values[first : first + _SNIPS] for values in (example.snips, example.masks))
-            filled = np.pad(snips, ((0, _SNIPS - len(snips)), (0, 0), (0, 0), (0, 0)), mode="edge")
-            full = (settings.snip_lines, settings.snip_columns)
-            made = np.asarray(segment(params, filled, settings, dtype, full))[: len(snips)] >= 0.5
+        for first in range(0, len(example.crops), _CROPS):
+            crops, masks = (values[first : first + _CROPS] for values in (example.crops, example.masks))
+            filled = np.pad(crops, ((0, _CROPS - len(crops)), (0, 0), (0, 0), (0, 0)), mode="edge")
+            full = (settings.crop_height, settings.crop_width)
+            made = np.asarray(segment(params, filled, settings, dtype, full))[: len(crops)] >= 0.5
             common, either = (made & masks).sum((1, 2)), (made | masks).sum((1, 2))
             overlaps += (common / np.maximum(either, 1)).tolist()
     return float(np.mean(overlaps)) if overlaps else float("nan")

@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.training.detector_training import (
     initial_networks,
     update_networks,
 )
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resized_snips
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resize_crops
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, find_in, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import Split
 
@@ -47,7 +47,7 @@ class Tuning:
         steps: Maximum number of updates.
         minutes: Maximum duration of the updates in minutes; None for no limit.
         batch: Batch size of images.
-        snips: Batch size of stalk crops; 0 if masks are not trained.
+        crops: Batch size of stalk crops; 0 if masks are not trained.
         rate: Peak learning rate.
         look: Number of updates between evaluations on held-out images.
         patience: Number of evaluations without improvement after which training stops.
@@ -57,7 +57,7 @@ class Tuning:
     steps: int
     minutes: float | None
     batch: int
-    snips: int
+    crops: int
     rate: float
     look: int = 25
     patience: int = 8
@@ -112,7 +112,7 @@ def tune(
         NonFiniteError: A loss is not finite.
     """
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
-    frozen = ((*FROZEN,) if start is not None else ()) + (() if tuning.snips else ("segmenter",))
+    frozen = ((*FROZEN,) if start is not None else ()) + (() if tuning.crops else ("segmenter",))
     detector_key, segmenter_key, steps_key = jax.random.split(jax.random.key(tuning.seed), 3)
     state = beginning(start if start is not None else initial_networks(settings, detector_key, segmenter_key))
     shape = padded_shape(_largest(examples))
@@ -204,7 +204,7 @@ class _Batches:
         widest = max(float((stalk[2] - stalk[0]).max()) for stalk in (example.stalks.T for example in examples))
         self._shape = shape[0], min(shape[1], padded_shape((1, max(_STRIP, round(_BESIDE * widest))))[1])
         self._rng = np.random.default_rng(tuning.seed)
-        self._snips, self._masks = _alike(examples) if tuning.snips else (np.zeros(0), np.zeros(0))
+        self._crops, self._masks = _alike(examples) if tuning.crops else (np.zeros(0), np.zeros(0))
 
     def draw(self) -> Any:
         """Sample a batch for `update_networks`."""
@@ -213,20 +213,20 @@ class _Batches:
             for place in self._rng.integers(len(self._examples), size=self._tuning.batch)
         ]
         strips = None
-        if len(self._snips):
-            places = self._rng.integers(len(self._snips), size=self._tuning.snips)
-            strips = self._snips[places], self._masks[places]
+        if len(self._crops):
+            places = self._rng.integers(len(self._crops), size=self._tuning.crops)
+            strips = self._crops[places], self._masks[places]
         return image_batch(chosen, self._shape), strips
 
 
 def _alike(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
     """Return the stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to their median size."""
-    shapes = sorted(example.snips.shape[1:3] for example in examples for _ in example.snips)
+    shapes = sorted(example.crops.shape[1:3] for example in examples for _ in example.crops)
     if not shapes:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)
     lines, columns = shapes[len(shapes) // 2]
-    alike = [resized_snips(example, (lines, columns)) for example in examples if len(example.snips)]
-    return np.concatenate([each.snips for each in alike]), np.concatenate([each.masks for each in alike])
+    alike = [resize_crops(example, (lines, columns)) for example in examples if len(example.crops)]
+    return np.concatenate([each.crops for each in alike]), np.concatenate([each.masks for each in alike])
 
 
 def _largest(examples: Sequence[Example]) -> tuple[int, int]:
