@@ -54,8 +54,8 @@ class Sighting:
             of the measurement around 24 inches above the ground.
         upper_place: Column, row and width of that measurement, pixels.
         confidence: Confidence of the measurement, 0 to 1.
-        occluded, upper_occluded: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches it,
-            or, for the lower measurement, the edges are not visible around the row itself.
+        occluded, upper_occluded: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches
+            it, or, for the lower measurement, the edges are not visible around the row itself.
         ray_deg: Horizontal angle between the left camera's axis and the ray to the stalk, degrees, positive to the right.
         reason: Reason why the stalk was not measured; empty if it was.
     """
