@@ -59,7 +59,7 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
         halved = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
         remark = (
             f"The episodes are fresh ones, drawn from key {FRESH_KEY} after the training. The weights are shipped in float16 "
-            f"({size / 1e6:.2f} MB), and the figures are theirs; in float32 success is {whole.share:.3f}."
+            f"({size / 1e6:.2f} MB), and the figures are theirs; in float32 success is {whole.success:.3f}."
         )
         text = card(
             policy.config, record, policy.seed, {policy.seed: halved}, policy.env.distance_unit, name_here=name, remark=remark
@@ -88,7 +88,7 @@ def main() -> None:
         result = ship(options.run, options.name, checkpoint, options.seed, options.episodes)
     except RequestError as error:
         sys.exit(str(error))
-    print(f"{shipped.FOLDER / options.name}: success {result.share:.3f} ({result.low:.3f} to {result.high:.3f})")
+    print(f"{shipped.FOLDER / options.name}: success {result.success:.3f} ({result.low:.3f} to {result.high:.3f})")
 
 
 if __name__ == "__main__":

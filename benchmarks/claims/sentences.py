@@ -122,8 +122,10 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(
         LAB, f"{none[FINGER].median(2_480_000):.3f} against {authors.median(2_480_000):.3f} at 2.48 M", none[FINGER].name
     )
-    share = np.median(none[FINGER].means(metric="train/positive_share"))
-    yield Sentence(LAB, f"{share:.0%}".replace("%", " %") + " of its relabelled goals are reached already", none[FINGER].name)
+    fraction = np.median(none[FINGER].means(metric="train/positive_share"))
+    yield Sentence(
+        LAB, f"{fraction:.0%}".replace("%", " %") + " of its relabelled goals are reached already", none[FINGER].name
+    )
     faster = study("target_decay", f"{FINGER}-none-paper-decay0.95", fresh=True)
     yield Sentence(
         LAB, f"the distance falls from {_distance(none[FINGER], FINGER)} to {_distance(faster, FINGER)}", faster.name

@@ -260,20 +260,20 @@ def filtered_share(task: str) -> float:
 
 
 def _filter() -> Claim:
-    shares = {task: filtered_share(task) for task in (REACHER, FETCH, SAWYER, HAND)}
+    fractions = {task: filtered_share(task) for task in (REACHER, FETCH, SAWYER, HAND)}
     hand = indicator.run(HAND, OURS)
     precision, chance = (hand.median(metric=f"train/{name}") for name in ("filter_precision", "false_negative_share"))
-    active = [task for task, share in shares.items() if share >= 0.01]
+    active = [task for task, fraction in fractions.items() if fraction >= 0.01]
     comparisons = _rewards(OURS, "balance_only", (REACHER, FETCH))
     return Claim(
         "The filter removes false negatives",
         PARTLY if active else FAILS,
         f"Active (1 % of negatives or more) on {', '.join(SHORT[task] for task in active) or 'none'}; share of negatives "
-        f"dropped: {', '.join(f'{SHORT[task]} {share:.3f}' for task, share in shares.items())}. "
+        f"dropped: {', '.join(f'{SHORT[task]} {fraction:.3f}' for task, fraction in fractions.items())}. "
         f"On the hand {precision:.2f} of these are false at the end, {chance:.2f} of all negatives",
         "without the filter, " + "; ".join(comparison.text for comparison in comparisons),
         f"[the hand]({_INDICATOR}#the-hand)",
-        [indicator.run(task, OURS) for task in shares],
+        [indicator.run(task, OURS) for task in fractions],
     )
 
 

@@ -98,18 +98,18 @@ def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
     ]
     mean = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)[coloured].mean() if coloured.any() else 0.0
     return Measures(
-        segmentation=_share(inside & ((ours.segmentation == theirs.segmentation) | either), inside),
-        depth=_share(solid & near, solid),
+        segmentation=_fraction(inside & ((ours.segmentation == theirs.segmentation) | either), inside),
+        depth=_fraction(solid & near, solid),
         rgb=float(mean),
         most=int(difference[coloured].max(initial=0)),
-        loud=1.0 - _share(coloured & (difference <= LOUD), coloured),
+        loud=1.0 - _fraction(coloured & (difference <= LOUD), coloured),
         matched=min(matched_shares(ours, theirs).values(), default=1.0),
         missing=tuple(missing),
     )
 
 
-def _share(part: np.ndarray, whole: np.ndarray) -> float:
-    return float(part.sum() / whole.sum()) if whole.any() else 1.0
+def _fraction(part: np.ndarray, total: np.ndarray) -> float:
+    return float(part.sum() / total.sum()) if total.any() else 1.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -142,8 +142,10 @@ def share_of_one(config: Config) -> Config:
 
 def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
     """Time an iteration of `share_of_one`, in seconds."""
-    share = share_of_one(config)
-    return time_iterations(Programs(share, make_train_step(env, share), cache=False), settings.repeats)[1].median_s
+    config_of_one = share_of_one(config)
+    return time_iterations(Programs(config_of_one, make_train_step(env, config_of_one), cache=False), settings.repeats)[
+        1
+    ].median_s
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:

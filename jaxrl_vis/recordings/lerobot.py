@@ -250,13 +250,13 @@ def _of_images(episodes: list[np.ndarray]) -> dict[str, Any]:
     counts, levels = np.broadcast_to(counts, (3, 256)), np.arange(256) / 255.0
     total = counts.sum(axis=1)
     mean = counts @ levels / total
-    share = np.cumsum(counts, axis=1) / total[:, None]
+    fraction = np.cumsum(counts, axis=1) / total[:, None]
     occurs = counts > 0
     statistics = {
         "min": levels[occurs.argmax(axis=1)],
         "max": levels[255 - occurs[:, ::-1].argmax(axis=1)],
         "mean": mean,
         "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0.0)),
-    } | {name: levels[(share >= quantile).argmax(axis=1)] for name, quantile in _QUANTILES.items()}
+    } | {name: levels[(fraction >= quantile).argmax(axis=1)] for name, quantile in _QUANTILES.items()}
     as_lists: dict[str, Any] = {name: values.reshape(3, 1, 1).tolist() for name, values in statistics.items()}
     return as_lists | {"count": [sum(len(part) for part in episodes)]}

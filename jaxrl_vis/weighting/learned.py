@@ -88,9 +88,9 @@ def auxinash(learning_rate: float = 0.01, **options: Unpack[Options]) -> Weighti
     def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, Any]:
         logits, main = state.memory["logits"], loss_order(state.weights).index(MAIN)
         count = len(gramian)
-        shares, pullback = jax.vjp(lambda logits: count * jax.nn.softmax(logits), logits)
-        weights = solvers.bargain(gramian, shares)
-        (gradient,) = pullback(preference_slope(gramian, shares, weights, main).astype(logits.dtype))
+        preferences, pullback = jax.vjp(lambda logits: count * jax.nn.softmax(logits), logits)
+        weights = solvers.bargain(gramian, preferences)
+        (gradient,) = pullback(preference_slope(gramian, preferences, weights, main).astype(logits.dtype))
         changes, rule_state = rule.update(gradient, state.memory["rule"])
         return weights, {"logits": optax.apply_updates(logits, changes), "rule": rule_state}
 
@@ -104,14 +104,14 @@ def auxinash(learning_rate: float = 0.01, **options: Unpack[Options]) -> Weighti
     return weighting._replace(init=init)
 
 
-def preference_slope(gramian: jax.Array, shares: jax.Array, weights: jax.Array, main: int) -> jax.Array:
+def preference_slope(gramian: jax.Array, preferences: jax.Array, weights: jax.Array, main: int) -> jax.Array:
     """Compute the derivative of the main loss with respect to the preferences, per unit of step size and of 1 / a_main: [K].
 
     Args:
         gramian: [K, K] float.
-        shares: [K] float, p.
+        preferences: [K] float, p.
         weights: [K] float, a, with G a = p / a.
         main: Index of the main loss.
     """
     scaled = weights[:, None] * gramian * weights[None, :]
-    return -jnp.linalg.solve(scaled + jnp.diag(shares), scaled[main])
+    return -jnp.linalg.solve(scaled + jnp.diag(preferences), scaled[main])

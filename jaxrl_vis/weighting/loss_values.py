@@ -211,8 +211,8 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         kept = {name: memory[name] for name in learned}
         # There are no losses before the first ones.
         now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, kept)
-        shares = jax.nn.softmax(now["logits"]) / above
-        weights = by_name(losses, shares / jnp.sum(shares))
+        ratios = jax.nn.softmax(now["logits"]) / above
+        weights = by_name(losses, ratios / jnp.sum(ratios))
         return weights, *moved(state, weights, memory={**now, "logs": jnp.log(above)})
 
     return Weighting("famo", init, update, main=False)

@@ -179,8 +179,8 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     ball = jnp.maximum(radius * jnp.sqrt(squared), eps)
 
     def evaluate(t: jax.Array, free: jax.Array, passes: int = 1) -> tuple[jax.Array, jax.Array, jax.Array]:
-        share = t / ball
-        shifted = scaled + share * (to_mean[:, None] + to_mean[None, :]) + share**2 * squared
+        fraction = t / ball
+        shifted = scaled + fraction * (to_mean[:, None] + to_mean[None, :]) + fraction**2 * squared
         # Only the rounding errors of these sums would be left of a gradient that is shifted close to 0. This minimum norm
         # keeps them below the ridge that `nonnegative` adds.
         weights, free = min_norm(shifted, free, passes, least=float(eps) ** (1 / 6))
@@ -235,17 +235,17 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
     unit = unit + len(unit) * eps * jnp.eye(len(unit), dtype=unit.dtype)  # keeps the solution finite
     greatest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(gramian)), 0.0))
     lengths = relative * jnp.where(greatest > 0.0, greatest, 1.0)
-    # With a = x scale / lengths, the equation is unit x = shares x^(-power), where the maximum of shares is 1.
+    # With a = x scale / lengths, the equation is unit x = preferences x^(-power), where the maximum of preferences is 1.
     wanted = preferences * lengths ** (power - 1.0)
     scale = jnp.max(wanted) ** (1.0 / (1.0 + power))
-    shares = wanted / jnp.max(wanted)
+    preferences = wanted / jnp.max(wanted)
 
     def objective(x: jax.Array) -> jax.Array:
         utility = jnp.log(x) if power == 1.0 else x ** (1.0 - power) / (1.0 - power)
-        return 0.5 * quadratic(unit, x) - jnp.sum(shares * utility)
+        return 0.5 * quadratic(unit, x) - jnp.sum(preferences * utility)
 
     def step(now: _Newton) -> _Newton:
-        pull = shares * now.x**-power
+        pull = preferences * now.x**-power
         slope = jnp.dot(unit, now.x, precision=jax.lax.Precision.HIGHEST) - pull
         hessian = unit + jnp.diag(power * pull / now.x)
         change = -jnp.linalg.solve(hessian, slope)
@@ -257,11 +257,11 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
         # Close to the minimum, the objective no longer distinguishes steps, and full ones converge quadratically.
         length = jnp.where(decrement < 1e-2, farthest, lengths[jnp.argmin(values)])
         x = now.x + length * change
-        pull = shares * x**-power
+        pull = preferences * x**-power
         slope = jnp.dot(unit, x, precision=jax.lax.Precision.HIGHEST) - pull
         return _Newton(x, jnp.max(jnp.abs(slope) / pull), now.steps + 1)
 
-    first = _Newton(shares ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
+    first = _Newton(preferences ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
     last = jax.lax.while_loop(lambda now: (now.residual > 20.0 * eps) & (now.steps < _NEWTON_STEPS), step, first)
     return last.x * scale / lengths
 

@@ -17,7 +17,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposal
 from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, put_back
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.images import rgb8
@@ -172,7 +172,7 @@ def test_a_crop_is_put_back_where_it_was():
     image = rng.uniform(0.1, 1, (60, 50)).astype(np.float32)
     stalk = np.array([18.0, 5, 40, 55, 36, 20], np.float32)
     crop = np.asarray(cut(jnp.asarray(image), stalk[None], (48, 16)))[0]
-    back, (line, column) = put_back(crop, stalk, image.shape)
+    back, (line, column) = paste(crop, stalk, image.shape)
     there = image[line : line + back.shape[0], column : column + back.shape[1]]
     assert (back > 0).sum() == 48 * 16
     np.testing.assert_array_equal(back[back > 0], there[back > 0])
@@ -186,9 +186,9 @@ def test_crops_at_the_images_edge_are_black_beyond_it():
     stalk = np.array([-4.0, 10, 6, 40, 1, 1], np.float32)
     crop = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))[0]
     assert crop[:, :7].max() == 0 and crop[:31, 7:].min() == 1
-    back, corner = put_back(crop, stalk, image.shape)
+    back, corner = paste(crop, stalk, image.shape)
     assert corner == (9, 0) and back.min() == 1
-    nowhere, _ = put_back(crop, stalk + 100, image.shape)
+    nowhere, _ = paste(crop, stalk + 100, image.shape)
     assert nowhere.size == 0
 
 

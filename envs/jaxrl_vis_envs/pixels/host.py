@@ -123,8 +123,8 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         cameras = [name for name, outputs in self.views.outputs.items() for _ in outputs]
         for name, output, camera in zip(self._names, chosen, cameras, strict=True):
             image = images[name]
-            share = output == "rgb" or (output == "depth" and self._form.depth_range is not None)
-            low, high = (0, 255 if image.dtype == np.uint8 else 1) if share else _BOUNDS.get(output, (0.0, far[camera]))
+            is_scaled = output == "rgb" or (output == "depth" and self._form.depth_range is not None)
+            low, high = (0, 255 if image.dtype == np.uint8 else 1) if is_scaled else _BOUNDS.get(output, (0.0, far[camera]))
             spaces[name] = gymnasium.spaces.Box(low, high, image.shape, image.dtype.type)
         if self._goal_image is not None:
             spaces |= {name + formats.GOAL: space for name, space in spaces.items()}

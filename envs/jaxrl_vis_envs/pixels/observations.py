@@ -130,8 +130,8 @@ def image_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig) 
 def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Array:
     """Encode depths ``[...]`` (m) as uint8: 0 up to the near end of ``depth_range`` (m), 255 from the far end on."""
     near, far = depth_range
-    share = jnp.clip((depth - near) / (far - near), 0.0, 1.0)
-    return jnp.round(255.0 * share).astype(jnp.uint8)
+    fraction = jnp.clip((depth - near) / (far - near), 0.0, 1.0)
+    return jnp.round(255.0 * fraction).astype(jnp.uint8)
 
 
 def encode_zbuffer(depth: jax.Array, clip_range: tuple[float, float]) -> jax.Array:

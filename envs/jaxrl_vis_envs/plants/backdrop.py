@@ -59,8 +59,8 @@ def _outdoors(rng: np.random.Generator) -> np.ndarray:
     elevation = ((_HORIZON - np.arange(SHAPE[0])) / _HORIZON * REACH[0])[:, None, None]
     zenith = np.array([0.25, 0.45, 0.95]) * rng.uniform(0.5, 1.3)
     haze = np.array([0.85, 0.92, 1.0]) * rng.uniform(0.7, 1.6)
-    share = np.exp(-np.clip(elevation, 0.0, None) / rng.uniform(0.15, 0.8))
-    picture = zenith + (haze - zenith) * share
+    fraction = np.exp(-np.clip(elevation, 0.0, None) / rng.uniform(0.15, 0.8))
+    picture = zenith + (haze - zenith) * fraction
     cover = rng.uniform(0.0, 1.0)
     clouds = 0.6 * smooth_noise(rng, (30, 90)) + 0.4 * smooth_noise(rng, (10, 25))
     thick = np.clip((clouds - (1.0 - cover)) / 0.25, 0.0, 1.0)[..., None]

@@ -30,8 +30,8 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
         [np.round(255.0 * table[:, channel]).astype(np.uint8)[image[..., channel]] for channel in range(3)], axis=2
     )
     values = _moved(values, scene.motion[0] * width)
-    share = scene.resolution[0]
-    small = Image.fromarray(values).resize((max(round(share * width), 8), max(round(share * height), 8)), Image.Resampling.BOX)
+    scale = scene.resolution[0]
+    small = Image.fromarray(values).resize((max(round(scale * width), 8), max(round(scale * height), 8)), Image.Resampling.BOX)
     packed = io.BytesIO()
     small.save(packed, "JPEG", quality=round(scene.jpeg[0]))
     with Image.open(packed) as opened:

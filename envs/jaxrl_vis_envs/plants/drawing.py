@@ -122,15 +122,15 @@ def draw(
     batch_size = min(batch_size or (1 if on_cpu else _TILES_PER_BATCH), len(order))
     workers = num_cores() if on_cpu else 1
     parts = [order[start::workers] for start in range(workers)]
-    share = max(map(len, parts))  # all parts have one size, hence one program: pad with a repeated tile
-    parts = [np.concatenate([part, np.repeat(order[:1], share - len(part))]) for part in parts]
+    length = max(map(len, parts))  # all parts have one size, hence one program: pad with a repeated tile
+    parts = [np.concatenate([part, np.repeat(order[:1], length - len(part))]) for part in parts]
     tile = tile_size(width)
     program = _program(samples, tile, batch_size, 1 if on_cpu else _SURFACES_PER_STEP)
     jobs = [(view.tiles[part], view.cone_ranges[part], view.triangle_ranges[part]) for part in parts]
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         results = list(pool.map(lambda job: jax.block_until_ready(program(tables, shot, *job)), jobs))
     position = np.empty(len(order), np.int64)
-    position[np.concatenate(parts)[::-1]] = np.arange(share * workers)[::-1]
+    position[np.concatenate(parts)[::-1]] = np.arange(length * workers)[::-1]
     join = _joiner(tile, width, height)
     return tuple(join(jnp.asarray(position), *(result[part] for result in results)) for part in range(3))  # pyright: ignore
 

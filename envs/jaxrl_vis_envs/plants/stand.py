@@ -169,5 +169,5 @@ def _distance_to_line(points: np.ndarray, end: np.ndarray) -> np.ndarray:
     start = np.array([0.0, -MAST_DISTANCE])
     along = end - start
     length = max(math.hypot(*along), 1e-9)
-    share = np.clip((points - start) @ along / length**2, 0.0, 1.0)
-    return np.linalg.norm(points - start - share[:, None] * along, axis=1)
+    fraction = np.clip((points - start) @ along / length**2, 0.0, 1.0)
+    return np.linalg.norm(points - start - fraction[:, None] * along, axis=1)

@@ -153,8 +153,8 @@ def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> L
         pairs = jnp.stack([jnp.concatenate([goal, reached]), jnp.concatenate([goal, goal])])
         of_goals, of_reached = head.apply({"params": params["head"]}, pairs)[:, 0].reshape(2, -1)
         loss = jnp.mean(jax.nn.softplus(-of_goals)) + jnp.mean(jax.nn.softplus(of_reached))
-        share = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair in both classes, of probability 1/2, gets R+
-        return loss, resolved.reward_negative + (resolved.reward_positive - resolved.reward_negative) * share
+        fraction = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair in both classes, of probability 1/2, gets R+
+        return loss, resolved.reward_negative + (resolved.reward_positive - resolved.reward_negative) * fraction
 
     return LearnedReward("classifier", networks, init, loss_and_reward, optax.adam(config.ddpg.critic_learning_rate))
 

@@ -113,9 +113,9 @@ class Sampler:
 
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
         """Choose goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
-        shares = self.config.goals.relabel_probability, self.resolved.balance_probability
+        probabilities = self.config.goals.relabel_probability, self.resolved.balance_probability
         discount = self.resolved.discount if self.config.goals.future_goals == "geometric" else None
-        return choose_goal_slots(key, time, self.replay.horizon, *shares, discount)
+        return choose_goal_slots(key, time, self.replay.horizon, *probabilities, discount)
 
     def _replaced(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
         """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
@@ -198,10 +198,10 @@ class Sampler:
             reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1
         )
         reward = goals.oracle_reward(states, batch.goal_state, self.threshold, positive, negative)
-        shares = config.study.reward_false_positives, config.study.reward_false_negatives
-        if not any(shares):
+        error_rates = config.study.reward_false_positives, config.study.reward_false_negatives
+        if not any(error_rates):
             return reward
         is_positive = reward_errors.flip(
-            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.study.reward_clutter, clutter_end
+            reward == positive, batch.state_tp1, batch.goal_state, *error_rates, config.study.reward_clutter, clutter_end
         )
         return jnp.where(is_positive, positive, negative).astype(jnp.float32)

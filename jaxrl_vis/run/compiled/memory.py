@@ -113,9 +113,9 @@ def check_memory(
     """
     capacity = math.ceil(config.run.replay_transitions / steps_per_iteration) * steps_per_iteration
     parts = layout.shards.count
-    share = parts / layout.num_devices  # fraction of the seeds on each device
-    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.run.seeds) * share
-    replay = replay_bytes * config.run.seeds * share / parts
+    fraction = parts / layout.num_devices  # fraction of the seeds on each device
+    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.run.seeds) * fraction
+    replay = replay_bytes * config.run.seeds * fraction / parts
     bytes_per_rollout = replay * steps_per_iteration / capacity
     collected = bytes_per_rollout * frame_stack
     batch = collected / steps_per_iteration * config.run.batch_size * 4

@@ -141,9 +141,9 @@ def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit:
         above.axvline(threshold, color=FAINT, linewidth=0.8)
         above.set_title(name, color=INK, fontsize=10)
         above.set_xlabel(f"true distance, {unit}")
-        mean, share, _ = measures.calibration(reward, is_reached)
+        mean, frequency, _ = measures.calibration(reward, is_reached)
         below.plot([0, 1], [0, 1], color=FAINT, linewidth=0.8)
-        below.plot(mean, share, "o", color="#b4531f", markersize=4)
+        below.plot(mean, frequency, "o", color="#b4531f", markersize=4)
         below.set_xlabel("reward")
         for each, label in ((above, "reward"), (below, "share that reaches")):
             each.set_ylim(-0.05, 1.05)

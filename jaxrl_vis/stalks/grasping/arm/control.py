@@ -72,10 +72,10 @@ class Drive(NamedTuple):
     error: jax.Array
 
 
-def smooth(share: Any) -> Any:
-    """Return the fraction of a minimum-jerk movement done after the fraction ``share`` of its time, clipped to 0 to 1."""
-    share = jnp.clip(share, 0.0, 1.0)
-    return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+def smooth(fraction: Any) -> Any:
+    """Return the fraction of a minimum-jerk movement done after a ``fraction`` of its time, clipped to 0 to 1."""
+    fraction = jnp.clip(fraction, 0.0, 1.0)
+    return fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)
 
 
 def better_side(target: Any, numeric: Any = jnp) -> Any:

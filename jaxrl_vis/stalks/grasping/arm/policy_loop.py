@@ -125,8 +125,8 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
             wanted = within_reach(place + env.config.action_scale * action)
             is_closing = reaching.data.time > timing.reach - 0.5 / control.RATE
 
-            def one(reaching: Reaching, share: jax.Array) -> tuple[Reaching, None]:
-                return period(arms, model, scene, reaching, place + share * (wanted - place), is_closing, gains), None
+            def one(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:
+                return period(arms, model, scene, reaching, place + fraction * (wanted - place), is_closing, gains), None
 
             reaching, _ = jax.lax.scan(one, reaching, jnp.arange(1, substeps + 1) / substeps)
             reaching = reaching._replace(data=mjx_model.kinematics(model, reaching.data))

@@ -133,8 +133,11 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
 
 def score_figures(score: Score) -> dict[str, Any]:
     """Return the thesis's ratio and all proportions of a score, as values for JSON."""
-    shares = {share.name: {"count": share.count, "of": share.of, "interval": share.interval} for share in score.shares}
-    return {"thesis_ratio": score.thesis_ratio, "shares": shares}
+    proportions = {
+        proportion.name: {"count": proportion.count, "of": proportion.of, "interval": proportion.interval}
+        for proportion in score.proportions
+    }
+    return {"thesis_ratio": score.thesis_ratio, "shares": proportions}
 
 
 @dataclasses.dataclass(frozen=True)

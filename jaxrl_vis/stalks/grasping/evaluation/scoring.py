@@ -254,5 +254,5 @@ def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
     return figures
 
 
-def _quantile(values: np.ndarray, share: float) -> float:
-    return float(np.quantile(values, share)) if values.size else math.nan
+def _quantile(values: np.ndarray, fraction: float) -> float:
+    return float(np.quantile(values, fraction)) if values.size else math.nan

@@ -98,7 +98,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
         The new state, and the losses by name.
     """
     generator, average, discriminator, moments = state
-    rate, share = rates
+    rate, decay = rates
     images, masks = vary(batch[0], batch[1], key)
     network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalise(images)
     true = jnp.where(masks[..., None], jnp.array(_RED), values)
@@ -118,7 +118,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     gradients, (parts, painted) = jax.grad(of_generator, has_aux=True)(generator)
     updates, first = _optimiser().update(gradients, moments[0], generator)
     generator = jax.tree.map(lambda old, change: old + rate * change, generator, updates)
-    average = jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, average, generator)
+    average = jax.tree.map(lambda old, new: decay * old + (1.0 - decay) * new, average, generator)
     if settings.loss == "segmentation":
         return (generator, average, None, (first, None)), parts
 

@@ -31,13 +31,13 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
     strength = jax.random.uniform(keys["strength"], (count,), minval=0.3)
     strength = jnp.where(jax.random.bernoulli(keys["kept"], _AS_IT_IS, (count,)), 0.0, strength)
     values, masks = _moved(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
-    share = strength[:, None, None, None]
-    values = values * _textures(values.shape, share, keys["texture"])
-    values = _coloured(values, share, keys["colour"])
-    values = _lit(values, share, keys["light"])
+    strengths = strength[:, None, None, None]
+    values = values * _textures(values.shape, strengths, keys["texture"])
+    values = _coloured(values, strengths, keys["colour"])
+    values = _lit(values, strengths, keys["light"])
     values = _blurred(values, strength, keys["blur"])
     level, shot = jax.random.split(keys["noise"])
-    amount = 0.06 * share * jax.random.uniform(level, share.shape)
+    amount = 0.06 * strengths * jax.random.uniform(level, strengths.shape)
     values = values + amount * jnp.sqrt(jnp.maximum(values, 0.05)) * jax.random.normal(shot, values.shape)
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0)).astype(jnp.uint8), masks
 

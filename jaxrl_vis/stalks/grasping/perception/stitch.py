@@ -212,9 +212,9 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
 
 def rigid(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> Motion:
     """Return the rigid motion from points [N, 3] to corresponding ones [N, 3], by least squares with weights [N]."""
-    share = weight / weight.sum()
-    here, there = share @ source, share @ target
-    left, _, right = np.linalg.svd(((source - here) * share[:, None]).T @ (target - there))
+    weights = weight / weight.sum()
+    here, there = weights @ source, weights @ target
+    left, _, right = np.linalg.svd(((source - here) * weights[:, None]).T @ (target - there))
     turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
     rotation = right.T @ turn @ left.T
     return Motion(rotation, there - rotation @ here)

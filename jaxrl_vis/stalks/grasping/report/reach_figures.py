@@ -141,12 +141,12 @@ def _beside(figure: Figure, score: Score) -> None:
         ("reachable,\ncrowded", score.crowded),
         ("all stalks", score.of_all),
     ]
-    for place, (_, share) in enumerate(rows):
-        if share.of:
-            low, high = share.interval
+    for place, (_, proportion) in enumerate(rows):
+        if proportion.of:
+            low, high = proportion.interval
             axes.plot([100 * low, 100 * high], [place, place], color=_HELD, linewidth=2)
-            axes.plot(100 * share.share, place, "o", color=_HELD)
-            axes.text(101, place - 0.22, f"{share.count} of {share.of}", fontsize=7, color=FAINT, ha="right")
+            axes.plot(100 * proportion.value, place, "o", color=_HELD)
+            axes.text(101, place - 0.22, f"{proportion.count} of {proportion.of}", fontsize=7, color=FAINT, ha="right")
     place = len(rows)
     axes.plot(100 * score.thesis_ratio, place, "s", color="#2b6cb0")
     axes.plot(100 * THESIS_RATIO, place + 1, "D", color=_OTHER)

@@ -73,8 +73,8 @@ def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Arr
     union = (high - low).sum(-1)[:, None] + (other_high - other_low).sum(-1)[None] - common
     across = common / jnp.maximum(union, 1e-6)
     shared = jnp.minimum(first[:, None, 3], second[None, :, 3]) - jnp.maximum(first[:, None, 1], second[None, :, 1])
-    least = jnp.minimum((first[:, 3] - first[:, 1])[:, None], (second[:, 3] - second[:, 1])[None])
-    return across * jnp.clip(shared / jnp.maximum(least, 1e-6), 0.0, 1.0)
+    shorter = jnp.minimum((first[:, 3] - first[:, 1])[:, None], (second[:, 3] - second[:, 1])[None])
+    return across * jnp.clip(shared / jnp.maximum(shorter, 1e-6), 0.0, 1.0)
 
 
 def _edges(stalks: jax.Array, lines: int) -> tuple[jax.Array, jax.Array]:
@@ -123,8 +123,8 @@ def roi_align(
     def weights(low: jax.Array, high: jax.Array, cells: int, length: int) -> jax.Array:
         """Return interpolation weights [..., cells, length] of features in the cells between ``low`` and ``high`` [...]."""
         extent = high - low if aligned else jnp.maximum(high - low, 1.0)
-        share = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
-        place = low[..., None] + extent[..., None] * share
+        fraction = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
+        place = low[..., None] + extent[..., None] * fraction
         inside = (place >= -1.0) & (place <= length)
         place = jnp.clip(place, 0.0, length - 1.0)
         weight = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(length)), 0.0) * inside[..., None]

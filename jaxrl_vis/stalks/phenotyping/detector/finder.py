@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, put_back, smoothed
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste, smoothed
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
@@ -206,7 +206,7 @@ class Finder:
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
         settings = self._settings
-        share = settings.width / settings.full_width / settings.resizing(image.shape[1], pixels_per_metre)
+        relative_scale = settings.width / settings.full_width / settings.resizing(image.shape[1], pixels_per_metre)
         stalks, scores, pooled = self.look(image, pixels_per_metre)
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
         selected = scores >= self._least
@@ -214,7 +214,7 @@ class Finder:
         inside = np.array([_is_shown(stalk, frame) for stalk in stalks], bool)
         stalks, scores = stalks[inside], scores[inside]
         on_device = jnp.asarray(image)
-        pieces = self._pieces(on_device, stalks, settings.crop_height, share)
+        pieces = self._pieces(on_device, stalks, settings.crop_height, relative_scale)
         pieces = [(_without_border(mask, corner, frame), corner) for mask, corner in pieces]
         once = np.flatnonzero(without_duplicates(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
@@ -222,7 +222,7 @@ class Finder:
         higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
         shown = [place for place, upper in enumerate(higher) if upper is not None]
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
-        above = self._pieces(on_device, some, settings.crop_height // 2, share)
+        above = self._pieces(on_device, some, settings.crop_height // 2, relative_scale)
         upper = {place: (_without_border(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
         detections = Detections(doubt=doubt)
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
@@ -234,17 +234,17 @@ class Finder:
         return detections
 
     def _pieces(
-        self, image: jax.Array, stalks: np.ndarray, lines: int, share: float
+        self, image: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float
     ) -> list[tuple[np.ndarray, tuple[int, int]]]:
         """Segment stalks [N, 6] in crops of ``lines`` rows at full resolution; return masks and their corners in the image."""
-        crops = self._segment(image, stalks, lines, share)
-        return [put_back(crop, stalk, (image.shape[0], image.shape[1])) for crop, stalk in zip(crops, stalks)]
+        crops = self._segment(image, stalks, lines, relative_scale)
+        return [paste(crop, stalk, (image.shape[0], image.shape[1])) for crop, stalk in zip(crops, stalks)]
 
-    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, share: float) -> np.ndarray:
-        """Compute masks [N, h, w] float32 of the crops of stalks [N, 6]; ``share`` is the resolution relative to full."""
+    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float) -> np.ndarray:
+        """Compute masks [N, h, w] float32 of the crops of stalks [N, 6]; ``relative_scale``: see `crop_shape`."""
         settings = self._settings
         full = (lines, settings.crop_width)
-        shape = crop_shape(full, share)
+        shape = crop_shape(full, relative_scale)
         if not len(stalks):
             return np.zeros((0, *shape), np.float32)
         masks = []

@@ -169,12 +169,12 @@ def logistic(measures: np.ndarray, wrong: np.ndarray) -> np.ndarray:
         Intercept and weights [1 + M].
     """
     inputs = np.concatenate([np.ones((len(measures), 1)), measures], axis=1)
-    share = np.where(wrong, 0.5 / wrong.sum(), 0.5 / (~wrong).sum())
+    weight = np.where(wrong, 0.5 / wrong.sum(), 0.5 / (~wrong).sum())
     shrink = np.diag([0.0, *[1e-3] * measures.shape[1]])
     weights = np.zeros(inputs.shape[1])
     for _ in range(50):
         chance = 1.0 / (1.0 + np.exp(-np.clip(inputs @ weights, -30.0, 30.0)))
-        slope = inputs.T @ (share * (chance - wrong)) + shrink @ weights
-        bend = (inputs.T * (share * chance * (1.0 - chance))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
+        slope = inputs.T @ (weight * (chance - wrong)) + shrink @ weights
+        bend = (inputs.T * (weight * chance * (1.0 - chance))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
         weights = weights - np.linalg.solve(bend, slope)
     return weights

@@ -15,14 +15,14 @@ _ALONG = 15  # rows of a full-size stalk crop that are averaged
 _EXPONENT = 0.35
 
 
-def crop_shape(full: tuple[int, int], share: float) -> tuple[int, int]:
+def crop_shape(full: tuple[int, int], scale: float) -> tuple[int, int]:
     """Return the height and width of stalk crops, multiples of 8 and at least 16.
 
     Args:
         full: Height and width of crops of a full-resolution image.
-        share: Resolution of the image relative to full resolution.
+        scale: Resolution of the image relative to full resolution.
     """
-    lines, columns = (max(round(length * share / 8), 2) * 8 for length in full)
+    lines, columns = (max(round(length * scale / 8), 2) * 8 for length in full)
     return lines, columns
 
 
@@ -42,8 +42,8 @@ def crop_places(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray,
     top = np.round(middle - 0.5 * shape[0]).astype(np.int32)
     tall = np.maximum(stalks[:, 3] - stalks[:, 1], 1.0)
     line = top[:, None] + np.arange(shape[0]) + 0.5
-    share = (line - stalks[:, 1:2]) / tall[:, None]
-    axis = stalks[:, 4:5] + (stalks[:, 5:6] - stalks[:, 4:5]) * share
+    fraction = (line - stalks[:, 1:2]) / tall[:, None]
+    axis = stalks[:, 4:5] + (stalks[:, 5:6] - stalks[:, 4:5]) * fraction
     return top, np.round(axis - 0.5 * shape[1]).astype(np.int32)
 
 
@@ -82,7 +82,7 @@ def smoothed(crops: jax.Array) -> jax.Array:
     return 2.0 * jnp.maximum(sums / _ALONG, 0.0) ** _EXPONENT - 1.0
 
 
-def put_back(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
+def paste(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
     """Paste a stalk crop back to its position in the image.
 
     Args:

@@ -81,8 +81,8 @@ def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndar
         for start in range(0, len(here), some):
             one, other = here[start : start + some], ahead[start : start + some]
             edge, line = np.nonzero((one[:, 1:] <= middles) != (other[:, 1:] <= middles))
-            share = (middles[line] - one[edge, 1]) / (other[edge, 1] - one[edge, 1])
-            crossing = one[edge, 0] + share * (other[edge, 0] - one[edge, 0])
+            fraction = (middles[line] - one[edge, 1]) / (other[edge, 1] - one[edge, 1])
+            crossing = one[edge, 0] + fraction * (other[edge, 0] - one[edge, 0])
             # A pixel is inside if the number of crossings to its left is odd.
             np.add.at(crossings, (line, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
         mask[first:last] |= np.cumsum(crossings[:, :width], axis=1) % 2 == 1

@@ -47,9 +47,9 @@ def _shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
     if places.min() < 0.0 or places.max() >= image.shape[1] - 1:
         return 0.0
     first = places.astype(int)
-    share = places - first
+    fraction = places - first
     row = lines[:, None]
-    across = np.median(image[row, first] * (1.0 - share) + image[row, first + 1] * share, axis=0)
+    across = np.median(image[row, first] * (1.0 - fraction) + image[row, first + 1] * fraction, axis=0)
     reach = np.arange(-8, 9)
     kernel = np.exp(-0.5 * (reach / _SMOOTHING) ** 2)
     change = np.abs(np.gradient(np.convolve(np.pad(across, 8, mode="edge"), kernel / kernel.sum(), mode="valid")))

@@ -31,7 +31,7 @@ class Gates:
         behind: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
         astray: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
         row: Maximum difference between the depth of a counted stalk and the median depth.
-        share: Minimum fraction of the pairs with the stalk in view that must show it to count it.
+        fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
         least: Minimum number of pairs that must show it, unless fewer have it in view.
         ends: Maximum distance of a counted stalk's foot beyond the ends of the path.
     """
@@ -42,7 +42,7 @@ class Gates:
     behind: float = 0.005
     astray: float = 0.34
     row: float = 0.2
-    share: float = 0.3
+    fraction: float = 0.3
     least: int = 2
     ends: float = 0.01
 
@@ -316,7 +316,7 @@ def _closed(track: _Open, path: Path, step: float, field: tuple[float, ...], usu
     expected = int((np.abs(path.places + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
     # A stalk without a measured depth must be seen twice as often.
-    wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.share * expected), 1)
+    wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.fraction * expected), 1)
     begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
     if len(track.sightings) < wanted:
         reason = f"seen in {len(track.sightings)} of {expected} pairs"

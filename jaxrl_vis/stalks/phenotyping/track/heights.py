@@ -166,21 +166,21 @@ def _robust(values: list[_Value]) -> Width | None:
     an occluded edge are lower bounds.
     """
     clear = [value for value in values if not value.occluded]
-    some, share = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
-    if not some:
+    used, quantile = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
+    if not used:
         return None
-    widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in some]).T
+    widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in used]).T
     weights = np.maximum(weights, 0.02)
     order = np.argsort(widths)
     passed = np.cumsum(weights[order]) - 0.5 * weights[order]
-    middle = float(np.interp(share * weights.sum(), passed, widths[order]))
+    middle = float(np.interp(quantile * weights.sum(), passed, widths[order]))
     enough = float(weights.sum() ** 2 / (weights**2).sum())
     scatter = 1.4826 * float(np.median(np.abs(widths - middle))) * 1.2533 if len(widths) > 2 else 0.0
     least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
     of_pairs = max(scatter, least) / math.sqrt(enough)
     error = math.hypot(
         of_pairs * math.sqrt(1.0 + _FEW / len(widths)),
-        _MASK_ERROR * float(np.median([value.pixel for value in some])),
+        _MASK_ERROR * float(np.median([value.pixel for value in used])),
         _HIDING_ERROR * (1.0 - len(clear) / len(values)),
         _CALIBRATION_ERROR * middle,
     )

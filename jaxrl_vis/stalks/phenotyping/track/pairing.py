@@ -16,7 +16,7 @@ _MOST = 0.7  # minimum fraction of the detections that are measured in a good pa
 _SAME_DEPTH = 0.15  # maximum relative difference of the depths of one row
 _NEAREST = 3.0  # minimum depth in baselines: below, the fields of view hardly overlap
 _LEAST_DISPARITY = 2.0  # pixels
-_SMALL_SHARE, _LARGE_SHARE = 0.25, 0.6
+_SMALL_SHARE, _LARGE_FRACTION = 0.25, 0.6
 _LINES = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
 
 
@@ -57,11 +57,11 @@ def pair_fault(
         )
         for detection in detections
     ]
-    if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_SHARE:
+    if _measured_fraction(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_FRACTION:
         return "left and right are swapped: exchange their names"
     for lines in sorted({max(round(line * calibration.focal / 2168), 3) for line in _LINES}):
         for shift in (lines, -lines):
-            if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_SHARE:
+            if _measured_fraction(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_FRACTION:
                 return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
     return None
 
@@ -85,7 +85,7 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
         return None
     depth = float(np.median(depths))
     agree = np.mean(np.abs(np.array(depths) / depth - 1.0) < _SAME_DEPTH)
-    if DEPTHS[0] <= depth <= DEPTHS[1] or agree < _LARGE_SHARE:
+    if DEPTHS[0] <= depth <= DEPTHS[1] or agree < _LARGE_FRACTION:
         return None
     baseline = calibration.baseline * USUAL_DISTANCE / depth
     return (
@@ -110,7 +110,7 @@ def _some(detections: list[Detection]) -> list[Detection]:
     return detections[:: -(-len(detections) // 10)] if detections else []
 
 
-def _share(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
+def _measured_fraction(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
     """Return the fraction of the detections, of which at most ten are tried, that can be measured with the right image."""
     some = _some(detections)
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)

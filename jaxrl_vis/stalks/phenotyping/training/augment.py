@@ -135,15 +135,17 @@ def _stretched(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.
     place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], source of each column
     place = jnp.clip(place, 0.0, width - 1.0)
     left = jnp.minimum(jnp.floor(place).astype(jnp.int32), width - 2)
-    share = (place - left)[:, None, :]
+    fraction = (place - left)[:, None, :]
 
     def columns(values: jax.Array, at: jax.Array) -> jax.Array:
         return jnp.take_along_axis(values, at.reshape(count, 1, width, *(1,) * (values.ndim - 3)), axis=2)
 
     values = crops.astype(jnp.float32)
-    mixed = columns(values, left) * (1 - share[..., None]) + columns(values, left + 1) * share[..., None]
+    mixed = columns(values, left) * (1 - fraction[..., None]) + columns(values, left + 1) * fraction[..., None]
     inside = masks.astype(jnp.float32)
-    return jnp.round(mixed).astype(jnp.uint8), columns(inside, left) * (1 - share) + columns(inside, left + 1) * share >= 0.5
+    return jnp.round(mixed).astype(jnp.uint8), columns(inside, left) * (1 - fraction) + columns(
+        inside, left + 1
+    ) * fraction >= 0.5
 
 
 def _textured(crops: jax.Array, key: jax.Array) -> jax.Array:
@@ -194,15 +196,15 @@ def _set_off(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     inside = masks.astype(jnp.float32)
     own = jnp.exp(0.3 * jax.random.normal(keys[0], (count, 1, 1, 1)) + 0.15 * jax.random.normal(keys[1], (count, 1, 1, 3)))
     # Fraction of stalk pixels in the horizontal neighbourhood of each pixel: 1 at the centre, about a half at the edges.
-    share = jnp.zeros_like(inside)
+    coverage = jnp.zeros_like(inside)
     weights = jax.nn.softmax(2.0 * jax.random.normal(keys[2], (3, count)), axis=0)
     for reach, weight in zip((4, 8, 16), weights):
         reach = min(reach, (width - 1) // 2)
         sums = jax.lax.reduce_window(inside, 0.0, jax.lax.add, (1, 1, 2 * reach + 1), (1, 1, 1), "SAME")
-        share += weight[:, None, None] * sums / (2 * reach + 1)
+        coverage += weight[:, None, None] * sums / (2 * reach + 1)
     amount = jax.random.uniform(keys[3], (count, 1, 1), minval=-0.3, maxval=0.8)
     power = jnp.exp(0.4 * jax.random.normal(keys[4], (count, 1, 1)))
-    shade = 1.0 - amount * jnp.clip(2.0 * (1.0 - share), 0.0, 1.0) ** power
+    shade = 1.0 - amount * jnp.clip(2.0 * (1.0 - coverage), 0.0, 1.0) ** power
     # Half of the crops are unchanged: in real images, the original contrast is the only cue.
     changed = jax.random.bernoulli(keys[5], 0.5, (count, 1, 1, 1)) & masks[..., None]
     factor = jnp.where(changed, own * shade[..., None], 1.0)

@@ -128,7 +128,7 @@ def update_networks(
         New state, and the terms of the loss by name.
     """
     params, average, moments = state
-    rate, share = rates
+    rate, decay = rates
     (images, stalks, kinds, sizes), strips = batch
     places, light, near, variation = jax.random.split(key, 4)
     images, stalks, kinds = move(images, stalks, kinds, sizes, places)
@@ -147,7 +147,7 @@ def update_networks(
     updates, moments = _optimiser().update(gradients, moments, params)
     updates = _map_frozen(jnp.zeros_like, updates, frozen)  # weight decay also acts at zero gradient
     params = jax.tree.map(lambda old, change: old + rate * change, params, updates)
-    average = jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, average, params)
+    average = jax.tree.map(lambda old, new: decay * old + (1.0 - decay) * new, average, params)
     return (params, average, moments), parts
 
 

@@ -198,10 +198,10 @@ def _example(
     higher: float = 0.0,
 ) -> Example:
     """Build the example of an image [H, W, 3]; a fraction ``higher`` of its stalks also gets a crop around the upper height."""
-    whole = np.asarray(image)
-    reduced, scale = resize(whole, settings, pixels_per_metre)
-    share = settings.width / settings.full_width / settings.resizing(whole.shape[1], pixels_per_metre)
-    shape = crop_shape((settings.crop_height, settings.crop_width), share)
+    full_image = np.asarray(image)
+    reduced, scale = resize(full_image, settings, pixels_per_metre)
+    relative_scale = settings.width / settings.full_width / settings.resizing(full_image.shape[1], pixels_per_metre)
+    shape = crop_shape((settings.crop_height, settings.crop_width), relative_scale)
     clear = np.flatnonzero(kinds == STALK)
     # Jitter the positions, as detections are not exact.
     moved = stalks[clear].copy()

@@ -63,16 +63,16 @@ def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) ->
         name = names[number] if number < len(names) else str(number)
         values = [float(word) for word in words[1:]]
         if len(values) in (4, 5):
-            shares: list[Any] = values[:4]  # the fifth is a confidence
+            coordinates: list[Any] = values[:4]  # the fifth is a confidence
         elif len(values) >= 6 and len(values) % 2 == 0:
-            shares = values
+            coordinates = values
         else:
             raise ValueError(f"line {place + 1} has {len(values)} numbers")
-        if not all(math.isfinite(share) and -_BEYOND <= share <= 1.0 + _BEYOND for share in shares):
+        if not all(math.isfinite(coordinate) and -_BEYOND <= coordinate <= 1.0 + _BEYOND for coordinate in coordinates):
             raise ValueError(f"line {place + 1} holds what is no share of an image")
-        if len(shares) == 4:
-            x, y, wide, high = (share * size[axis % 2] for axis, share in enumerate(shares))
+        if len(coordinates) == 4:
+            x, y, wide, high = (coordinate * size[axis % 2] for axis, coordinate in enumerate(coordinates))
             annotations.append(boxed(name, [x - wide / 2, y - high / 2, wide, high], source))
         else:
-            annotations.append(outlined(name, np.reshape(shares, (-1, 2)) * size, source))
+            annotations.append(outlined(name, np.reshape(coordinates, (-1, 2)) * size, source))
     return annotations
