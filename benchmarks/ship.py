@@ -43,7 +43,7 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
         RequestError: The run cannot be used, or its policy is too large.
     """
     policy = load_policy(run_dir, seed=seed, checkpoint=checkpoint)
-    whole = fresh_score(run_dir, checkpoint, policy.seed, policy.iteration, episodes)
+    score_float32 = fresh_score(run_dir, checkpoint, policy.seed, policy.iteration, episodes)
     shipped.FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=shipped.FOLDER, prefix=".ship-") as temporary:
         folder = Path(temporary) / name
@@ -56,20 +56,26 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
             raise RequestError(
                 f"the policy of {run_dir} takes {size / 2**20:.1f} MiB: ship one of {MOST_BYTES / 2**20:.0f} MiB or less"
             )
-        halved = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
+        score_float16 = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
         remark = (
             f"The episodes are fresh ones, drawn from key {FRESH_KEY} after the training. The weights are shipped in float16 "
-            f"({size / 1e6:.2f} MB), and the figures are theirs; in float32 success is {whole.success:.3f}."
+            f"({size / 1e6:.2f} MB), and the figures are theirs; in float32 success is {score_float32.success:.3f}."
         )
         text = card(
-            policy.config, record, policy.seed, {policy.seed: halved}, policy.env.distance_unit, name_here=name, remark=remark
+            policy.config,
+            record,
+            policy.seed,
+            {policy.seed: score_float16},
+            policy.env.distance_unit,
+            name_here=name,
+            remark=remark,
         )
         write_atomically(folder / "README.md", text)
         place = shipped.FOLDER / name
         place.mkdir(exist_ok=True)
         for file in folder.iterdir():
             file.replace(place / file.name)
-    return halved
+    return score_float16
 
 
 def main() -> None:

@@ -56,15 +56,15 @@ def _row(record: dict[str, Any]) -> tuple[str, ...]:
 
 def _benchmarked(results: Path) -> list[tuple[str, ...]]:
     """Return a row for each device, Python and JAX that benchmarks were run on, with the newest date."""
-    found: dict[tuple[str, str, str], tuple[str, set[str]]] = {}
+    rows: dict[tuple[str, str, str], tuple[str, set[str]]] = {}
     for path, record in read_all(results):
         name = record["name"].partition("/")[0]
         if path.parent != results or name not in _BENCHMARKS or not isinstance(record["device"], str):
             continue
         place = (record["device"], record["versions"]["python"], record["versions"]["jax"])
-        date, names = found.get(place, ("", set()))
-        found[place] = (max(date, record["date"][:10]), names | {name})
+        date, names = rows.get(place, ("", set()))
+        rows[place] = (max(date, record["date"][:10]), names | {name})
     return [
         (date, device, "", python, jax, f"benchmarks: {', '.join(name for name in _BENCHMARKS if name in names)}")
-        for (device, python, jax), (date, names) in found.items()
+        for (device, python, jax), (date, names) in rows.items()
     ]

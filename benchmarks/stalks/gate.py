@@ -94,15 +94,15 @@ def f1_of(hits: int, finds: int, stalks: int) -> float:
 
 def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
     """Evaluate the images of a file of `draw`, or read the cached results of the detector of this name."""
-    kept = path.with_suffix(f".{name.split()[-1]}.npz")
-    if not kept.exists():
+    cached = path.with_suffix(f".{name.split()[-1]}.npz")
+    if not cached.exists():
         arrays = {}
         for place, seen in enumerate(_seen_now(path, finder)):
             values = {"pooled": seen.pooled, "scores": seen.scores, "f1": seen.f1, "plain": seen.plain}
             arrays |= {f"{key}_{place}": value for key, value in values.items()}
-        np.savez(kept, **arrays)
+        np.savez(cached, **arrays)
     family = path.stem.split("_", 1)[1].rpartition("_")[0]
-    with np.load(kept) as data:
+    with np.load(cached) as data:
         columns = [[data[f"{key}_{place}"] for place in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
     return [
         Seen(family, pooled, scores, float(f1), (float(plain[0]), float(plain[1])))
@@ -123,10 +123,10 @@ def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
 
 def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
     """Evaluate photographs, whose cameras are unknown."""
-    for image, count, found in photographs:
+    for image, count, find_boxes in photographs:
         stalks, scores, pooled = see(finder, image, None)
         boxes = stalks[scores >= LEAST_SCORE][:, :4]
-        yield Seen("photographs", pooled, scores, f1_of(found(boxes), len(boxes), count), plain_measures(image))
+        yield Seen("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
 
 
 def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:

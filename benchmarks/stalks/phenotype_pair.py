@@ -61,9 +61,9 @@ if __name__ == "__main__":
     detections, ground, sightings = once()
     first = time.perf_counter() - started
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
-    whole = timed(once, asked.repeats)
+    seconds = timed(once, asked.repeats)
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
-    print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first one, which compiles, {first:.1f} s")
+    print(f"{np.median(seconds):.3f} s a pair (least {min(seconds):.3f}); the first one, which compiles, {first:.1f} s")
     pixels_per_metre = stated.focal / USUAL_DISTANCE
     small = pad(resize(left, settings, pixels_per_metre)[0])
     dtype = finder.dtype

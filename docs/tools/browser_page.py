@@ -74,9 +74,9 @@ def fetch_packages(folder: Path) -> None:
             archives = list(Path(temporary).glob("*.tgz"))
             if done.returncode or len(archives) != 1:
                 sys.exit(f"npm cannot fetch {package}: {done.stderr.strip()[-300:]}")
-            found = hashlib.sha256(archives[0].read_bytes()).hexdigest()
-            if found != digest:
-                sys.exit(f"{package} has the digest {found}, not {digest}: nothing of it is used")
+            actual = hashlib.sha256(archives[0].read_bytes()).hexdigest()
+            if actual != digest:
+                sys.exit(f"{package} has the digest {actual}, not {digest}: nothing of it is used")
             with tarfile.open(archives[0]) as archive:
                 for file in files:
                     member = archive.extractfile(f"package/{file}")

@@ -121,8 +121,8 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
 
 def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
     """Format a table of the parts: milliseconds, and percent of an iteration."""
-    whole = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
-    rows = {**parts, "sum without evaluation": whole, "iteration": iteration, "promised": promised}
+    total = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
+    rows = {**parts, "sum without evaluation": total, "iteration": iteration, "promised": promised}
     lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]
     return "\n".join(lines)
 

@@ -76,7 +76,7 @@ def _read_options(environment: EnvironmentOptions) -> dict[str, Any]:
     if not environment.env_options:
         return {}
     hints = fields.hints(config_class(environment.env))
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for option in environment.env_options:
         name, equals, value = option.partition("=")
         if not equals:
@@ -89,5 +89,5 @@ def _read_options(environment: EnvironmentOptions) -> dict[str, Any]:
         if not fields.is_known(hints[name]):
             raise RequestError(f"{name} cannot be set by name=value: it is a {hints[name]}, neither a number nor a word")
         _, _, several = fields.unwrap(hints[name])
-        found[name] = fields.read(name, hints[name], value.split(",") if several else [value])
-    return found
+        options[name] = fields.read(name, hints[name], value.split(",") if several else [value])
+    return options

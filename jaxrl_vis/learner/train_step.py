@@ -236,7 +236,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         return episodes, outcome
 
     learn = iterations.make_learn(config, insert, algorithm, sampler, layout)
-    seeds, environments, whole = layout.by_seed, layout.by_environment, layout.everywhere
+    seeds, environments, replicated = layout.by_seed, layout.by_environment, layout.everywhere
     host = layout.read_by_host
 
     def spread(name: str, function: Any, in_specs: tuple, out_specs: Any, kept_as: Any = None) -> Any:
@@ -254,8 +254,8 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         plays_any=plays_any,
         part_size=num_played * shards.count,
         init=spread("init", init, (seeds,), layout.loop),
-        keys=spread("keys", rollout_keys, (seeds, whole), seeds),
-        play=spread("play", play_part, (seeds, seeds, whole, whole), (environments, environments)),
+        keys=spread("keys", rollout_keys, (seeds, replicated), seeds),
+        play=spread("play", play_part, (seeds, seeds, replicated, replicated), (environments, environments)),
         learn=spread(
             "learn",
             jax.vmap(learn, (_SEED_AXES, 0), Learned(_SEED_AXES, 0)),  # type: ignore[arg-type]
@@ -266,7 +266,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         evaluate=spread(
             "evaluate",
             make_evaluate(acting, config.run.eval_episodes, shards),
-            (seeds, whole),
+            (seeds, replicated),
             Evaluation(seeds, environments),  # type: ignore[arg-type]
             kept_as=Evaluation(host, host) if jax.process_count() > 1 else None,  # type: ignore[arg-type]
         ),

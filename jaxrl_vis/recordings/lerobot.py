@@ -47,11 +47,11 @@ def write(recordings: Recordings, folder: Path) -> None:
         raise RequestError(f"{folder} is not empty: name a new folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as temporary:
-        whole = Path(temporary) / "dataset"
-        _Writer(recordings, whole).write()
+        dataset = Path(temporary) / "dataset"
+        _Writer(recordings, dataset).write()
         if folder.exists():
             folder.rmdir()
-        shutil.move(whole, folder)
+        shutil.move(dataset, folder)
 
 
 class _Writer:

@@ -72,8 +72,8 @@ def descend(weighting: Weighting) -> Paths:
 
         (last, _), points = jax.lax.scan(step, (start, weighting.init(NAMES, start)), jnp.arange(STEPS))
         points = jnp.concatenate([points, last[None]])
-        found = jax.vmap(losses)(points)
-        return points, jnp.stack([found[name] for name in NAMES], axis=-1)
+        values = jax.vmap(losses)(points)
+        return points, jnp.stack([values[name] for name in NAMES], axis=-1)
 
     return Paths(*map(np.asarray, jax.jit(jax.vmap(path))(jnp.array(STARTS))))
 

@@ -82,8 +82,8 @@ def graddrop_direction(gradients: Mapping[str, Params], drawn: Params, leak: flo
         rows = to_float32(jnp.stack(leaves))
         total = jnp.sum(jnp.abs(rows), axis=0)
         purity = 0.5 * (1.0 + jnp.where(total > 0.0, jnp.sum(rows, axis=0) / jnp.where(total > 0.0, total, 1.0), 0.0))
-        kept = jnp.where(purity > drawn, rows > 0.0, rows < 0.0)
-        return jnp.sum((leak + (1.0 - leak) * kept) * rows, axis=0)
+        selected = jnp.where(purity > drawn, rows > 0.0, rows < 0.0)
+        return jnp.sum((leak + (1.0 - leak) * selected) * rows, axis=0)
 
     return jax.tree.map(masked, drawn, *gradients.values())
 

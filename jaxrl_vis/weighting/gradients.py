@@ -42,7 +42,7 @@ from jaxrl_vis.weighting.base import (
     weighted_sum,
 )
 
-Way = Literal["per_loss", "latents"]
+GradientMode = Literal["per_loss", "latents"]
 LossesFunction = Callable[..., Any]
 Encode = Callable[..., Any] | Mapping[str, Callable[..., Any]]
 Selector = Callable[[Params], Params]
@@ -138,7 +138,7 @@ def weighted_grad(
     losses_fn: LossesFunction,
     weighting: Weighting,
     shared: Selector = everything,
-    way: Way = "per_loss",
+    mode: GradientMode = "per_loss",
     has_aux: bool = False,
     reduce: Callable[[Any], Any] = everything,
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
@@ -153,7 +153,7 @@ def weighted_grad(
         weighting: Weighting, such as from `make_weighting`.
         shared: Function that selects the parameters in which gradients are compared, for instance
             ``lambda params: params["encoder"]``. It must return parts of its argument unmodified.
-        way: Method of computing gradients, see the module docstring.
+        mode: Method of computing gradients, see the module docstring.
         has_aux: See ``losses_fn``.
         reduce: Function applied to losses, gradients and dots before the weighting reads them, for use if each device has its
             own part of the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``. Inside `jax.shard_map`
@@ -170,12 +170,12 @@ def weighted_grad(
         RequestError: The method is unknown, or does not support the weighting; from the returned function: ``losses_fn`` does
             not return a dictionary of scalars, or the losses are not those with which the state was initialised.
     """
-    if way not in get_args(Way):
-        raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
-    if way == "latents" and weighting.needs == "gradients":
+    if mode not in get_args(GradientMode):
+        raise RequestError(f"unknown gradient mode {mode!r}{nearest(mode, get_args(GradientMode))}")
+    if mode == "latents" and weighting.needs == "gradients":
         raise RequestError(f"weighting {weighting.name} needs whole gradients, which latents does not find; use per_loss")
-    if way == "latents" and encode is None:
-        raise RequestError("way latents needs to know what the latents are: give encode")
+    if mode == "latents" and encode is None:
+        raise RequestError("mode latents needs to know what the latents are: give encode")
 
     def encoded_losses(params: Params, *args: Any) -> Any:
         if encode is None:
@@ -236,7 +236,7 @@ def weighted_grad(
         combined = jax.tree.map(jnp.add, in_heads, _embed(shared, params, added))
         return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
 
-    return find_per_loss if way == "per_loss" else find_by_latents
+    return find_per_loss if mode == "per_loss" else find_by_latents
 
 
 def _replaced(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:

@@ -168,9 +168,9 @@ def differentiate(
 
         # Differentiate each loss separately, so that the compiler can remove the computation of all others as dead code.
         chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
-        losses[name], pullback, beside = jax.vjp(one, chosen, read, has_aux=True)
+        losses[name], pullback, aux = jax.vjp(one, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
-        extra = beside if name == MAIN or MAIN not in reads else extra
+        extra = aux if name == MAIN or MAIN not in reads else extra
     return Differentiated(losses, of_params, at_latents, extra)
 
 

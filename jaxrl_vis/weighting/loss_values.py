@@ -208,9 +208,9 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         (gradient,) = pullback((memory["logs"] - jnp.log(above)).astype(memory["logits"].dtype))
         changes, rule_state = rule.update(gradient, memory["rule"], memory["logits"])
         learned = {"logits": optax.apply_updates(memory["logits"], changes), "rule": rule_state}
-        kept = {name: memory[name] for name in learned}
+        previous = {name: memory[name] for name in learned}
         # There are no losses before the first ones.
-        now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, kept)
+        now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, previous)
         ratios = jax.nn.softmax(now["logits"]) / above
         weights = by_name(losses, ratios / jnp.sum(ratios))
         return weights, *moved(state, weights, memory={**now, "logs": jnp.log(above)})

@@ -24,22 +24,22 @@ _NEWTON_STEPS = 60
 _HALVINGS = 16
 
 
-def unit_gramian(gramian: jax.Array, least: float | None = None) -> tuple[jax.Array, jax.Array]:
+def unit_gramian(gramian: jax.Array, min_length: float | None = None) -> tuple[jax.Array, jax.Array]:
     """Scale gradients to unit norm.
 
     Args:
         gramian: [K, K] float.
-        least: Minimum norm by which gradients are divided, relative to the largest norm; None for the machine epsilon.
+        min_length: Minimum norm by which gradients are divided, relative to the largest norm; None for the machine epsilon.
 
     Returns:
         [K, K] Gramian of the scaled gradients; [K] norms of the gradients relative to the largest norm, and not less than
-        ``least``. If all gradients vanish, the Gramian is 0 and every norm is ``least``.
+        ``min_length``. If all gradients vanish, the Gramian is 0 and every norm is ``min_length``.
     """
     eps = jnp.finfo(gramian.dtype).eps
     lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
     greatest = jnp.max(lengths)
     greatest = jnp.where(greatest > 0.0, greatest, 1.0)
-    relative = jnp.maximum(lengths / greatest, eps if least is None else least)
+    relative = jnp.maximum(lengths / greatest, eps if min_length is None else min_length)
     # Divide by one factor at a time: the product of two small norms might underflow.
     return gramian / greatest / greatest / relative[:, None] / relative[None, :], relative
 
@@ -106,7 +106,7 @@ def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.A
 
 
 def min_norm(
-    gramian: jax.Array, free: jax.Array | None = None, passes: int = 3, least: float | None = None
+    gramian: jax.Array, free: jax.Array | None = None, passes: int = 3, min_length: float | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Compute the weights w >= 0, of sum 1, that minimise w^T G w.
 
@@ -116,12 +116,12 @@ def min_norm(
     Args:
         gramian: [K, K] float, positive semidefinite.
         free, passes: See `nonnegative`.
-        least: See `unit_gramian`.
+        min_length: See `unit_gramian`.
 
     Returns:
         [K] float, w; [K] bool, as in `nonnegative`.
     """
-    unit, lengths = unit_gramian(gramian, least)
+    unit, lengths = unit_gramian(gramian, min_length)
     per_length = jnp.min(lengths) / lengths
     x, free = nonnegative(unit + per_length[:, None] * per_length[None, :], per_length, free, passes)
     weights = per_length * x
@@ -151,7 +151,7 @@ class _Bracket(NamedTuple):
     high: jax.Array  # [] t with |g_w(t)| <= t
     at_low: jax.Array  # [] |g_w(t)| - t at low, halved if this end was kept twice
     at_high: jax.Array  # [] likewise at high
-    kept: jax.Array  # [] int32, end kept by the last step: -1 low, 1 high
+    kept_end: jax.Array  # [] int32, end kept by the last step: -1 low, 1 high
     free: jax.Array  # [K] bool
     error: jax.Array  # [] |g_w(t)| - t at the latest t
     steps: jax.Array
@@ -183,7 +183,7 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
         shifted = scaled + fraction * (to_mean[:, None] + to_mean[None, :]) + fraction**2 * squared
         # Only the rounding errors of these sums would be left of a gradient that is shifted close to 0. This minimum norm
         # keeps them below the ridge that `nonnegative` adds.
-        weights, free = min_norm(shifted, free, passes, least=float(eps) ** (1 / 6))
+        weights, free = min_norm(shifted, free, passes, min_length=float(eps) ** (1 / 6))
         return weights, jnp.sqrt(jnp.maximum(quadratic(scaled, weights), 0.0)), free
 
     def step(now: _Bracket) -> _Bracket:
@@ -192,8 +192,8 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
         _, length, free = evaluate(t, now.free)
         above = length > t
         error = length - t
-        at_low = jnp.where(above, error, jnp.where(now.kept == -1, 0.5 * now.at_low, now.at_low))
-        at_high = jnp.where(above, jnp.where(now.kept == 1, 0.5 * now.at_high, now.at_high), error)
+        at_low = jnp.where(above, error, jnp.where(now.kept_end == -1, 0.5 * now.at_low, now.at_low))
+        at_high = jnp.where(above, jnp.where(now.kept_end == 1, 0.5 * now.at_high, now.at_high), error)
         low, high = jnp.where(above, t, now.low), jnp.where(above, now.high, t)
         return _Bracket(low, high, at_low, at_high, jnp.where(above, 1, -1).astype(jnp.int32), free, error, now.steps + 1)
 
@@ -207,7 +207,7 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     first = _Bracket(zero, one, one, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
     last = jax.lax.while_loop(is_open, step, first)
     # The last error is that of the end that moved last.
-    weights, length, _ = evaluate(jnp.where(last.kept == 1, last.low, last.high), last.free, passes=3)
+    weights, length, _ = evaluate(jnp.where(last.kept_end == 1, last.low, last.high), last.free, passes=3)
     return weights, length
 
 

@@ -76,8 +76,8 @@ def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path,
     assert largest < all_of_them
     for there, fits in ((largest, False), (all_of_them - 1, False), (all_of_them, True)):
         monkeypatch.setattr(memory, "available_bytes", lambda there=there: there)
-        memory.check_compiled(compiled, already_there=False)
-        assert memory.fit_together(compiled, already_there=False) is fits
+        memory.check_compiled(compiled, is_allocated=False)
+        assert memory.fit_together(compiled, is_allocated=False) is fits
     monkeypatch.undo()
     monkeypatch.setattr(run_loop, "fit_together", lambda *_: False)
     list(make_fake_trainer(read_config(run_dir), tmp_path / "later").run())
@@ -87,11 +87,11 @@ def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path,
 def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkeypatch):
     """Scratch memory of the evaluation, which depends on --eval-episodes, is asked for before anything is allocated."""
     compiled = straight[1].programs.compile()
-    memory.check_compiled(compiled, already_there=False)
+    memory.check_compiled(compiled, is_allocated=False)
     state = compiled["learn"].memory_analysis().argument_size_in_bytes
     monkeypatch.setattr(memory, "available_bytes", lambda: state + 100)
     with pytest.raises(RequestError, match="(evaluate|learn|play|broken_leaves) needs .* --eval-episodes") as refused:
-        memory.check_compiled(compiled, already_there=False)
+        memory.check_compiled(compiled, is_allocated=False)
     assert "\n" not in str(refused.value)
     monkeypatch.setattr(restored_run, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
     monkeypatch.setattr(memory, "available_bytes", lambda: 100)

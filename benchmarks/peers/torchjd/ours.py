@@ -78,17 +78,17 @@ def vaccinated(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
 
 def results(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute all results, by ``K/NAME``; needs 64-bit JAX."""
-    found: dict[str, Any] = {}
+    directions: dict[str, Any] = {}
     for count in sorted({int(name.split("/")[0]) for name in arrays}):
         jacobians, orders = (jnp.asarray(arrays[f"{count}/{name}"]) for name in ("jacobians", "orders"))
         for name in DIRECTIONS:
             one = weights_function(jw.make_weighting(name), count)
-            found[f"{count}/{name}"] = jax.jit(jax.vmap(lambda jacobian, one=one: one(jacobian) @ jacobian))(jacobians)
+            directions[f"{count}/{name}"] = jax.jit(jax.vmap(lambda jacobian, one=one: one(jacobian) @ jacobian))(jacobians)
         for name, weighting in SOLVED.items():
-            found[f"{count}/{name}"] = jax.jit(jax.vmap(weights_function(weighting, count)))(jacobians)
+            directions[f"{count}/{name}"] = jax.jit(jax.vmap(weights_function(weighting, count)))(jacobians)
         for name, weighting in READERS.items():
             path = jax.jit(jax.vmap(path_function(weighting, count)))
-            found[f"{count}/{name}"] = path(jnp.asarray(arrays[f"{count}/losses"]))
+            directions[f"{count}/{name}"] = path(jnp.asarray(arrays[f"{count}/losses"]))
         drawn: dict[str, Any] = {
             "pcgrad": lambda jacobian, order: surgery.pcgrad_weights(jacobian @ jacobian.T, order) @ jacobian,
             "gradvac": vaccinated,
@@ -97,8 +97,8 @@ def results(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             ),
             "random": lambda jacobian, normal: loss_values.random_weights(normal) @ jacobian,
         }
-        given = {"graddrop": "uniform", "random": "normal"}
+        noise = {"graddrop": "uniform", "random": "normal"}
         for name, function in drawn.items():
-            inputs = jnp.asarray(arrays[f"{count}/{given[name]}"]) if name in given else orders
-            found[f"{count}/{name}"] = jax.jit(jax.vmap(function))(jacobians, inputs)
-    return {name: np.asarray(value) for name, value in found.items()}
+            inputs = jnp.asarray(arrays[f"{count}/{noise[name]}"]) if name in noise else orders
+            directions[f"{count}/{name}"] = jax.jit(jax.vmap(function))(jacobians, inputs)
+    return {name: np.asarray(value) for name, value in directions.items()}

@@ -119,13 +119,13 @@ def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
     for name, method in METHODS.items():
         # Takes seconds each, and linearly dependent gradients may have no solution: full rank only.
         chosen = is_full if name == "nash_mtl" else np.ones(len(jacobians), bool)
-        found = [method(jacobian) for jacobian in jacobians[torch.from_numpy(chosen)]]
-        results[f"{prefix}/{name}"] = np.full((len(jacobians), len(found[0])), np.nan)
-        results[f"{prefix}/{name}"][chosen] = np.stack(found)
+        directions = [method(jacobian) for jacobian in jacobians[torch.from_numpy(chosen)]]
+        results[f"{prefix}/{name}"] = np.full((len(jacobians), len(directions[0])), np.nan)
+        results[f"{prefix}/{name}"][chosen] = np.stack(directions)
         print(prefix, name, flush=True)
     results |= {f"{prefix}/{name}": value for name, value in drawn(arrays, prefix).items()}
     by_path = [dict(paths(losses)) for losses in torch.from_numpy(arrays[f"{prefix}/losses"])]
-    return results | {f"{prefix}/{name}": np.stack([each[name] for each in by_path]) for name in by_path[0]}
+    return results | {f"{prefix}/{name}": np.stack([path[name] for path in by_path]) for name in by_path[0]}
 
 
 def main() -> None:
@@ -133,8 +133,8 @@ def main() -> None:
     prefixes = sorted({name.split("/")[0] for name in np.load(sys.argv[1])})
     results: dict[str, Any] = {"versions": np.array([f"torchjd {version('torchjd')}", f"torch {torch.__version__}"])}
     with multiprocessing.get_context("spawn").Pool(len(prefixes)) as pool:
-        for found in pool.starmap(compute, [(prefix, sys.argv[1]) for prefix in prefixes]):
-            results |= found
+        for part in pool.starmap(compute, [(prefix, sys.argv[1]) for prefix in prefixes]):
+            results |= part
     np.savez(sys.argv[2], **results)
 
 

@@ -46,7 +46,7 @@ class PixelsConfig(checks.CheckedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole(self, "image_size", "frame_stack")
+        checks.integers(self, "image_size", "frame_stack")
         checks.choice(self, "pixels", CHANNELS)
         checks.choice(self, "depth_encoding", get_args(DepthEncoding))
         for field, minimum in (("depth_range", 0.0), ("clip_range", 1e-6)):

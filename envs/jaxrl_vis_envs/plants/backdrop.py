@@ -155,10 +155,10 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
     if not paths:
         raise ValueError("scene.photographs needs photographs that packages ship: pip install scikit-image, or scikit-learn")
     with Image.open(paths[rng.integers(len(paths))]) as opened:
-        whole = np.asarray(opened.convert("RGB"))
-    tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in whole.shape[:2])
-    line, column = rng.integers(0, whole.shape[0] - tall + 1), rng.integers(0, whole.shape[1] - wide + 1)
-    part = Image.fromarray(whole[line : line + tall, column : column + wide])
+        photograph = np.asarray(opened.convert("RGB"))
+    tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in photograph.shape[:2])
+    line, column = rng.integers(0, photograph.shape[0] - tall + 1), rng.integers(0, photograph.shape[1] - wide + 1)
+    part = Image.fromarray(photograph[line : line + tall, column : column + wide])
     part = part.resize((SHAPE[1], SHAPE[0]), Image.Resampling.BILINEAR)
     values = (np.asarray(part) / 255.0) ** 2.2
     return values[:, ::-1] if rng.random() < 0.5 else values
@@ -166,9 +166,9 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
 
 def photograph_files() -> list[Path]:
     """Return the paths of the photographs shipped with scikit-image and scikit-learn, in fixed order; empty without them."""
-    found = []
+    paths = []
     for package, folder in _PHOTOGRAPHS:
         spec = importlib.util.find_spec(package)
         if spec is not None and spec.origin is not None:
-            found += sorted((Path(spec.origin).parent / folder).glob("*.jpg"))
-    return found
+            paths += sorted((Path(spec.origin).parent / folder).glob("*.jpg"))
+    return paths

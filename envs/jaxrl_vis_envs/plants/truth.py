@@ -107,10 +107,10 @@ def stalks_in_view(
     stalks = []
     for index, stalk in enumerate(plot.measured):
         tall = stalk.points[:, 2].max()
-        whole = _area(outline(stalk, pose, camera, np.linspace(0.0, tall, 120)), camera)
-        if whole is None:
+        projection = _area(outline(stalk, pose, camera, np.linspace(0.0, tall, 120)), camera)
+        if projection is None:
             continue
-        box, area = _down_to_ground(whole[0], stalk, pose, camera), whole[1]
+        box, area = _down_to_ground(projection[0], stalk, pose, camera), projection[1]
         rows, columns = _pixels(box, camera)
         line, column = np.nonzero(instance[rows, columns] == index)
         line, column = line + rows.start, column + columns.start

@@ -74,7 +74,7 @@ class HandReachConfig(TaskConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole(self, "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations")
+        checks.integers(self, "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations")
         checks.choice(self, "goal_rule", ("random_actions", "meet"))
         checks.not_negative(self, "goal_noise")
         checks.boolean(self, "contacts")

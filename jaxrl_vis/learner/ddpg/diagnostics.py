@@ -60,8 +60,8 @@ def fractions(counts: Metrics, parts: int = 1) -> Metrics:
         parts: Number of parts.
     """
 
-    def fraction(part: str, whole: str) -> jax.Array:
-        return counts[part] / jnp.maximum(counts[whole], 1.0 / parts)
+    def fraction(part: str, total: str) -> jax.Array:
+        return counts[part] / jnp.maximum(counts[total], 1.0 / parts)
 
     result = {"positive_share": counts["positive_share"], "filtered_share": fraction("filtered", "negative")}
     if "failure" not in counts:

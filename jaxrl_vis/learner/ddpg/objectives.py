@@ -97,12 +97,12 @@ def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[
     return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.encoded)}
 
 
-def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
+def _together(auxiliary: Auxiliary, encoded: Latents | dict[str, jax.Array]) -> Latents:
     """Collect the latents for the losses, whether encoded together or by `_encoders`."""
-    if isinstance(found, Latents):
-        return found
-    before, *others = found[_OTHERS_READ]
-    return _with_others(auxiliary, found[_MAIN_READS], before, others)
+    if isinstance(encoded, Latents):
+        return encoded
+    before, *others = encoded[_OTHERS_READ]
+    return _with_others(auxiliary, encoded[_MAIN_READS], before, others)
 
 
 def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
@@ -122,7 +122,7 @@ def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latent
     return of_actor, of_critic
 
 
-def _least(values: jax.Array) -> jax.Array:
+def _minimum(values: jax.Array) -> jax.Array:
     """Return the minimum of the heads' values: [K, B] -> [B]."""
     return values[0] if values.shape[0] == 1 else jnp.min(values, axis=0)
 
@@ -154,29 +154,29 @@ class Objectives:
 
         All heads are trained on the same target; ``values`` are the minimum over heads. ``noise`` as for `_target`.
         """
-        networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
+        networks, weighting, mode = self.networks, self.auxiliary.weighting, self.auxiliary.gradient_mode
 
         def encode(encoder: Params) -> Latents:
-            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=way == "per_loss")
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=mode == "per_loss")
 
-        def critic_losses(critic: Params, found: Latents | dict[str, jax.Array]):
+        def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
-            latents = _together(self.auxiliary, found)
+            latents = _together(self.auxiliary, encoded)
             target = self._target(now, inputs, latents, batch, noise)
             values = networks.values(critic, latents.pair, batch.action)
-            value = _least(values)
+            value = _minimum(values)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
             others = self._auxiliary(critic, latents, inputs, image, batch)
             errors = [losses.critic_loss(of_head, target, keep, self._kept(keep)) for of_head in values]
             return {MAIN: functools.reduce(jnp.add, errors), **others}, (latents, value, keep)
 
         # If losses are differentiated one by one, auxiliary losses need not pass through everything that the main one reads.
-        passes_apart = way == "latents" and weighting.needs in ("dots", "gramian")
+        passes_apart = mode == "latents" and weighting.needs in ("dots", "gramian")
         encoders = _encoders(networks, self.auxiliary, inputs) if passes_apart else encode
         options: dict[str, Any] = {"forwards": forward_mode.with_tangents, "encode": encoders, "has_aux": True}
         if self.reduces_early:
             options["reduce"] = self.shards.mean
-        return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
+        return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), mode, **options)
 
     def _kept(self, keep: jax.Array) -> jax.Array | None:
         """Return the mean number of unfiltered transitions per shard, the divisor for all shards; None for each its own."""
@@ -192,7 +192,7 @@ class Objectives:
         action = networks.act(now.target_actor, of_actor)
         if noise is not None:
             action = jnp.clip(action + noise, -1.0, 1.0)
-        value_tp1 = _least(networks.values(now.target_critic, of_critic, action))
+        value_tp1 = _minimum(networks.values(now.target_critic, of_critic, action))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
@@ -213,12 +213,12 @@ class Objectives:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
             others = self._auxiliary(actor, latents, inputs, image, batch, weights)
         if self.auxiliary.weighting.log:
-            others = {name: self.shards.whole(loss) for name, loss in others.items()}
+            others = {name: self.shards.global_mean(loss) for name, loss in others.items()}
         action = self.networks.act(actor, self.auxiliary.main_latents(latents.pair, weights) if has_encoder else latents.pair)
         value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
         loss = losses.actor_loss(
-            value, action, self.config.ddpg.action_penalty, best, self.shards.whole, self.config.ddpg.actor_log
+            value, action, self.config.ddpg.action_penalty, best, self.shards.global_mean, self.config.ddpg.actor_log
         )
         weighting = self.auxiliary.weighting
         of_heads = weighting.head_weights(weights)

@@ -101,7 +101,7 @@ class Replay(NamedTuple):
             stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`).
         """
         episodes, horizon = self.num_episodes, self.horizon
-        beside = {
+        fields = {
             name: _pack_steps(jnp.zeros((episodes, *spec.shape), spec.dtype)) for name, spec in dict(stored or {}).items()
         }
         first, *others = observation.shape
@@ -111,7 +111,7 @@ class Replay(NamedTuple):
                 observations=pack(jnp.zeros(stored_shape, observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
-                stored=beside,
+                stored=fields,
             ),
             size=jnp.zeros((), jnp.int32),
         )

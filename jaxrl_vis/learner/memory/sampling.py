@@ -91,9 +91,9 @@ class Sampler:
             # Transitions are sampled at random, so the next transition's episode is a random one.
             choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
         if self.config.network.random_shift:
-            most, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
+            max_shift, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
-            choice = choice._replace(shift=scaled(fraction, 2 * most + 1) - most)
+            choice = choice._replace(shift=scaled(fraction, 2 * max_shift + 1) - max_shift)
         if self.config.study.reward_clutter < 1.0:
             choice = choice._replace(clutter_end=self._clutter_end(state, iteration))
         parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))

@@ -104,11 +104,11 @@ def _unclipped(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         layers = layers_of(policy)
     except RequestError:
         return {}
-    found = {}
+    ranges = {}
     for name in INPUTS:
         mean, scale = (layers.arrays[f"{layers.scaling(name)}/{part}"] for part in ("mean", "scale"))
-        found[name] = (mean - layers.limit / scale, mean + layers.limit / scale)
-    return found
+        ranges[name] = (mean - layers.limit / scale, mean + layers.limit / scale)
+    return ranges
 
 
 def _write(
@@ -166,11 +166,11 @@ def check_file(path: Path | str) -> Check:
 def _of_program(contract: Contract) -> Any:
     """Load a policy in ONNX or StableHLO, and compare its inputs and outputs with the contract."""
     model = (onnx_file.Model if contract.format == "onnx" else stablehlo.Program)(contract.file)
-    found = {**model.inputs, **model.outputs}
+    tensors = {**model.inputs, **model.outputs}
     for name, (shape, dtype) in contract.forms.items():
-        if name not in found:
+        if name not in tensors:
             raise RequestError(f"{contract.file} has no {name}, which its contract names: export it again")
-        (_, *sizes), kind = found[name]
+        (_, *sizes), kind = tensors[name]
         if tuple(sizes) != shape or kind != dtype:
             raise RequestError(
                 f"{contract.file} does not fit its contract, {name} is {kind} {tuple(sizes)} and not {dtype} {shape}: "

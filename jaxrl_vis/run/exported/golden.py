@@ -82,8 +82,8 @@ def read(path: Path, forms: dict[str, tuple[tuple[int, ...], str]]) -> Golden:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
         for name in (*INPUTS, OUTPUT):
             shape, dtype = forms[name]
-            most = COUNT * int(np.prod(shape)) * np.dtype(dtype).itemsize + 1024
-            if not 0 < sizes.get(f"{name}.npy", 0) <= most:  # before anything is unpacked
+            max_bytes = COUNT * int(np.prod(shape)) * np.dtype(dtype).itemsize + 1024
+            if not 0 < sizes.get(f"{name}.npy", 0) <= max_bytes:  # before anything is unpacked
                 raise RequestError(f"{path} has no {COUNT} frames of {name} as the contract says: {mend}")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in (*INPUTS, OUTPUT)}

@@ -23,8 +23,8 @@ def clock(seconds: float | None) -> str:
     """Format a duration as ``0:07:30``, with unlimited hours; ``-:--:--`` for None."""
     if seconds is None:
         return "-:--:--"
-    whole = max(0, int(seconds))
-    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
+    seconds_left = max(0, int(seconds))
+    return f"{seconds_left // 3600}:{seconds_left // 60 % 60:02}:{seconds_left % 60:02}"
 
 
 class FittingProgress(Progress):

@@ -64,11 +64,11 @@ def card(
     lines += [f"# {name}", "", f"A policy that reaches goals of the task {task}, trained by jaxrl-vis.", ""]
     lines += [f"![{caption}]({file})\n" for caption, file in (pictures or {}).items()]
     lines += ["| seed | environment steps | success | 95 % interval | episodes | mean distance |", "|---|---|---|---|---|---|"]
-    for number, each in scores.items():
+    for number, result in scores.items():
         here = " (these weights)" if number == seed else ""
         lines.append(
-            f"| {number}{here} | {each.env_steps:,} | {each.success:.3f} | {each.low:.3f} to {each.high:.3f} | "
-            f"{each.episodes} | {each.distance:.3g} {unit} |"
+            f"| {number}{here} | {result.env_steps:,} | {result.success:.3f} | {result.low:.3f} to {result.high:.3f} | "
+            f"{result.episodes} | {result.distance:.3g} {unit} |"
         )
     if not scores:
         lines[-2:] = [f"Weights of seed {seed}; not evaluated where they were saved."]

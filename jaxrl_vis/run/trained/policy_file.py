@@ -112,10 +112,10 @@ def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
 
     def declare(about: dict[str, Any]) -> tuple[Source, dict[str, Any]]:
         named = _named(wanted)
-        found = about.pop(_SAME, {})
-        if not isinstance(found, dict) or not all(isinstance(other, str) for other in found.values()):
+        aliases = about.pop(_SAME, {})
+        if not isinstance(aliases, dict) or not all(isinstance(other, str) for other in aliases.values()):
             raise ValueError(_SAME)
-        same.update(found)
+        same.update(aliases)
         if any(named[name].shape != named[other].shape or other in same for name, other in same.items()):
             raise ValueError("an array is not the same as another one")
         return _source(folder, about), {name: leaf for name, leaf in named.items() if name not in same}

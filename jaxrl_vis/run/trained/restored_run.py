@@ -83,10 +83,10 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Re
 
 def _load_best(trainer: Trainer, run_dir: Path | str, checkpoints: Checkpoints) -> Restored:
     try:
-        kept = checkpoints.iterations(BEST)
-        if not kept:
+        iterations = checkpoints.iterations(BEST)
+        if not iterations:
             raise RequestError(f"the run in {run_dir} has kept no best checkpoint: train with --best-by, such as success")
-        return checkpoints.restore(BEST, checkpoints.manifest(BEST, kept[-1]), trainer.shapes)
+        return checkpoints.restore(BEST, checkpoints.manifest(BEST, iterations[-1]), trainer.shapes)
     finally:
         checkpoints.close()
 
@@ -114,7 +114,7 @@ def evaluate_run(
     """
     trainer = open_run(run_dir, cache_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir, checkpoint)
-    check_compiled(trainer.programs.of_evaluation(), already_there=True)
+    check_compiled(trainer.programs.of_evaluation(), is_allocated=True)
     values = jax.device_get(trainer.evaluate(restored.train))
     return {name: [float(number) for number in value] for name, value in values.items()}
 

@@ -285,7 +285,7 @@ class _Verifier:
             program.replay.frame_stack,
         )
         self._say("compiling ...")
-        check_compiled(self._programs.compile(), already_there=False, layout=layout)
+        check_compiled(self._programs.compile(), is_allocated=False, layout=layout)
 
     def _plan(self, begin: int, progress: Progress, iterations: int | None) -> list[int]:
         """List iterations whose rows can be repeated from a state after ``begin`` iterations."""

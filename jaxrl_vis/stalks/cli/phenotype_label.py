@@ -56,7 +56,7 @@ def label(options: Label) -> int:
 
     weights = resolve_weights(options.weights)
     find = load_finder(weights, options.min_score)
-    found, skipped = [], 0
+    labelled, skipped = [], 0
     for place, path in enumerate(paths, start=1):
         try:
             image = rgb8(read_image(path))
@@ -65,13 +65,13 @@ def label(options: Label) -> int:
             skipped += 1
             continue
         detections = find(image)
-        found.append((path, (image.shape[0], image.shape[1]), detections))
+        labelled.append((path, (image.shape[0], image.shape[1]), detections))
         if options.format == "labelme":
             write_labelme(path, (image.shape[0], image.shape[1]), detections)
         print(f"{place} of {len(paths)}  {path.name}: {len(detections)} proposals", flush=True)
     if options.format == "coco":
-        write_coco(there, found, f"proposals of {detector_name(weights)}: correct them")
-    total = sum(len(detections) for _, _, detections in found)
+        write_coco(there, labelled, f"proposals of {detector_name(weights)}: correct them")
+    total = sum(len(detections) for _, _, detections in labelled)
     where = there if options.format == "coco" else f"{options.images}/*.json"
-    print(f"{where}: {total} proposals in {len(found)} images; correct them, then `jaxrl-vis phenotype train`")
+    print(f"{where}: {total} proposals in {len(labelled)} images; correct them, then `jaxrl-vis phenotype train`")
     return 3 if skipped else 0

@@ -83,12 +83,12 @@ def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, 
     """Read all images with their stalks and stalk crops, and report the progress every few seconds."""
     from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples
 
-    examples, told = [], time.monotonic()
+    examples, last_report = [], time.monotonic()
     say(f"reading {count} images ...")
     for example in annotated_examples(folder, settings, options.label):
         examples.append(example)
-        if time.monotonic() - told > 5.0:
-            told = time.monotonic()
+        if time.monotonic() - last_report > 5.0:
+            last_report = time.monotonic()
             say(f"{len(examples)} of {count} images read")
     return examples
 
@@ -136,11 +136,11 @@ def _report(
             for name, params in pairs.items()
             if params is not None
         }
-    for name, each in scores.items():
+    for name, result in scores.items():
         overlap = overlaps.get(name, math.nan)
         say(
-            f"{name:6} on {each.images} held-out images: {each.right} of {each.labels} stalks found, {each.finds - each.right} "
-            f"false finds, F1 {each.f1:.2f}, AP50 {each.ap50:.2f}"
+            f"{name:6} on {result.images} held-out images: {result.right} of {result.labels} stalks found, "
+            f"{result.finds - result.right} false finds, F1 {result.f1:.2f}, AP50 {result.ap50:.2f}"
             + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
         )
     facts = [

@@ -264,6 +264,6 @@ def draw_points(left: np.ndarray, perception: Perception, calibration: Calibrati
         middle = (round(column), round(line))
         cv2.circle(image, middle, size, (255, 255, 0), -1, cv2.LINE_AA)
         cv2.circle(image, middle, size, (0, 0, 0), 1, cv2.LINE_AA)
-        beside = (middle[0] + size + 2, middle[1] + size)
-        cv2.putText(image, str(place + 1), beside, cv2.FONT_HERSHEY_SIMPLEX, size / 10, (255, 255, 0), 1, cv2.LINE_AA)
+        label_place = (middle[0] + size + 2, middle[1] + size)
+        cv2.putText(image, str(place + 1), label_place, cv2.FONT_HERSHEY_SIMPLEX, size / 10, (255, 255, 0), 1, cv2.LINE_AA)
     return image

@@ -45,7 +45,7 @@ def _of_run(run_dir: Path, trust: bool) -> Reward:
     model = make_learned_reward(networks, trainer.config, resolved)
     assert model is not None
     scaling = networks.batch_scaling(train.statistics)
-    least, most = resolved.reward_negative, resolved.reward_positive
+    low, high = resolved.reward_negative, resolved.reward_positive
 
     shape = networks.observation_spec.shape
 
@@ -54,7 +54,7 @@ def _of_run(run_dir: Path, trust: bool) -> Reward:
             raise RequestError(f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}: audit those")
         batch = _as_batch(images, goals)
         inputs = networks.prepare_batch(scaling, batch)
-        return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - least) / (most - least)
+        return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - low) / (high - low)
 
     return reward
 
@@ -78,8 +78,8 @@ def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
     if ":" not in name:
         others = "run folders and module:function are rewards, too"
         raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} ({others})")
-    found: Any = plugins.find("reward", name, {}, config.environment.env_folder)
-    if not callable(found):
+    plugin: Any = plugins.find("reward", name, {}, config.environment.env_folder)
+    if not callable(plugin):
         raise RequestError(f"{name} is no reward: it must be a function of images and goal images")
-    own: Any = found
+    own: Any = plugin
     return own

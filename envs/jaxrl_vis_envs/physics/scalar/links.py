@@ -153,5 +153,5 @@ def _rotations(quaternions: object) -> np.ndarray:
 def _tidy(array: np.ndarray) -> np.ndarray:
     """Round entries within rounding errors of 0 and, in arrays with entries above 0.5, of whole numbers."""
     array = np.where(np.abs(array) < _ROUNDING * max(np.abs(array).max(), 1e-30), 0.0, array)
-    whole = np.round(array)
-    return np.where(np.abs(array - whole) < _ROUNDING, whole, array) if np.abs(array).max() > 0.5 else array
+    rounded = np.round(array)
+    return np.where(np.abs(array - rounded) < _ROUNDING, rounded, array) if np.abs(array).max() > 0.5 else array

@@ -36,7 +36,7 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     rectified,
     rows,
     tiles_of_program,
-    whole,
+    whole_block,
 )
 from jaxrl_vis.learner.networks.kernels.patches import divisor, padded_channels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
@@ -163,7 +163,7 @@ def _on_gpu(
             jax.ShapeDtypeStruct((programs, total), jnp.float32),
         ),
         grid=(programs,),
-        in_specs=[rows(block, features), rows(block, target.shape[1]), *map(whole, cast)],
+        in_specs=[rows(block, features), rows(block, target.shape[1]), *map(whole_block, cast)],
         out_specs=(rows(block, features), pl.BlockSpec((None, total), lambda program: (program, 0))),
         compiler_params=_PARAMS,
         interpret=interpret,

@@ -28,7 +28,7 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     rows,
     tile_quarters,
     tile_rows,
-    whole,
+    whole_block,
 )
 from jaxrl_vis.learner.networks.kernels.patches import divisor
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
@@ -92,7 +92,7 @@ def _along_on_gpu(
         _tangent_kernel,
         out_shape=(out, out),
         grid=(count // block,),
-        in_specs=[data_spec, *map(whole, cast)],
+        in_specs=[data_spec, *map(whole_block, cast)],
         out_specs=(rows(block, outputs), rows(block, outputs)),
         compiler_params=FORWARD,
         interpret=interpret,

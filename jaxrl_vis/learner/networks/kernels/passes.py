@@ -77,7 +77,7 @@ def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
     """Call the kernel if the program is compiled for a GPU that runs it, else its equivalent in plain JAX."""
     if interpret:
         return on_gpu(*arguments)
-    return dispatch_by_platform(lambda *given: (on_gpu if use_gpu_kernels(probe) else plain)(*given), *arguments)
+    return dispatch_by_platform(lambda *args: (on_gpu if use_gpu_kernels(probe) else plain)(*args), *arguments)
 
 
 # -- Layers
@@ -174,7 +174,7 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         first += value.size
 
 
-def whole(array: jax.Array) -> pl.BlockSpec:
+def whole_block(array: jax.Array) -> pl.BlockSpec:
     """Return a block that gives every program the whole array."""
     return pl.BlockSpec(array.shape, lambda program: (0,) * array.ndim)
 
@@ -192,10 +192,10 @@ def tiles_of_program(tiles: int, total: int, limit: int) -> int:
         total: Number of tiles of all programs.
         limit: Maximum of the result.
     """
-    most = divisor(tiles, limit)
-    while most > 1 and total < most * _LEAST_PROGRAMS:
-        most //= 2
-    return most
+    block = divisor(tiles, limit)
+    while block > 1 and total < block * _LEAST_PROGRAMS:
+        block //= 2
+    return block
 
 
 def cast_kernels(weights: Weights, dtype: Any) -> Weights:
@@ -235,7 +235,7 @@ def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, 
         _forward_kernel,
         out_shape=jax.ShapeDtypeStruct((count, outputs), patches.dtype),
         grid=(count // block,),
-        in_specs=[data_spec, *map(whole, cast)],
+        in_specs=[data_spec, *map(whole_block, cast)],
         out_specs=rows(block, outputs),
         compiler_params=FORWARD,
         interpret=interpret,
@@ -277,7 +277,7 @@ def _backward_on_gpu(
         # All weights in one row, so that one reduction adds up the programs.
         out_shape=jax.ShapeDtypeStruct((programs, total), jnp.float32),
         grid=(programs,),
-        in_specs=[data_spec, rows(block, outputs), rows(block, outputs), *map(whole, cast)],
+        in_specs=[data_spec, rows(block, outputs), rows(block, outputs), *map(whole_block, cast)],
         out_specs=pl.BlockSpec((None, total), lambda program: (program, 0)),
         compiler_params=_BACKWARD if total <= _MOST_SUMS else _BACKWARD_WITH_MORE,
         interpret=interpret,

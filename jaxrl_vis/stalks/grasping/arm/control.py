@@ -131,12 +131,12 @@ def drive(state: Drive, joints: jax.Array, velocity: jax.Array, wanted: jax.Arra
     error = wanted - joints
     integral = jnp.clip(state.integral + period * error, -0.05, 0.05)
     parts = [jnp.asarray(part, jnp.float32) for part in gains[:5]]
-    proportional, integrating, derivative, spring, most = parts
+    proportional, integrating, derivative, spring, max_torque = parts
     slope = (error[1:] - state.error) / period
-    wish = jnp.clip(proportional * error[1:] + integrating * integral[1:] + derivative * slope, -most, most)
+    wish = jnp.clip(proportional * error[1:] + integrating * integral[1:] + derivative * slope, -max_torque, max_torque)
     # Series elastic actuators: torque is the deflection of the spring between motor and joint.
     motor = state.motor + period * gains.motor * (joints[1:] + wish / spring - state.motor)
-    torque = jnp.clip(spring * (motor - joints[1:]), -most, most)
+    torque = jnp.clip(spring * (motor - joints[1:]), -max_torque, max_torque)
     speed = gains.slide_proportional * error[0] + gains.slide_integral * integral[0]
     force = gains.slide_drive * (jnp.clip(speed, -gains.slide_speed, gains.slide_speed) - velocity[0])
     return Drive(integral, motor, error[1:]), jnp.concatenate([force[None], torque])

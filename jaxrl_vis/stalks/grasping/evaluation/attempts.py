@@ -159,9 +159,9 @@ def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, c
         return np.full(2, np.nan)
     motion: Motion = perception.to_last[choice.stop]
     middles_here = motion(chords[choice.stop].middle)
-    beside = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
-    near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(beside, axis=1) < _BESIDE)
-    return np.median(beside[near], axis=0) if near.sum() >= _MIN_SEGMENTS else np.full(2, np.nan)
+    offsets = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
+    near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(offsets, axis=1) < _BESIDE)
+    return np.median(offsets[near], axis=0) if near.sum() >= _MIN_SEGMENTS else np.full(2, np.nan)
 
 
 def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
@@ -189,8 +189,8 @@ def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, .
             continue
         others = np.arange(len(middles)) != index
         best = approach.best_approach(origins, middle, middles[others, :2], radii[others], enough=np.inf)
-        beside = np.linalg.norm(middles[others, :2] - middle[:2], axis=1)
-        standing.append(Standing(number, index, best.stop >= 0, best.room, float(beside.min(initial=np.inf))))
+        distances = np.linalg.norm(middles[others, :2] - middle[:2], axis=1)
+        standing.append(Standing(number, index, best.stop >= 0, best.room, float(distances.min(initial=np.inf))))
     return tuple(standing)
 
 

@@ -200,9 +200,9 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
     spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _LINE_RADIUS) ** 2)))
     thickness = float(np.median(chords.thickness[members[near]]))
     # Direction and curvature are fitted to the whole line.
-    whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
-    bend = whole[2] if len(whole) > 2 else np.zeros(2)
-    direction = np.array([*(whole[1] + 2.0 * bend * (places[best] - middle)), 1.0])
+    curve, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
+    bend = curve[2] if len(curve) > 2 else np.zeros(2)
+    direction = np.array([*(curve[1] + 2.0 * bend * (places[best] - middle)), 1.0])
     return GraspPoint(
         np.array([x, y, places[best]]),
         direction / np.linalg.norm(direction),
@@ -240,7 +240,7 @@ def _distinct(lines: list[_Line], chords: StalkSegments) -> list[_Line]:
     """Return the lines without those that are the same stalk as an earlier one."""
     distinct: list[_Line] = []
     for line in lines:
-        if not any(_same(line.point, other.point) and not _beside(chords, line, other) for other in distinct):
+        if not any(_same(line.point, other.point) and not _side_by_side(chords, line, other) for other in distinct):
             distinct.append(line)
     return distinct
 
@@ -253,7 +253,7 @@ def _same(point: GraspPoint, other: GraspPoint) -> bool:
     return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
 
 
-def _beside(chords: StalkSegments, one: _Line, other: _Line) -> bool:
+def _side_by_side(chords: StalkSegments, one: _Line, other: _Line) -> bool:
     """Return True if pairs show two lines side by side in the same image rows: these are distinct stalks, however near."""
     apart = [np.zeros(0)]
     for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):

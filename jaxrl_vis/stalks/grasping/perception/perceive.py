@@ -124,10 +124,10 @@ def perceive(
             clouds = list(side_by_side(lambda disparity, red: organised(disparity, red, calibration, mount), matched, painted))
         with clock("stitch"):
             method = THESIS if variant.stitch else DEFAULT
-            whole = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
+            thinned = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
             driven = [_driven(*neighbours) for neighbours in itertools.pairwise(views)]
             stitches = list(
-                side_by_side(lambda here, there, far: stitch(here, there, far, method), whole[:-1], whole[1:], driven)
+                side_by_side(lambda here, there, far: stitch(here, there, far, method), thinned[:-1], thinned[1:], driven)
             )
         notes += [
             f"pair {views[place].number} does not stitch to the next, odometry was used: {step.refused}"

@@ -59,7 +59,7 @@ class Method:
         voxel: Edge of a voxel of the grid, m.
         gates: Maximum distances of corresponding points, m, applied in this order.
         steps: Maximum number of iterations with each gate.
-        most: Approximate number of points of the source cloud with each gate, evenly subsampled.
+        max_points: Approximate number of points of the source cloud with each gate, evenly subsampled.
         from_odometry: Whether to start from the odometry and refuse results that differ too much from it, and to weight
             correspondences robustly; if not, start from the identity.
         pixels: Approximate number of pixels of an image to use, evenly subsampled.
@@ -68,22 +68,22 @@ class Method:
     voxel: float
     gates: tuple[float, ...]
     steps: int
-    most: tuple[int, ...]
+    max_points: tuple[int, ...]
     from_odometry: bool
     pixels: int = 1_000_000_000
 
     def after_first_gate(self) -> "Method":
         """Return the method without its first, widest gate."""
-        return dataclasses.replace(self, gates=self.gates[1:], most=self.most[1:])
+        return dataclasses.replace(self, gates=self.gates[1:], max_points=self.max_points[1:])
 
 
-THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, most=(1_000_000,), from_odometry=False)
+THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, max_points=(1_000_000,), from_odometry=False)
 # Wide gates only bring the clouds near enough for the next one, for which few points suffice.
 DEFAULT = Method(
     voxel=0.005,
     gates=(0.15, 0.05, 0.02, 0.01),
     steps=30,
-    most=(1000, 1500, 3000, 5000),
+    max_points=(1000, 1500, 3000, 5000),
     from_odometry=True,
     pixels=512 * 512,
 )
@@ -190,8 +190,8 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
         with a correspondence.
     """
     motion, residual, overlap = start, math.nan, 0.0
-    for gate, most in zip(method.gates, method.most):
-        chosen = source[:: max(len(source) // most, 1)]
+    for gate, max_points in zip(method.gates, method.max_points):
+        chosen = source[:: max(len(source) // max_points, 1)]
         still = _STILL * gate if method.from_odometry else 1e-5
         for _ in range(method.steps):
             moved = motion(chosen)

@@ -118,7 +118,7 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
     axes.set_xticklabels([str(record["number"]) for record in records])
     axes.grid(axis="y", alpha=0.25)
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
-    _beside(figure, score)
+    _draw_proportions(figure, score)
     figure.text(0.03, 0.95, "Attempts and grasps", fontsize=14, weight="bold", color=INK, va="center")
     figure.text(0.03, 0.895, title, fontsize=9, color=FAINT, va="center")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ def _counts(record: Record, name: str) -> tuple[int, int, int, int]:
     return int(record["stalks"]), len(attempts), alone, sum(len(attempt.held) for attempt in attempts) - alone
 
 
-def _beside(figure: Figure, score: Score) -> None:
+def _draw_proportions(figure: Figure, score: Score) -> None:
     """Draw the success rates with their intervals, beside those that the thesis and Cornbot report from fields."""
     axes = figure.add_axes((0.76, 0.13, 0.21, 0.7))
     rows = [

@@ -195,8 +195,8 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
     proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
-    found = judge(network, params, features[0], proposals, valid, settings)
-    return dataclasses.replace(found, pooled=_pooled(features[0], image))
+    detected = judge(network, params, features[0], proposals, valid, settings)
+    return dataclasses.replace(detected, pooled=_pooled(features[0], image))
 
 
 def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:

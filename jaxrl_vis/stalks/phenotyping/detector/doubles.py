@@ -32,8 +32,8 @@ def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, max_shared: 
     for place in np.argsort(-np.asarray(scores), kind="stable").tolist():
         corner = pieces[place][1]
         shared = (_shared(inside[place], corner, inside[other], pieces[other][1]) for other in selected)
-        least = (min(sizes[place], sizes[other]) for other in selected)
-        if not any(common > max_shared * size for common, size in zip(shared, least)):
+        smaller = (min(sizes[place], sizes[other]) for other in selected)
+        if not any(common > max_shared * size for common, size in zip(shared, smaller)):
             selected.append(place)
     return np.isin(np.arange(len(pieces)), selected)
 

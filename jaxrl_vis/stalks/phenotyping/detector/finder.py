@@ -165,7 +165,7 @@ class Finder:
     """
 
     def __init__(self, params: Any, settings: Settings, min_score: float = 0.5, gate: Gate | None = None) -> None:
-        self._params, self._settings, self._least, self.gate = params, settings, min_score, gate
+        self._params, self._settings, self._min_score, self.gate = params, settings, min_score, gate
         accelerated = jax.default_backend() in ("gpu", "tpu")
         self.dtype = jnp.bfloat16 if accelerated else jnp.float32
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
@@ -198,10 +198,10 @@ class Finder:
         added = 0
         if pixels_per_metre and settings.pixels_per_metre:
             reduced, added = usual_lines(reduced, settings)
-        found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
-        assert found.pooled is not None
-        moved = found.stalks[found.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
-        return in_image(moved, scale), found.scores[found.valid], np.asarray(found.pooled)
+        detected = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
+        assert detected.pooled is not None
+        moved = detected.stalks[detected.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
+        return in_image(moved, scale), detected.scores[detected.valid], np.asarray(detected.pooled)
 
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
@@ -209,7 +209,7 @@ class Finder:
         relative_scale = settings.width / settings.full_width / settings.resizing(image.shape[1], pixels_per_metre)
         stalks, scores, pooled = self.look(image, pixels_per_metre)
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
-        selected = scores >= self._least
+        selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
         inside = np.array([_is_shown(stalk, frame) for stalk in stalks], bool)
         stalks, scores = stalks[inside], scores[inside]

@@ -76,8 +76,8 @@ def smoothed(crops: jax.Array) -> jax.Array:
     Args:
         crops: Stalk crops, uint8 or float from 0 to 255.
     """
-    beside = _ALONG // 2
-    values = jnp.pad(crops.astype(jnp.float32) / 255.0, ((0, 0), (beside, beside), (0, 0), (0, 0)), mode="edge")
+    margin = _ALONG // 2
+    values = jnp.pad(crops.astype(jnp.float32) / 255.0, ((0, 0), (margin, margin), (0, 0), (0, 0)), mode="edge")
     sums = jax.lax.reduce_window(values, 0.0, jax.lax.add, (1, _ALONG, 1, 1), (1, 1, 1, 1), "VALID")
     return 2.0 * jnp.maximum(sums / _ALONG, 0.0) ** _EXPONENT - 1.0
 
@@ -100,7 +100,7 @@ def paste(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[n
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])
     if not used.size or end <= begin:
         return np.zeros((0, 0), np.float32), (0, 0)
-    whole = np.zeros((used.size, end - begin), np.float32)
+    pasted = np.zeros((used.size, end - begin), np.float32)
     # Rows with the same horizontal shift are copied together.
     places = left[used] - begin
     breaks = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), used.size]
@@ -108,5 +108,5 @@ def paste(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[n
         place = int(places[first])
         low, high = max(place, 0), min(place + columns, end - begin)
         if high > low:
-            whole[first:last, low:high] = crop[used[first] : used[last - 1] + 1, low - place : high - place]
-    return whole, (int(top + used[0]), begin)
+            pasted[first:last, low:high] = crop[used[first] : used[last - 1] + 1, low - place : high - place]
+    return pasted, (int(top + used[0]), begin)

@@ -158,8 +158,8 @@ def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], 
 
 def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
     """Return the true diameter in mm, as the cameras face it, at a height in m; near a node, the mean above and below it."""
-    beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
-    return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
+    offsets = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
+    return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in offsets]))
 
 
 def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:

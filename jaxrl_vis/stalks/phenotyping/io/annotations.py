@@ -58,8 +58,7 @@ def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]
         RequestError: There are no annotations, they cannot be read, or one is invalid; the message says which.
     """
     images, annotations = [], []
-    found = gather(folder)
-    for number, image in found:
+    for number, image in gather(folder):
         key = "/".join(map(str, number)) if isinstance(number, tuple) else number
         source = str(image.source)
         images.append({"id": key, "file_name": image.name, "width": image.width, "height": image.height, "source": source})
@@ -118,8 +117,8 @@ def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
         said = f"{reprlib.repr(image.get('width'))} and {reprlib.repr(image.get('height'))}"
         raise RequestError(f"{image['source']}: image {name} needs a width and a height in pixels, not {said}")
     if sides[0] * sides[1] > MAX_PIXELS:
-        most = f"more than {MAX_PIXELS // 10**6} million pixels"
-        raise RequestError(f"{image['source']}: image {name} is said to have {sides[0]:g} x {sides[1]:g}, {most}")
+        limit = f"more than {MAX_PIXELS // 10**6} million pixels"
+        raise RequestError(f"{image['source']}: image {name} is said to have {sides[0]:g} x {sides[1]:g}, {limit}")
     return {**image, "width": int(sides[0]), "height": int(sides[1])}
 
 

@@ -92,8 +92,8 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
     plots: dict[str, PlotFolder] = {}
     for path, pairs in folders.items():
         check_length(path)
-        way = path.resolve().name if own else path.relative_to(folder).as_posix()
-        name = "/".join(readable(part) for part in way.split("/")) or "plot"
+        relative = path.resolve().name if own else path.relative_to(folder).as_posix()
+        name = "/".join(readable(part) for part in relative.split("/")) or "plot"
         if name in plots:
             raise RequestError(f"{readable(str(folder))} holds two plots called {name}: rename one of them")
         plots[name] = PlotFolder(name, path, pairs)
@@ -108,7 +108,7 @@ def _below(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFile
     Raises:
         RequestError: There are more than 20,000 folders.
     """
-    found: dict[Path, tuple[PairFiles, ...]] = {}
+    plots: dict[Path, tuple[PairFiles, ...]] = {}
     waiting, count = [(path, 1) for path in _folders(folder)], 0
     while waiting:
         path, depth = waiting.pop(0)
@@ -117,10 +117,10 @@ def _below(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFile
             raise RequestError(f"{readable(str(folder))} holds more than {_MAX_FOLDERS} folders: name one with plots")
         pairs = _pairs(path, patterns)
         if pairs:
-            found[path] = pairs
+            plots[path] = pairs
         elif depth < _DEPTH:
             waiting = [(inside, depth + 1) for inside in _folders(path)] + waiting
-    return found
+    return plots
 
 
 def _folders(folder: Path) -> list[Path]:
@@ -164,10 +164,10 @@ def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
     stored = _find_folder(folder, ("disparity",))
     inside = [] if stored is None else image_files(stored, _DISPARITIES)
     for path in [*inside, *image_files(folder, _DISPARITIES)]:
-        beside = path.parent == folder
+        is_sibling = path.parent == folder
         stem = readable(path.stem)
-        name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if beside else stem
-        if name in sides and (not beside or "disparity" in stem.lower()):
+        name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if is_sibling else stem
+        if name in sides and (not is_sibling or "disparity" in stem.lower()):
             _put(sides, name, "disparity", path)
     files = [
         PairFiles(name, by_side.get("left"), by_side.get("right"), by_side.get("disparity")) for name, by_side in sides.items()
@@ -256,14 +256,14 @@ def _by_folder(folder: Path) -> _Sides:
     names = {path.name.lower(): path for path, images in nested.items() if images}
     pairs = [tuple(names[name] for name in both) for both in (("left", "right"), ("l", "r")) if set(both) <= set(names)][:1]
     if not pairs:
-        found = {
+        candidates = {
             (path, names[other.lower()]) if side == "left" else (names[other.lower()], path)
             for path in names.values()
             for side, other in partners(path.name)
             if other.lower() in names
         }
         # A folder that holds whole pairs is a plot, not a side.
-        pairs = sorted(pair for pair in found if not any(_whole_pairs(path) for path in pair))
+        pairs = sorted(pair for pair in candidates if not any(_whole_pairs(path) for path in pair))
     if len(pairs) > 1:
         both = " and of ".join(f"{readable(left.name)} and {readable(right.name)}" for left, right in pairs[:2])
         raise RequestError(f"{readable(str(folder))} holds pairs of {both}: say which with --left 'PATTERN' --right 'PATTERN'")
@@ -315,11 +315,11 @@ def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
         stem: Stem of its name.
         stems: Lower-case stems of all images in its folder.
     """
-    found = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
-    if len(found) != 1:
+    matches = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
+    if len(matches) != 1:
         return []
-    back = [other for _, other in partners(found[0][1], files=True) if other.lower() in stems]
-    return found if len(back) == 1 else []
+    back = [other for _, other in partners(matches[0][1], files=True) if other.lower() in stems]
+    return matches if len(back) == 1 else []
 
 
 def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:

@@ -102,7 +102,7 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
         # Dark objects next to the border make it look wider; nothing makes it look narrower.
         heavy = np.abs(reach - curve) <= max(_BEND, float(np.quantile(np.abs(reach - curve), 0.5)))
     # A border extends to the adjacent sides of the image, or tapers off.
-    ends = [curve[end] for end, whole in ((0, first == 0), (-1, last == dark.shape[0])) if not whole]
+    ends = [curve[end] for end, complete in ((0, first == 0), (-1, last == dark.shape[0])) if not complete]
     if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _THINNEST:
         return None
     columns = np.zeros(dark.shape[0])

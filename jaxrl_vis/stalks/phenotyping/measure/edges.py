@@ -42,8 +42,8 @@ def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line:
 
 def _shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
     """Return the shift to the right, pixels, of an edge at image rows and columns [N]; 0 without a clear gradient maximum."""
-    beside = _SAMPLE_STEP * np.arange(-_BESIDE, _BESIDE + 1)
-    places = columns[:, None] + beside
+    offsets = _SAMPLE_STEP * np.arange(-_BESIDE, _BESIDE + 1)
+    places = columns[:, None] + offsets
     if places.min() < 0.0 or places.max() >= image.shape[1] - 1:
         return 0.0
     first = places.astype(int)
@@ -53,10 +53,10 @@ def _shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
     reach = np.arange(-8, 9)
     kernel = np.exp(-0.5 * (reach / _SMOOTHING) ** 2)
     change = np.abs(np.gradient(np.convolve(np.pad(across, 8, mode="edge"), kernel / kernel.sum(), mode="valid")))
-    near = np.flatnonzero(np.abs(beside) <= _FURTHEST)
+    near = np.flatnonzero(np.abs(offsets) <= _FURTHEST)
     best = int(near[np.argmax(change[near])])
-    before, most, after = change[best - 1 : best + 2]
-    if most < _MIN_CONTRAST * max(median(change), 1e-6) or before > most or after > most:
+    before, peak, after = change[best - 1 : best + 2]
+    if peak < _MIN_CONTRAST * max(median(change), 1e-6) or before > peak or after > peak:
         return 0.0
-    bend = before - 2.0 * most + after
-    return float(beside[best] + (0.5 * _SAMPLE_STEP * (before - after) / bend if bend < 0.0 else 0.0))
+    bend = before - 2.0 * peak + after
+    return float(offsets[best] + (0.5 * _SAMPLE_STEP * (before - after) / bend if bend < 0.0 else 0.0))

@@ -42,19 +42,19 @@ def _simplified(points: np.ndarray) -> np.ndarray:
     return cv2.approxPolyDP(points.astype(np.float32)[:, None], _TOLERANCE, closed=False)[:, 0].astype(float)
 
 
-def write_coco(path: Path, found: Sequence[tuple[Path, tuple[int, int], list[Detection]]], about: str) -> None:
+def write_coco(path: Path, detected: Sequence[tuple[Path, tuple[int, int], list[Detection]]], about: str) -> None:
     """Write the detections in several images in COCO format.
 
     Args:
         path: The file; images are named relative to its folder.
-        found: File, size (height, width) and detections of each image.
+        detected: File, size (height, width) and detections of each image.
         about: Description of the data set.
 
     Raises:
         OSError: The file cannot be written.
     """
     images, annotations = [], []
-    for number, (image, (height, width), detections) in enumerate(found, start=1):
+    for number, (image, (height, width), detections) in enumerate(detected, start=1):
         name = image.relative_to(path.parent).as_posix()
         images.append({"id": number, "file_name": name, "width": width, "height": height})
         for detection in detections:

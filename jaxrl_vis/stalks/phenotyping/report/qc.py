@@ -259,12 +259,12 @@ class _Pictures:
         for place, track in enumerate(plot.tracks):
             frame, sighting = max(track.sightings, key=lambda indices: self._clear(*indices))
             wanted.setdefault(frame, []).append((place, sighting))
-        self._found: dict[int, _Html] = {}
+        self._crops: dict[int, _Html] = {}
         for frame, tracks in wanted.items():
             overlay = read_image(folder / file_name(f"{plot.pairs[frame]}.png"))
             for place, sighting in tracks:
                 name = f"pair {plot.pairs[frame]}"
-                self._found[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
+                self._crops[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
 
     def _clear(self, frame: int, sighting: int) -> tuple[bool, float]:
         chosen = self._plot.frames[frame][sighting]
@@ -273,9 +273,9 @@ class _Pictures:
     def _crop(self, overlay: np.ndarray, sighting: Sighting) -> np.ndarray:
         scale = overlay_scale(self._plot.image_width)
         left, top, right, bottom = (round(edge * scale) for edge in sighting.box)
-        beside = max((bottom - top) // 2, 12)
-        top, bottom = max(top - beside // 2, 0), min(bottom + beside // 4, overlay.shape[0])
-        left, right = max(left - beside, 0), min(right + beside, overlay.shape[1])
+        margin = max((bottom - top) // 2, 12)
+        top, bottom = max(top - margin // 2, 0), min(bottom + margin // 4, overlay.shape[0])
+        left, right = max(left - margin, 0), min(right + margin, overlay.shape[1])
         cut = overlay[top:bottom, left:right]
         shrink = min(240 / max(cut.shape[0], 1), 1.0)
         return (
@@ -286,12 +286,12 @@ class _Pictures:
 
     def of(self, track: Track) -> _Html:
         """Return the image of a track's best sighting."""
-        return self._found[next(place for place, other in enumerate(self._plot.tracks) if other is track)]
+        return self._crops[next(place for place, other in enumerate(self._plot.tracks) if other is track)]
 
-    def whole(self, most: int) -> Iterable[str]:
-        """Yield images of at most ``most`` whole pairs, spread evenly over the plot."""
+    def whole(self, count: int) -> Iterable[str]:
+        """Yield images of at most ``count`` whole pairs, spread evenly over the plot."""
         pairs = self._plot.pairs
-        for place in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round()).astype(int):
+        for place in np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round()).astype(int):
             overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))
             shrink = min(_THUMB / overlay.shape[1], 1.0)
             small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
@@ -325,18 +325,18 @@ def _chart(plot: PlotResult, rejected: list[Track]) -> str:
         return ""
     places = [point[0] for point in points] + [track.position_m - plot.start for track in rejected]
     low, high = min(places) - 0.05, max(places) + 0.05
-    most = 1.1 * max(point[1] + point[2] for point in points)
+    maximum = 1.1 * max(point[1] + point[2] for point in points)
     wide, tall, margin = 900, 240, 44
 
     def x(place: float) -> float:
         return margin + (place - low) / (high - low) * (wide - margin - 8)
 
     def y(width: float) -> float:
-        return tall - 30 - width / most * (tall - 40)
+        return tall - 30 - width / maximum * (tall - 40)
 
     marks = []
-    step = 5 if most < 40 else 10
-    for value in range(0, int(most) + 1, step):
+    step = 5 if maximum < 40 else 10
+    for value in range(0, int(maximum) + 1, step):
         marks.append(f'<line class="grid" x1="{margin}" x2="{wide - 8}" y1="{y(value):.1f}" y2="{y(value):.1f}"/>')
         marks.append(f'<text x="{margin - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value}</text>')
     apart = 0.25 if high - low > 1.0 else 0.1

@@ -53,13 +53,13 @@ def write_page(
         OSError: The file cannot be written.
     """
     rows = []
-    for name, each in scores.items():
-        values = dataclasses.asdict(each) | {"masks": overlaps.get(name, math.nan), "false": each.finds - each.right}
+    for name, score in scores.items():
+        values = dataclasses.asdict(score) | {"masks": overlaps.get(name, math.nan), "false": score.finds - score.right}
         texts = {key: f"{value:.2f}" if isinstance(value, float) else value for key, value in values.items()}
         rows.append({"weights": name, **{key: "" if text == "nan" else text for key, text in texts.items()}})
     figures = []
     for place, example in enumerate(examples[:_MOST]):
-        shown = {name: draw_finds(example, each[place]) for name, each in finds.items()}
+        shown = {name: draw_finds(example, of_set[place]) for name, of_set in finds.items()}
         pictures = "".join(picture(image, f"image {place + 1}, {name}", "pair") for name, image in shown.items())
         figures.append(f"<figure>{pictures}<figcaption>{' | '.join(shown)}</figcaption></figure>")
     parts = [

@@ -78,9 +78,9 @@ def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
     """
     compared = judged = against = 0
     for first, second, step in zip(frames, frames[1:], np.diff(places)):
-        best, own, most = _shared(_places(first), _places(second), float(step))
-        compared += most >= _MIN_SHARED
-        if best >= max(_MIN_SHARED, _SHARED_SHARE * most):
+        best, own, possible = _shared(_places(first), _places(second), float(step))
+        compared += possible >= _MIN_SHARED
+        if best >= max(_MIN_SHARED, _SHARED_SHARE * possible):
             judged += 1
             against += own < _MAX_STEP_SHARE * best
     return against > max(judged / 2, _MIN_CONTRADICTIONS * compared)
@@ -106,9 +106,9 @@ def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, in
     Returns:
         Number of shared stalks after the best step and after about the given step, and the maximum possible number.
     """
-    most = min(len(first), len(second))
-    if most < _MIN_SHARED:
-        return 0, 0, most
+    possible = min(len(first), len(second))
+    if possible < _MIN_SHARED:
+        return 0, 0, possible
     moved = first[:, None, 0] - second[None, :, 0]  # [N, M], m: motion of the cameras if the two are one stalk
     near = np.abs(first[:, None, 1] - second[None, :, 1]) < _DEPTH
 
@@ -120,4 +120,4 @@ def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, in
     best = max((count(float(by)) for by in candidates), default=0)
     # Tolerate an error of the odometry of a few per cent, which `follow` corrects where possible.
     own = max((count(float(by)) for by in candidates if abs(by - step) < 0.018), default=0)
-    return best, own, most
+    return best, own, possible

@@ -43,7 +43,7 @@ class Gates:
     astray: float = 0.34
     row: float = 0.2
     fraction: float = 0.3
-    least: int = 2
+    minimum: int = 2
     ends: float = 0.01
 
 
@@ -143,7 +143,7 @@ def follow(
             depth = float(view.depth[new]) if view.known[new] else math.nan
             if new in taken:
                 track = tracks[taken[new]]
-                along = view.along[new] if view.known[new] else view.beside(track.place()[1])[new]
+                along = view.along[new] if view.known[new] else view.along_at(track.place()[1])[new]
             else:
                 track, along = _Open(), view.along[new]
                 tracks.append(track)
@@ -173,8 +173,8 @@ def _seen(places: np.ndarray, step: float, field: list[float]) -> float:
     if not len(places):
         return 0.0
     points = np.linspace(places[0] - 0.5 * step, places[-1] + 0.5 * step, 201)
-    beside = points[:, None] - places
-    return float(((beside >= field[0]) & (beside <= field[1])).any(axis=1).mean())
+    offsets = points[:, None] - places
+    return float(((offsets >= field[0]) & (offsets <= field[1])).any(axis=1).mean())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +214,7 @@ class _PairView:
         along = np.where(known, along, rays * usual - half)
         return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), over, half, usual)
 
-    def beside(self, depth: float) -> np.ndarray:
+    def along_at(self, depth: float) -> np.ndarray:
         """Return the positions along the row [N], m, assuming a ``depth`` in m; the usual depth if NaN."""
         return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
 
@@ -253,7 +253,7 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
         return []
     there = np.array([track.place() for track in tracks])
     # A sighting without depth is compared at the depth of the track.
-    along = np.where(view.known, view.along, [view.beside(depth) for _, depth in there]) + place
+    along = np.where(view.known, view.along, [view.along_at(depth) for _, depth in there]) + place
     aside = np.abs(there[:, :1] - along) / gates.along
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
     cost = np.where((aside < 1.0) & (away < 1.0) & view.there, aside + 0.5 * away, _FORBIDDEN_COST)
@@ -292,8 +292,8 @@ def _one_behind(track: _Open, other: _Open) -> float:
     if len(track.sightings) < 2 or not len(depths):
         return math.inf
     depth = float(np.median(depths))
-    beside = np.array([offset + ray * depth for offset, ray in track.rays]) - float(np.median(other.along))
-    return float(np.median(np.abs(beside)))
+    positions = np.array([offset + ray * depth for offset, ray in track.rays]) - float(np.median(other.along))
+    return float(np.median(np.abs(positions)))
 
 
 def _apart(track: _Open, other: _Open) -> tuple[float, float]:
@@ -316,7 +316,7 @@ def _closed(track: _Open, path: Path, step: float, field: tuple[float, ...], usu
     expected = int((np.abs(path.places + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
     # A stalk without a measured depth must be seen twice as often.
-    wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.fraction * expected), 1)
+    wanted = max(min(gates.minimum, expected), math.ceil((1.0 if known else 2.0) * gates.fraction * expected), 1)
     begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
     if len(track.sightings) < wanted:
         reason = f"seen in {len(track.sightings)} of {expected} pairs"

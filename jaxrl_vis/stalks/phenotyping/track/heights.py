@@ -138,11 +138,11 @@ def _at(height: float, values: list[_Value], taper: float) -> Width | None:
     """Estimate the width at a height in m; None if nothing was measured near it."""
     near, far = [], 0
     for value in values:
-        beside = (value.height - height) / INCH
+        inches = (value.height - height) / INCH
         if abs(value.height - height) > _FURTHEST:
             continue
-        error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * beside)
-        near.append(dataclasses.replace(value, mm=value.mm + taper * beside, deviation=error))
+        error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * inches)
+        near.append(dataclasses.replace(value, mm=value.mm + taper * inches, deviation=error))
         far += abs(value.height - height) > _NEAR_HEIGHT
     width = _robust(near)
     return None if width is None else dataclasses.replace(width, corrected=2 * far > len(near))
@@ -176,8 +176,8 @@ def _robust(values: list[_Value]) -> Width | None:
     middle = float(np.interp(quantile * weights.sum(), passed, widths[order]))
     enough = float(weights.sum() ** 2 / (weights**2).sum())
     scatter = 1.4826 * float(np.median(np.abs(widths - middle))) * 1.2533 if len(widths) > 2 else 0.0
-    least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
-    of_pairs = max(scatter, least) / math.sqrt(enough)
+    mean_error = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
+    of_pairs = max(scatter, mean_error) / math.sqrt(enough)
     error = math.hypot(
         of_pairs * math.sqrt(1.0 + _FEW / len(widths)),
         _MASK_ERROR * float(np.median([value.pixel for value in used])),

@@ -247,18 +247,20 @@ def measure_pair(
         line = 0.5 * (detection.box[1] + detection.box[3])
         images = (grey_left, grey_right, calibration)
         how = {"method": method, "ground": ground, "disparity": disparity}
-        got = measure(detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how)
+        measurement = measure(
+            detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how
+        )
         upper = None
         if ground is not None and detection.upper is not None:
             upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
-        measured.append((got, upper))
+        measured.append((measurement, upper))
     measured = _without_strangers(measured, calibration, find_frame(grey_right).columns[0])
-    occluded = _occluded_edges([got for got, _ in measured])
+    occluded = _occluded_edges([measurement for measurement, _ in measured])
     above = _occluded_edges([upper or Measurement() for _, upper in measured])
-    occluded = [behind or not got.here for behind, (got, _) in zip(occluded, measured)]
+    occluded = [behind or not measurement.here for behind, (measurement, _) in zip(occluded, measured)]
     sightings = []
-    for detection, (got, upper), *behind in zip(detections, measured, occluded, above):
-        less = dataclasses.replace(got, confidence=got.confidence * _OCCLUDED) if behind[0] else got
+    for detection, (measurement, upper), *behind in zip(detections, measured, occluded, above):
+        less = dataclasses.replace(measurement, confidence=measurement.confidence * _OCCLUDED) if behind[0] else measurement
         sighting = _sighting(detection, less, upper, calibration)
         sightings.append(dataclasses.replace(sighting, occluded=behind[0], upper_occluded=behind[1]))
     return sightings
@@ -274,19 +276,24 @@ def _without_strangers(
         calibration: Calibration of the cameras.
         begin: First column of the right image without a black border.
     """
-    depths = [got.depth for got, _ in measured if got.diameter_mm is not None]
+    depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
     if len(depths) < _AT_DISTANCE:
         return measured
     row = float(np.median(depths))
     disparity = float(calibration.disparity(np.array(row)))
-    kept = []
-    for got, upper in measured:
-        beyond = got.column - 0.5 * got.width - disparity < begin
-        if got.diameter_mm is not None and beyond and abs(got.depth - row) > _FAR_FROM_ROW:
-            got = Measurement(line=got.line, column=got.column, lean=got.lean, reason="the right image does not show it")
+    valid = []
+    for measurement, upper in measured:
+        beyond = measurement.column - 0.5 * measurement.width - disparity < begin
+        if measurement.diameter_mm is not None and beyond and abs(measurement.depth - row) > _FAR_FROM_ROW:
+            measurement = Measurement(
+                line=measurement.line,
+                column=measurement.column,
+                lean=measurement.lean,
+                reason="the right image does not show it",
+            )
             upper = None
-        kept.append((got, upper))
-    return kept
+        valid.append((measurement, upper))
+    return valid
 
 
 def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
@@ -332,21 +339,21 @@ def _in_pixels(detection: Detection) -> Sighting:
     )
 
 
-def _sighting(detection: Detection, got: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
+def _sighting(detection: Detection, measurement: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
     """Build a sighting from measurements, rounded so that it is unchanged by a round trip through JSON."""
-    line = got.line if math.isfinite(got.line) else 0.5 * (detection.box[1] + detection.box[3])
-    column = got.column if math.isfinite(got.column) else 0.5 * sum(detection.axis)
+    line = measurement.line if math.isfinite(measurement.line) else 0.5 * (detection.box[1] + detection.box[3])
+    column = measurement.column if math.isfinite(measurement.column) else 0.5 * sum(detection.axis)
 
     def known(value: float | None, digits: int) -> float | None:
         return None if value is None or not math.isfinite(value) else round(value, digits)
 
     # Another stalk may stand where this one's axis was extrapolated to.
-    same = upper is not None and abs(upper.depth - got.depth) < _SAME_DEPTH
+    same = upper is not None and abs(upper.depth - measurement.depth) < _SAME_DEPTH
     higher = upper if upper is not None and upper.diameter_mm is not None and same else Measurement()
     along = None
-    if got.diameter_mm is not None:
+    if measurement.diameter_mm is not None:
         # The axis is half a diameter behind the front surface.
-        depth = got.depth + 0.5e-3 * got.diameter_mm
+        depth = measurement.depth + 0.5e-3 * measurement.diameter_mm
         along = (column - calibration.centre[0]) / calibration.focal * depth - 0.5 * calibration.baseline
     return Sighting(
         box=tuple(round(edge, 2) for edge in detection.box),  # pyright: ignore[reportArgumentType]
@@ -354,13 +361,13 @@ def _sighting(detection: Detection, got: Measurement, upper: Measurement | None,
         score=round(detection.score, 4),
         line=round(line, 2),
         column=round(column, 2),
-        width_px=known(got.width, 3),
-        lean_deg=known(math.degrees(got.lean), 2),
-        diameter_mm=known(got.diameter_mm, 4),
-        deviation_mm=known(got.deviation_mm, 4),
-        depth_m=known(got.depth, 5),
+        width_px=known(measurement.width, 3),
+        lean_deg=known(math.degrees(measurement.lean), 2),
+        diameter_mm=known(measurement.diameter_mm, 4),
+        deviation_mm=known(measurement.deviation_mm, 4),
+        depth_m=known(measurement.depth, 5),
         along_m=known(along, 5),
-        height_m=known(got.height, 4),
+        height_m=known(measurement.height, 4),
         upper_mm=known(higher.diameter_mm, 4),
         upper_deviation_mm=known(higher.deviation_mm, 4),
         upper_height_m=known(higher.height, 4),
@@ -368,7 +375,7 @@ def _sighting(detection: Detection, got: Measurement, upper: Measurement | None,
         upper_place=None
         if higher.diameter_mm is None
         else tuple(round(x, 2) for x in (higher.column, higher.line, higher.width)),  # pyright: ignore[reportArgumentType]
-        confidence=round(got.confidence, 4),
+        confidence=round(measurement.confidence, 4),
         ray_deg=round(math.degrees(math.atan((column - calibration.centre[0]) / calibration.focal)), 2),
-        reason=got.reason,
+        reason=measurement.reason,
     )

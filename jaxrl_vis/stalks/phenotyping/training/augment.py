@@ -19,19 +19,19 @@ def relight(images: jax.Array, key: jax.Array) -> jax.Array:
     keys: dict[str, jax.Array] = dict(zip(names, jax.random.split(key, len(names))))
     count = images.shape[0]
 
-    def each(name: str, low: float, high: float) -> jax.Array:
+    def per_image(name: str, low: float, high: float) -> jax.Array:
         return jax.random.uniform(keys[name], (count, 1, 1, 1), minval=low, maxval=high)
 
     values = (images.astype(jnp.float32) / 255.0) ** 2.2
     grey = values.mean(axis=-1, keepdims=True)
-    values = jnp.maximum(grey + (values - grey) * each("grey", 0.2, 1.5), 0.0)
-    gain = jnp.exp(each("gain", -1.2, 1.0)) * jnp.exp(0.2 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
+    values = jnp.maximum(grey + (values - grey) * per_image("grey", 0.2, 1.5), 0.0)
+    gain = jnp.exp(per_image("gain", -1.2, 1.0)) * jnp.exp(0.2 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
     # Smooth random variations of brightness, as of other textures, on a grid of 24 x 24 cells.
     coarse = jax.random.normal(keys["blotch"], (count, 24, 24, 1))
-    gain = gain * jnp.exp(each("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
-    values = _blurred(values * gain, jnp.where(each("sharp", 0.0, 1.0) > 0.5, each("blur", 0.3, 1.3), 0.05))
+    gain = gain * jnp.exp(per_image("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
+    values = _blurred(values * gain, jnp.where(per_image("sharp", 0.0, 1.0) > 0.5, per_image("blur", 0.3, 1.3), 0.05))
     # Up to three times the shot and read noise of the original images, of which downscaled ones have less.
-    level = 3.0 * each("level", 0.0, 1.0) ** 2 / _WELL_ROOT
+    level = 3.0 * per_image("level", 0.0, 1.0) ** 2 / _WELL_ROOT
     values = values + level * jnp.sqrt(values + _DARK) * jax.random.normal(keys["noise"], values.shape)
     curve = jnp.exp(0.15 * jax.random.normal(keys["gamma"], (count, 1, 1, 1))) / 2.2
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0) ** curve).astype(jnp.uint8)
@@ -110,10 +110,10 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Arr
     line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
     top, left = jnp.floor(line).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
     down, over = (line - top)[..., None], (column - left)[..., None]
-    below, beside = jnp.minimum(top + 1, shape[0] - 1), jnp.minimum(left + 1, shape[1] - 1)
+    below, right = jnp.minimum(top + 1, shape[0] - 1), jnp.minimum(left + 1, shape[1] - 1)
     values = image.astype(jnp.float32)
-    upper = values[top, left] * (1 - over) + values[top, beside] * over
-    lower = values[below, left] * (1 - over) + values[below, beside] * over
+    upper = values[top, left] * (1 - over) + values[top, right] * over
+    lower = values[below, left] * (1 - over) + values[below, right] * over
     return jnp.round((upper * (1 - down) + lower * down) * inside[..., None]).astype(jnp.uint8)
 
 

@@ -107,19 +107,19 @@ def resize_crops(example: Example, shape: tuple[int, int]) -> Example:
     return dataclasses.replace(example, crops=crops, masks=np.stack(masks))
 
 
-def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:
+def cut_out(example: Example, max_size: tuple[int, int], rng: np.random.Generator) -> Example:
     """Crop the image of an example at random, mostly around a stalk.
 
     Args:
         example: Example to crop; its stalk crops are unchanged.
-        most: Maximum height and width.
+        max_size: Maximum height and width.
         rng: Generator of the position.
 
     Returns:
         Example with clipped stalks, of which those that are hardly left in the image are ``NOTHING``.
     """
     size = example.image.shape[:2]
-    lines, columns = (min(length, limit) for length, limit in zip(size, most))
+    lines, columns = (min(length, limit) for length, limit in zip(size, max_size))
     low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])
     there = np.flatnonzero(example.kinds == STALK)
     if len(there) and rng.random() < _AT_STALKS:

@@ -100,8 +100,8 @@ def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds
         fitting = np.where(free, overlaps_with(stalks[place, :4], clear[:, :4]), 0.0)
         if fitting.size and fitting.max() >= IOU:
             right[place], free[int(fitting.argmax())] = True, False
-    beside = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
-    return right, beside & ~right
+    on_unclear = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
+    return right, on_unclear & ~right
 
 
 def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, dtype: Any) -> float:
@@ -127,9 +127,9 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
 
 def score(finds: Sequence[Finds]) -> Score:
     """Compute the metrics of the detections in several images, pooled."""
-    labels = sum(each.labels for each in finds)
-    scores = np.concatenate([each.scores[~each.ignored] for each in finds] or [np.zeros(0)])
-    right = np.concatenate([each.right[~each.ignored] for each in finds] or [np.zeros(0, bool)])
+    labels = sum(image.labels for image in finds)
+    scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])
+    right = np.concatenate([image.right[~image.ignored] for image in finds] or [np.zeros(0, bool)])
     counted = scores >= LEAST_SCORE
     hits, count = int(right[counted].sum()), int(counted.sum())
     nothing = float("nan")

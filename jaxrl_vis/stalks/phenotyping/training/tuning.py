@@ -143,8 +143,8 @@ def tune(
         rates = jnp.float32(rate), jnp.float32(min(0.99, (1.0 + step) / (10.0 + step)))
         state, losses = update(state, batches.draw(), jax.random.fold_in(steps_key, step), rates)
         step += 1
-        told = step == 1 or time.monotonic() - last > _HEARTBEAT
-        if told or step % tuning.look == 0:
+        reports = step == 1 or time.monotonic() - last > _HEARTBEAT
+        if reports or step % tuning.look == 0:
             values = {name: float(value) for name, value in losses.items()}
             if not np.isfinite(list(values.values())).all():
                 raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
@@ -226,7 +226,7 @@ def _alike(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)
     lines, columns = shapes[len(shapes) // 2]
     alike = [resize_crops(example, (lines, columns)) for example in examples if len(example.crops)]
-    return np.concatenate([each.crops for each in alike]), np.concatenate([each.masks for each in alike])
+    return np.concatenate([example.crops for example in alike]), np.concatenate([example.masks for example in alike])
 
 
 def _largest(examples: Sequence[Example]) -> tuple[int, int]:

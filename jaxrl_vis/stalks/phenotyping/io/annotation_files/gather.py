@@ -32,20 +32,20 @@ def gather(folder: Path) -> list[tuple[Any, Annotated]]:
     Raises:
         RequestError: There are no annotations, a file cannot be read, or an image is ambiguous or annotated twice.
     """
-    found = _read(folder)
+    images = _read(folder)
     index = _Index(folder)
-    for _, image in found:
+    for _, image in images:
         if isinstance(image.name, str):
             index.settle(image)
         image.annotations = together(image.annotations)
-    return found
+    return images
 
 
 def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     path = folder / "annotations.json"
     if path.exists():
         return _one(path, lambda: _coco(path, read_json(path)), "COCO")
-    found: list[tuple[Any, Annotated]] = []
+    annotated: list[tuple[Any, Annotated]] = []
     others: list[Path] = []
     names: list[str] | None = None
     numbers = itertools.count()
@@ -60,19 +60,19 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
             read = list(zip(numbers, _one(file, lambda file=file, names=names: _yolo(file, images[file.stem], names), "YOLO")))
         else:
             continue
-        found += read or []
+        annotated += read or []
         others += [file] if read is None else []
     broken = next((file for file in others if file.stem in images), None)
     if broken is not None:  # files with other names, such as a calibration, are allowed
         kinds = "Pascal VOC" if broken.suffix.lower() == ".xml" else "LabelMe"
         raise RequestError(f"{broken} is no annotation of {kinds}, but called as an image is")
-    if not found:
+    if not annotated:
         there = f" ({others[0].name} is none)" if others else ""
         raise RequestError(
             f"there are no annotations in {folder}{there}: put annotations.json of COCO there, or .xml of Pascal VOC, .json of "
             "LabelMe or .txt of YOLO beside each image"
         )
-    return found
+    return annotated
 
 
 def _one(file: Path, read: Any, kind: str) -> Any:
@@ -210,15 +210,15 @@ class _Index:
     def _locate(self, name: str, source: Path) -> Path | None:
         parts = PureWindowsPath(name).parts
         base = parts[-1] if parts else ""
-        beside = [
+        neighbours = [
             path for path in (source.parent.joinpath(*parts), self._folder.joinpath(*parts)) if parts and ".." not in parts
         ]
-        for path in beside:
+        for path in neighbours:
             if path.suffix.lower() in _IMAGES and path in self._by_name.get(base.lower(), []):
                 return path
         stem = Path(base).stem if Path(base).suffix.lower() in _IMAGES else base
-        found = self._by_name.get(base.lower()) or self._by_name.get(f"{stem.lower()}\0", [])
-        near = [path for path in found if path.parent == source.parent] or found
+        candidates = self._by_name.get(base.lower()) or self._by_name.get(f"{stem.lower()}\0", [])
+        near = [path for path in candidates if path.parent == source.parent] or candidates
         exact = [path for path in near if path.name == base] or near
         if len(exact) > 1:
             both = " or ".join(readable(str(path.relative_to(self._folder))) for path in exact[:2])

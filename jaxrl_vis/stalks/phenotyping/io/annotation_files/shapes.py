@@ -71,10 +71,10 @@ def together(annotations: list[Annotation]) -> list[Annotation]:
         if not isinstance(group, (int, str)) or isinstance(group, bool) or not isinstance(outlines, list):
             result.append(annotation)
             continue
-        whole = joined.setdefault((annotation["name"], group), annotation)
-        if whole is annotation:
+        merged = joined.setdefault((annotation["name"], group), annotation)
+        if merged is annotation:
             result.append(annotation)
         else:
-            whole["segmentation"] = whole["segmentation"] + outlines
-            whole["bbox"] = None  # computed later from all parts
+            merged["segmentation"] = merged["segmentation"] + outlines
+            merged["bbox"] = None  # computed later from all parts
     return result

@@ -57,11 +57,11 @@ def _voc_image(path: Path, root: Element) -> Annotated:
             # Pixel indices start at 1, and the last ones are inclusive.
             left, top, right, bottom = (float(_text(element, f"bndbox/{edge}")) for edge in _EDGES)
             annotations.append(boxed(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
-    width, height = (_whole(root.findtext(f"size/{side}")) for side in ("width", "height"))
+    width, height = (_integer(root.findtext(f"size/{side}")) for side in ("width", "height"))
     return Annotated(_text(root, "filename"), width, height, path, annotations)
 
 
-def _whole(text: str | None) -> int | None:
+def _integer(text: str | None) -> int | None:
     """Parse a number of pixels; return None if it is missing or 0, as labelImg writes an unknown size."""
     return int(text) or None if text is not None and text.strip() else None
 

@@ -69,9 +69,9 @@ def _present(store: dict[str, Any], pairs: tuple[tuple[str, str], ...]) -> tuple
 def _coefficients(value: Any) -> np.ndarray:
     data = value.get("data") if isinstance(value, dict) else value
     for count in (4, 5, 8, 12, _MOST_COEFFICIENTS):
-        found = numbers(data, count)
-        if found is not None:
-            return found
+        values = numbers(data, count)
+        if values is not None:
+            return values
     return np.zeros(0)
 
 

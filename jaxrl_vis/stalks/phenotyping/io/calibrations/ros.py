@@ -88,8 +88,8 @@ def from_print(text: str) -> dict[str, Any] | None:
     binning: dict[str, float] = {}
     for name, value in _PRINTED_NUMBER.findall(text[matrix.end() :]):
         (binning if name.startswith("binning") else region).setdefault(name, float(value))
-    found = {"header": {}, "height": float(size[1]), "width": float(size[2]), "p": plain_numbers(matrix[1])}
-    return {**found, **binning, "roi": region}
+    info = {"header": {}, "height": float(size[1]), "width": float(size[2]), "p": plain_numbers(matrix[1])}
+    return {**info, **binning, "roi": region}
 
 
 def from_table(text: str) -> dict[str, Any] | None:

@@ -194,8 +194,8 @@ def _printed(path: Path, text: str) -> _Table | None:
     """
     messages = re.split(r"^---\s*$", text, flags=re.MULTILINE)
     for pattern in (_PRINTED_PLACE, _PRINTED_GLOBE):
-        found = [(_PRINTED_STAMP.search(message), pattern.search(message)) for message in messages]
-        rows = [(stamp, place) for stamp, place in found if place is not None]
+        matches = [(_PRINTED_STAMP.search(message), pattern.search(message)) for message in messages]
+        rows = [(stamp, place) for stamp, place in matches if place is not None]
         if not rows:
             continue
         places = np.array([[float(number) for number in place.groups()] for _, place in rows])
