@@ -62,11 +62,11 @@ def draw(folder: Path, part: str, family: str, number: int) -> Path:
     seed = FIRST_SEEDS[part] + number
     sequence = Sequence.of(plants.draw(drawn_from.at_width(WIDTH), seed))
     true, arrays = sequence.drive.true, {}
-    for place, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
+    for index, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
         image, instance, depth = sequence.left(int(frame))
         thinned = np.asarray(instance[::4, ::4]), np.asarray(depth[::4, ::4])
         stalks, kinds, _ = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
-        arrays |= {f"image_{place}": np.asarray(image), f"stalks_{place}": stalks, f"kinds_{place}": kinds}
+        arrays |= {f"image_{index}": np.asarray(image), f"stalks_{index}": stalks, f"kinds_{index}": kinds}
     pixels_per_metre = sequence.drive.stated.focal / sequence.plot.family.rig.distance
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(path, pixels_per_metre=pixels_per_metre, **arrays)
@@ -97,13 +97,13 @@ def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
     cached = path.with_suffix(f".{name.split()[-1]}.npz")
     if not cached.exists():
         arrays = {}
-        for place, seen in enumerate(_seen_now(path, finder)):
+        for index, seen in enumerate(_seen_now(path, finder)):
             values = {"pooled": seen.pooled, "scores": seen.scores, "f1": seen.f1, "plain": seen.plain}
-            arrays |= {f"{key}_{place}": value for key, value in values.items()}
+            arrays |= {f"{key}_{index}": value for key, value in values.items()}
         np.savez(cached, **arrays)
     family = path.stem.split("_", 1)[1].rpartition("_")[0]
     with np.load(cached) as data:
-        columns = [[data[f"{key}_{place}"] for place in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
+        columns = [[data[f"{key}_{index}"] for index in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
     return [
         Seen(family, pooled, scores, float(f1), (float(plain[0]), float(plain[1])))
         for pooled, scores, f1, plain in zip(*columns)
@@ -112,8 +112,8 @@ def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
 
 def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
     with np.load(path) as data:
-        for place in range(FRAMES):
-            image, truth, kinds = (data[f"{name}_{place}"] for name in ("image", "stalks", "kinds"))
+        for index in range(FRAMES):
+            image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
             stalks, scores, pooled = see(finder, image, float(data["density"]))
             right, ignored = match_finds(stalks, scores, truth, kinds)
             counted = (scores >= LEAST_SCORE) & ~ignored

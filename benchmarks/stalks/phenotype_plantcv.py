@@ -132,7 +132,7 @@ def compare(file: Path) -> None:
     ):
         _print(name, theirs[some], ours[some], truth[some])
     names, which = np.unique(stalks, axis=0, return_inverse=True)
-    groups = [which.ravel() == place for place in range(len(names))]
+    groups = [which.ravel() == index for index in range(len(names))]
     medians = [np.array([np.median(widths[group]) for group in groups]) for widths in (theirs, ours, truth)]
     _print("each stalk, median over its pairs", *medians)
 

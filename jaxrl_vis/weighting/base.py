@@ -241,7 +241,7 @@ def to_vector(by_name: Mapping[str, jax.Array]) -> jax.Array:
 
 def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
     """Split a vector [K] into scalars by the names of the losses."""
-    return {name: vector[place] for place, name in enumerate(loss_order(names))}
+    return {name: vector[index] for index, name in enumerate(loss_order(names))}
 
 
 def settled(after: WeightingState, before: WeightingState) -> WeightingState:

@@ -190,6 +190,6 @@ def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, throug
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):
                 needed.update(variable for variable in equation.invars if not isinstance(variable, Literal))
-        places = [place for place, variable in enumerate(of_leaf) if variable in needed]
+        places = [index for index, variable in enumerate(of_leaf) if variable in needed]
         reads[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
     return reads

@@ -39,8 +39,8 @@ def pcgrad_weights(gramian: jax.Array, orders: jax.Array) -> jax.Array:
     """
     rows, squares = jnp.arange(len(gramian)), jnp.diagonal(gramian)
     changed = jnp.eye(len(gramian), dtype=gramian.dtype)  # row i: modified g_i as a combination of the gradients
-    for place in range(len(gramian)):
-        others = orders[:, place]
+    for index in range(len(gramian)):
+        others = orders[:, index]
         dots = jnp.sum(gramian[others] * changed, axis=1)
         opposes = (dots < 0.0) & (others != rows) & (squares[others] > 0.0)
         removed = jnp.where(opposes, dots / jnp.where(opposes, squares[others], 1.0), 0.0)
@@ -83,8 +83,8 @@ def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, bet
     """
     rows, lengths = jnp.arange(len(gramian)), jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
     changed = jnp.eye(len(gramian), dtype=gramian.dtype)
-    for place in range(len(gramian)):
-        others = orders[:, place]
+    for index in range(len(gramian)):
+        others = orders[:, index]
         dots = jnp.matmul(changed, gramian, precision=jax.lax.Precision.HIGHEST)
         length = jnp.sqrt(jnp.maximum(jnp.sum(dots * changed, axis=1), 0.0))
         other = lengths[others]

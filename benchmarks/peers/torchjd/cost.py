@@ -50,7 +50,7 @@ class Size:
 
 def names_of(count: int) -> tuple[str, ...]:
     """Return the names of K losses, the main one first."""
-    return (jw.MAIN, *(f"other_{place}" for place in range(count - 1)))
+    return (jw.MAIN, *(f"other_{index}" for index in range(count - 1)))
 
 
 def problem(size: Size, count: int) -> tuple[dict[str, Any], dict[str, jax.Array]]:
@@ -101,8 +101,8 @@ def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
     state = weighting.init(names_of(count), params["trunk"])
     losses = {loss: jnp.float32(1.0) for loss in names_of(count)}
     gradients = {
-        loss: [jax.random.normal(jax.random.key(place), layer.shape) for layer in params["trunk"]]
-        for place, loss in enumerate(names_of(count))
+        loss: [jax.random.normal(jax.random.key(index), layer.shape) for layer in params["trunk"]]
+        for index, loss in enumerate(names_of(count))
     }
     statistics_of = jax.jit(lambda gradients: jw.measure(weighting, losses, gradients))(gradients)
     base = {"method": name, "losses": count}

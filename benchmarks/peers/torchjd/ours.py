@@ -36,7 +36,7 @@ READERS: dict[str, jw.Weighting] = {
 
 def names_of(count: int) -> tuple[str, ...]:
     """Return the names of K losses, in the order of the arrays' loss axis."""
-    return tuple(f"loss_{place}" for place in range(count))
+    return tuple(f"loss_{index}" for index in range(count))
 
 
 def weights_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], jax.Array]:

@@ -56,8 +56,8 @@ def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """Compute the results of random methods, with the file's random numbers instead of PyTorch's."""
     jacobians = torch.from_numpy(arrays[f"{prefix}/jacobians"])
     results: dict[str, list[np.ndarray]] = {name: [] for name in ("pcgrad", "gradvac", "graddrop", "random")}
-    for place, jacobian in enumerate(jacobians):
-        orders = [torch.from_numpy(row) for row in arrays[f"{prefix}/orders"][place]]
+    for index, jacobian in enumerate(jacobians):
+        orders = [torch.from_numpy(row) for row in arrays[f"{prefix}/orders"][index]]
         with mock.patch.object(torch, "randperm", side_effect=orders):
             results["pcgrad"].append(aggregation.PCGrad()(jacobian).numpy())
         # GradVac draws an order of the other losses: their positions among the remaining ones.
@@ -67,9 +67,9 @@ def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
             with mock.patch.object(torch, "randperm", side_effect=list(others)):
                 total = vaccine(jacobian)
         results["gradvac"].append(total.numpy())
-        with mock.patch.object(torch, "rand", return_value=torch.from_numpy(arrays[f"{prefix}/uniform"][place])):
+        with mock.patch.object(torch, "rand", return_value=torch.from_numpy(arrays[f"{prefix}/uniform"][index])):
             results["graddrop"].append(aggregation.GradDrop()(jacobian).numpy())
-        with mock.patch.object(torch, "randn", return_value=torch.from_numpy(arrays[f"{prefix}/normal"][place])):
+        with mock.patch.object(torch, "randn", return_value=torch.from_numpy(arrays[f"{prefix}/normal"][index])):
             results["random"].append(aggregation.Random()(jacobian).numpy())
     return {name: np.stack(rows) for name, rows in results.items()}
 
@@ -96,14 +96,14 @@ def paths(losses: torch.Tensor) -> Iterator[tuple[str, np.ndarray]]:
             optimizer.step()
         yield name, np.stack(steps)
     average, steps = scalarization.DWA(), []
-    for place, values in enumerate(losses):
+    for index, values in enumerate(losses):
         steps.append(derivative(average, values))
-        if place % 2 == 1:
+        if index % 2 == 1:
             average.step()
     yield "dwa", np.stack(steps)
     fast, steps = scalarization.FAMO(count).double(), []
-    for place, values in enumerate(losses):
-        if place:
+    for index, values in enumerate(losses):
+        if index:
             fast.update(values)
         steps.append(derivative(fast, values))
     yield "famo", np.stack(steps)

@@ -57,7 +57,7 @@ def label(options: Label) -> int:
     weights = resolve_weights(options.weights)
     find = load_finder(weights, options.min_score)
     labelled, skipped = [], 0
-    for place, path in enumerate(paths, start=1):
+    for index, path in enumerate(paths, start=1):
         try:
             image = rgb8(read_image(path))
         except OSError as error:
@@ -68,7 +68,7 @@ def label(options: Label) -> int:
         labelled.append((path, (image.shape[0], image.shape[1]), detections))
         if options.format == "labelme":
             write_labelme(path, (image.shape[0], image.shape[1]), detections)
-        print(f"{place} of {len(paths)}  {path.name}: {len(detections)} proposals", flush=True)
+        print(f"{index} of {len(paths)}  {path.name}: {len(detections)} proposals", flush=True)
     if options.format == "coco":
         write_coco(there, labelled, f"proposals of {detector_name(weights)}: correct them")
     total = sum(len(detections) for _, _, detections in labelled)

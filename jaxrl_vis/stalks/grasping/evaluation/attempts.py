@@ -247,19 +247,19 @@ def to_attempts(
         runs, stalks, errors, refused: [B] each, see `Plan`.
     """
     attempts = []
-    for place in range(len(stands)):
-        sent = not refused[place]
-        others = (stands.stalk[place] != stalks[place]) & sent
+    for index in range(len(stands)):
+        sent = not refused[index]
+        others = (stands.stalk[index] != stalks[index]) & sent
         attempts.append(
             Attempt(
-                run=int(runs[place]),
-                stalk=int(stalks[place]) if stalks[place] >= 0 else None,
-                held=frozenset(stands.stalk[place][result.held[place] & sent].tolist()),
-                reachable=bool(result.reachable[place]),
-                refused=bool(refused[place]),
-                collided=bool((result.touched[place] & others).any()),
-                brushed=bool((result.brushed[place] & others).any()),
-                aim_error=float(errors[place]),
+                run=int(runs[index]),
+                stalk=int(stalks[index]) if stalks[index] >= 0 else None,
+                held=frozenset(stands.stalk[index][result.held[index] & sent].tolist()),
+                reachable=bool(result.reachable[index]),
+                refused=bool(refused[index]),
+                collided=bool((result.touched[index] & others).any()),
+                brushed=bool((result.brushed[index] & others).any()),
+                aim_error=float(errors[index]),
             )
         )
     return attempts

@@ -122,8 +122,8 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
     true, detected, errors = match_stalks(targets, scene.plot)
     poses = scene.drive.poses
     errors_of_stitches = [
-        stitch_error(stitch.motion, poses[place], poses[place + 1], scene.mount)
-        for place, stitch in enumerate(perception.stitches)
+        stitch_error(stitch.motion, poses[index], poses[index + 1], scene.mount)
+        for index, stitch in enumerate(perception.stitches)
     ]
     count = len(scene.views)
     score = RunScore(

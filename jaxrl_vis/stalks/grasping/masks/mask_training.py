@@ -72,12 +72,12 @@ def crops(examples: list[Example], rng: np.random.Generator, count: int, size: i
     """
     images = np.zeros((count, size, size, 3), np.uint8)
     masks = np.zeros((count, size, size), bool)
-    for place, number in enumerate(rng.integers(len(examples), size=count)):
+    for index, number in enumerate(rng.integers(len(examples), size=count)):
         example = examples[number]
         top, left = (int(rng.integers(max(length - size, 0) + 1)) for length in example.mask.shape)
         part = example.image[top : top + size, left : left + size]
-        images[place, : part.shape[0], : part.shape[1]] = part
-        masks[place, : part.shape[0], : part.shape[1]] = example.mask[top : top + size, left : left + size]
+        images[index, : part.shape[0], : part.shape[1]] = part
+        masks[index, : part.shape[0], : part.shape[1]] = example.mask[top : top + size, left : left + size]
     return images, masks
 
 

@@ -130,8 +130,8 @@ def perceive(
                 side_by_side(lambda here, there, far: stitch(here, there, far, method), thinned[:-1], thinned[1:], driven)
             )
         notes += [
-            f"pair {views[place].number} does not stitch to the next, odometry was used: {step.refused}"
-            for place, step in enumerate(stitches)
+            f"pair {views[index].number} does not stitch to the next, odometry was used: {step.refused}"
+            for index, step in enumerate(stitches)
             if step.refused
         ]
         to_last = [Motion.along(0.0)]

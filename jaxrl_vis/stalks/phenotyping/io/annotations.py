@@ -32,7 +32,7 @@ def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about:
         about: The ``info`` of the data set.
     """
     numbered = [
-        {"id": place + 1, "category_id": STALK, "iscrowd": 0, **annotation} for place, annotation in enumerate(annotations)
+        {"id": index + 1, "category_id": STALK, "iscrowd": 0, **annotation} for index, annotation in enumerate(annotations)
     ]
     categories = [{"id": STALK, "name": "stalk", "supercategory": "plant"}]
     return {"info": about, "images": images, "annotations": numbered, "categories": categories}
@@ -77,7 +77,7 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
     if not data["images"] or not data["annotations"]:
         raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
     stalks, summary = choose(data["annotations"], labels, str(path))
-    images = [_checked_image(image, place) for place, image in enumerate(data["images"])]
+    images = [_checked_image(image, index) for index, image in enumerate(data["images"])]
     twice = len(images) - len({image["id"] for image in images})
     if twice:
         raise RequestError(f"{path}: {twice} images have the id of another one, so nobody can tell whose annotations are whose")

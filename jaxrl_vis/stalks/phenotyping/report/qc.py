@@ -286,7 +286,7 @@ class _Pictures:
 
     def of(self, track: Track) -> _Html:
         """Return the image of a track's best sighting."""
-        return self._crops[next(place for place, other in enumerate(self._plot.tracks) if other is track)]
+        return self._crops[next(index for index, other in enumerate(self._plot.tracks) if other is track)]
 
     def whole(self, count: int) -> Iterable[str]:
         """Yield images of at most ``count`` whole pairs, spread evenly over the plot."""

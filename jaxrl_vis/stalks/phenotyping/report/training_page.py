@@ -58,9 +58,9 @@ def write_page(
         texts = {key: f"{value:.2f}" if isinstance(value, float) else value for key, value in values.items()}
         rows.append({"weights": name, **{key: "" if text == "nan" else text for key, text in texts.items()}})
     figures = []
-    for place, example in enumerate(examples[:_MOST]):
-        shown = {name: draw_finds(example, of_set[place]) for name, of_set in finds.items()}
-        pictures = "".join(picture(image, f"image {place + 1}, {name}", "pair") for name, image in shown.items())
+    for index, example in enumerate(examples[:_MOST]):
+        shown = {name: draw_finds(example, of_set[index]) for name, of_set in finds.items()}
+        pictures = "".join(picture(image, f"image {index + 1}, {name}", "pair") for name, image in shown.items())
         figures.append(f"<figure>{pictures}<figcaption>{' | '.join(shown)}</figcaption></figure>")
     parts = [
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Training on own images</title>',

@@ -42,7 +42,7 @@ def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation) ** 2)  # [N, 1, 1, taps]
     taps = taps / taps.sum(axis=-1, keepdims=True)
     for axis in (1, 2):
-        padding = [(_TAPS, _TAPS) if place == axis else (0, 0) for place in range(4)]
+        padding = [(_TAPS, _TAPS) if index == axis else (0, 0) for index in range(4)]
         padded, size = jnp.pad(values, padding, mode="edge"), values.shape[axis]
         parts = [jax.lax.slice_in_dim(padded, k, k + size, axis=axis) * taps[..., k : k + 1] for k in range(2 * _TAPS + 1)]
         values = sum(parts[1:], parts[0])
@@ -175,8 +175,8 @@ def _striped(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, lines]
     stripes = jnp.zeros(masks.shape)
     weights = jax.nn.softmax(2.0 * jax.random.normal(keys[1], (2, count)), axis=0)
-    for place, (columns, weight) in enumerate(zip((5, 12), weights)):
-        drawn = jax.random.normal(keys[2 + place], (count, 4, max(width // columns, 2)))
+    for index, (columns, weight) in enumerate(zip((5, 12), weights)):
+        drawn = jax.random.normal(keys[2 + index], (count, 4, max(width // columns, 2)))
         across = jax.image.resize(drawn, (count, 4, width), "linear")
         stripes += weight[:, None, None] * jnp.take_along_axis(across, internode[..., None], axis=1)
     amount, chance = jax.random.uniform(keys[4], (2, count, 1, 1))

@@ -77,7 +77,7 @@ class _Pool(Pool[Example]):
         """Add an example and its stalk crops."""
         height, width = example.image.shape[:2]
         self._largest = max(self._largest[0], height), max(self._largest[1], width)
-        self.crops += [(len(self.examples), place) for place in range(len(example.crops))]
+        self.crops += [(len(self.examples), index) for index in range(len(example.crops))]
         super().add(example)
 
     def images(self, rng: np.random.Generator) -> Images:

@@ -292,8 +292,8 @@ def _own_masks(
     One at a time: masks may overlap, and all of an image together could exceed the memory.
     """
     crops = [
-        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[place : place + 1], shape))
-        for place, part in enumerate(parts)
+        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[index : index + 1], shape))
+        for index, part in enumerate(parts)
     ]
     return np.concatenate(crops)
 

@@ -36,9 +36,9 @@ def read_coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
     for number, image in images:
         if isinstance(number, (int, str)):
             by_id.setdefault(number, image)
-    for place, annotation in enumerate(data["annotations"]):
+    for index, annotation in enumerate(data["annotations"]):
         parsed: Annotation = {**annotation, "name": names.get(annotation.get("category_id"), "")}
-        parsed["source"] = f"{path}: annotation {str(annotation.get('id', place + 1))[:60]}"
+        parsed["source"] = f"{path}: annotation {str(annotation.get('id', index + 1))[:60]}"
         parsed["iscrowd"] = int(annotation.get("iscrowd") in (1, True, "1"))
         number = annotation.get("image_id")
         if not isinstance(number, (int, str)) or number not in by_id:

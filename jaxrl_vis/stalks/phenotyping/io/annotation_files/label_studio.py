@@ -28,8 +28,8 @@ def read_label_studio(path: Path, data: Any) -> list[Annotated]:
     for number, task in enumerate(data):
         chosen = [one for one in task.get("annotations", [{"result": _short(task)}]) if not one.get("was_cancelled")]
         shapes, sizes = [], set()
-        for place, result in enumerate(chosen[-1]["result"] if chosen else []):
-            source = f"{path}: annotation {place + 1} of task {str(task.get('id', number + 1))[:40]}"
+        for index, result in enumerate(chosen[-1]["result"] if chosen else []):
+            source = f"{path}: annotation {index + 1} of task {str(task.get('id', number + 1))[:40]}"
             sizes.add((result.get("original_width"), result.get("original_height")))
             shapes += _shapes(result, source)
         width, height = sizes.pop() if len(sizes) == 1 else (None, None)

@@ -33,7 +33,7 @@ def read_labelme(path: Path, data: Any) -> list[Annotated]:
         ValueError, KeyError, TypeError, AttributeError: The data are not a valid LabelMe file.
     """
     size = int(data["imageWidth"]), int(data["imageHeight"])
-    annotations = [_shape(shape, size, f"{path}: annotation {place + 1}") for place, shape in enumerate(data["shapes"])]
+    annotations = [_shape(shape, size, f"{path}: annotation {index + 1}") for index, shape in enumerate(data["shapes"])]
     # The path may have Windows separators.
     return [Annotated(str(data["imagePath"]).replace("\\", "/").rpartition("/")[2], *size, path, annotations)]
 

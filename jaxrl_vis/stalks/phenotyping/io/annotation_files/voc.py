@@ -46,8 +46,8 @@ def _text(node: Element, name: str) -> str:
 
 def _voc_image(path: Path, root: Element) -> Annotated:
     annotations = []
-    for place, element in enumerate(root.iter("object")):
-        name, source = _text(element, "name"), f"{path}: annotation {place + 1}"
+    for index, element in enumerate(root.iter("object")):
+        name, source = _text(element, "name"), f"{path}: annotation {index + 1}"
         if element.find("robndbox") is not None:
             x, y, wide, high, angle = (float(_text(element, f"robndbox/{part}")) for part in ("cx", "cy", "w", "h", "angle"))
             if not np.isfinite([x, y, wide, high, angle]).all():
@@ -69,10 +69,10 @@ def _integer(text: str | None) -> int | None:
 def _cvat_image(path: Path, element: Element) -> Annotated:
     size = int(element.get("width") or 0), int(element.get("height") or 0)
     annotations = []
-    for place, shape in enumerate(element):
+    for index, shape in enumerate(element):
         if shape.tag in ("tag", "attribute"):
             continue
-        name, source = shape.get("label") or "", f"{path}: annotation {place + 1} of {element.get('name')}"
+        name, source = shape.get("label") or "", f"{path}: annotation {index + 1} of {element.get('name')}"
         group = shape.get("group_id") if shape.get("group_id") not in (None, "", "0") else None
         annotations.append(_cvat_shape(shape, size, name, source, group))
     return Annotated(element.get("name") or "", *size, path, annotations)

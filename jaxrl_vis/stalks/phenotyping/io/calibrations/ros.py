@@ -105,7 +105,7 @@ def from_table(text: str) -> dict[str, Any] | None:
         return None
     if len(rows) == 2 and "field.P0" in rows[0]:
         cells = dict(zip(rows[0], rows[1]))
-        matrix = [float(cells[f"field.P{place}"]) for place in range(12) if f"field.P{place}" in cells]
+        matrix = [float(cells[f"field.P{index}"]) for index in range(12) if f"field.P{index}" in cells]
         rest = {name: float(cells[f"field.{name}"]) for name in ("height", "width", *_CSV_END[:2]) if f"field.{name}" in cells}
         region = {name: float(cells[f"field.roi.{name}"]) for name in _REGION if f"field.roi.{name}" in cells}
         return {"header": {}, **rest, "P": matrix, "roi": region}

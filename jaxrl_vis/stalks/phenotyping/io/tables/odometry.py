@@ -242,7 +242,7 @@ def _tabled(path: Path, text: str) -> _Table:
 
 
 def _time_column(columns: list[str]) -> int | None:
-    named = [place for place, name in enumerate(columns) if _TIME.fullmatch(name) or name in (*_ROS_TIMES, *_PLAIN_TIMES)]
+    named = [index for index, name in enumerate(columns) if _TIME.fullmatch(name) or name in (*_ROS_TIMES, *_PLAIN_TIMES)]
     return named[0] if named else None
 
 
