@@ -75,14 +75,14 @@ def _finished(part: Part, *statuses: int) -> Part:
     return part
 
 
-def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
+def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
     """Make a reward NaN on one of two seeds: the run stops, names the seed, and resumes from its last intact checkpoint."""
     folder.mkdir()
     (folder / "broken_task.py").write_text(TASK)
     run, steps = folder / "run", 4 * 50
     options = ["broken_task:BrokenReach", "--env-folder", str(folder), "--preset", "debug", "--seeds", "2"]
-    options += ["--env-steps", str(400 * steps), "--seed", str(dice.randrange(10**6)), "--checkpoint-interval", "3"]
-    part = Part.start(run, {"SOAK_NAN": str(1.0 / dice.uniform(100, 800))}, options)
+    options += ["--env-steps", str(400 * steps), "--seed", str(rng.randrange(10**6)), "--checkpoint-interval", "3"]
+    part = Part.start(run, {"SOAK_NAN": str(1.0 / rng.uniform(100, 800))}, options)
     _finished(part, 4)
     (line,) = [line for line in part.lines if "non-finite" in line]
     seeds = re.search(r"seeds? ([\d, ]+)", line)
@@ -120,19 +120,19 @@ def _is(process: int, words: str) -> bool:
         return False
 
 
-def _kill_a_worker(part: Part, words: str, dice: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
+def _kill_a_worker(part: Part, words: str, rng: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
     """Kill a descendant of a part whose command line contains ``words``, after a random delay; return True if there was one."""
 
     def workers() -> list[int]:
         return [process for process in _children(part.process.pid) if _is(process, words)]
 
     part.wait_for(lambda: bool(workers()) and is_ready())
-    time.sleep(dice.uniform(0.0, delay))
+    time.sleep(rng.uniform(0.0, delay))
     running = workers()
     if not running or not part.runs():
         return False
     try:
-        os.kill(dice.choice(running), signal.SIGKILL)
+        os.kill(rng.choice(running), signal.SIGKILL)
     except ProcessLookupError:
         return False
     return True
@@ -143,13 +143,13 @@ def _of_one_line(part: Part, words: str) -> None:
         raise Broken(f"not one line says {words!r}: {part.lines[-8:]}")
 
 
-def worker_of_a_study(folder: Path, dice: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
+def worker_of_a_study(folder: Path, rng: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
     """Kill one of two cells: the other continues, and the next start finishes both, with the rows of undisturbed ones."""
     words = _sweep(folder, executor)
     part = _command(words, folder)
     with killed_afterwards(part):
         cells = folder / "runs"
-        struck = _kill_a_worker(part, "jaxrl_vis train", dice, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
+        struck = _kill_a_worker(part, "jaxrl_vis train", rng, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
         part.end()
     part.check_words()
     if struck:
@@ -174,9 +174,9 @@ def _cell_rows(folder: Path) -> dict[str, list]:
     return {path.parent.name: read_rows(path.parent) for path in sorted((folder / "runs").glob("*/metrics.jsonl"))}
 
 
-def job_of_a_study(folder: Path, dice: random.Random, references: "References") -> None:
+def job_of_a_study(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a run of a sweep whose runs are submitit jobs; the next start finishes the sweep."""
-    worker_of_a_study(folder, dice, references, ("--executor", "local"))
+    worker_of_a_study(folder, rng, references, ("--executor", "local"))
 
 
 def _phenotype(folder: Path, plots: Path) -> list[str]:
@@ -187,10 +187,10 @@ def _tables(out: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in sorted(out.glob("*.csv"))}
 
 
-def worker_of_phenotyping(folder: Path, dice: random.Random, references: "References") -> None:
+def worker_of_phenotyping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``phenotype run``; the next start writes the same tables."""
     plots, tables = references.phenotyping()
-    _pool(_phenotype(folder, plots), folder, dice)
+    _pool(_phenotype(folder, plots), folder, rng)
     if _tables(folder / "out") != tables:
         raise Broken("tables differ from those of an undisturbed run")
 
@@ -208,10 +208,10 @@ def _figures(file: Path) -> list[dict[str, Any]]:
     return runs
 
 
-def worker_of_grasping(folder: Path, dice: random.Random, references: "References") -> None:
+def worker_of_grasping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``grasp eval``; the next start gives the same figures."""
     spec, figures = references.grasping()
-    _pool(_grasp(folder, spec), folder, dice)
+    _pool(_grasp(folder, spec), folder, rng)
     if _figures(folder / "eval.json") != figures:
         raise Broken("figures differ from those of an undisturbed evaluation")
 
@@ -220,12 +220,12 @@ class NotStruck(Exception):
     """The command finished before the fault."""
 
 
-def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
+def _pool(words: Sequence[str], folder: Path, rng: random.Random) -> None:
     """Kill a worker of a pool, and check that the same command finishes when started again."""
     folder.mkdir(exist_ok=True)
     part = _command(words, folder)
     with killed_afterwards(part):
-        struck = _kill_a_worker(part, "spawn_main", dice, 4.0, lambda: True)
+        struck = _kill_a_worker(part, "spawn_main", rng, 4.0, lambda: True)
         part.end()
     part.check_words()
     if struck and part.process.returncode == 0:
@@ -309,10 +309,10 @@ ALONE: dict[str, Alone] = {
 }
 
 
-def strike_alone(name: str, folder: Path, dice: random.Random, references: References) -> bool:
+def strike_alone(name: str, folder: Path, rng: random.Random, references: References) -> bool:
     """Inject a fault of `ALONE` in a new folder; return False if the command finished first."""
     try:
-        ALONE[name].strike(folder, dice, references)
+        ALONE[name].strike(folder, rng, references)
     except NotStruck:
         return False
     shutil.rmtree(folder, ignore_errors=True)

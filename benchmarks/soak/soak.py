@@ -75,7 +75,7 @@ class Soak:
             print(f"{self.record.total:4}  {where:8} {fault:32} {outcome}", flush=True)
             self._note(self.record)
 
-    def _broke(self, where: Path, faults: list[str], error: Exception) -> None:
+    def _note_violation(self, where: Path, faults: list[str], error: Exception) -> None:
         text = str(error) if isinstance(error, Broken) else traceback.format_exc()
         with self._lock:
             self.record.broken.append(f"{where.name}, {faults}: {text}")
@@ -86,32 +86,32 @@ class Soak:
         """Alternate between a run and a fault with a folder of its own, until it is time to end."""
         for turn in itertools.count():
             number = 1000 * worker + turn
-            dice, place = random.Random(f"{self._seed} {number}"), self._folder / f"run{number}"
+            rng, place = random.Random(f"{self._seed} {number}"), self._folder / f"run{number}"
             faults: list[str] = []
             try:
                 # Workers begin with different kinds, so that a short soak covers both.
                 if self._alone and (turn + worker) % 2:
-                    going = self._one_alone(place, dice, faults)
+                    going = self._one_alone(place, rng, faults)
                 else:
-                    going = self._one_run(place, dice, faults)
+                    going = self._one_run(place, rng, faults)
             except Exception as error:  # the others continue; the folder is kept for inspection
-                self._broke(place, faults, error)
+                self._note_violation(place, faults, error)
                 going = True
             if not going:
                 return
 
-    def _one_alone(self, place: Path, dice: random.Random, faults: list[str]) -> bool:
+    def _one_alone(self, place: Path, rng: random.Random, faults: list[str]) -> bool:
         fault = self._next(ALONE)
         if fault is None:
             return False
         faults.append(fault)
-        if strike_alone(fault, place, dice, self._references):
+        if strike_alone(fault, place, rng, self._references):
             self._struck(place.name, fault, "")
         else:
             self._again(ALONE, fault)
         return True
 
-    def _one_run(self, folder: Path, dice: random.Random, faults: list[str]) -> bool:
+    def _one_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
         """Train one run to its end, with faults; return False if none is left for it."""
         spoilt, fault = False, None
         while len(faults) < FAULTS_PER_RUN:
@@ -120,7 +120,7 @@ class Soak:
                 break
             faults.append(fault)
             before, good = read_rows(folder), list_checkpoints(folder)
-            status = FAULTS[fault].strike(folder, dice)
+            status = FAULTS[fault].strike(folder, rng)
             if status is None:  # the run finished before the fault
                 self._again(FAULTS, faults.pop())
                 break

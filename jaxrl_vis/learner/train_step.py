@@ -144,8 +144,8 @@ class TrainStep:
         def insert(
             train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
         ) -> tuple[TrainState, ReplayState]:
-            train, replay_state = self.pure_insert(train, layout.unfolded(replay_state), episodes, key, iteration)
-            return train, layout.folded(replay_state, self.replay.num_envs)
+            train, replay_state = self.pure_insert(train, layout.unfold_replay(replay_state), episodes, key, iteration)
+            return train, layout.fold_replay(replay_state, self.replay.num_envs)
 
         return layout.spread(
             jax.vmap(insert, (0, 0, 0, 0, None)),
@@ -168,7 +168,7 @@ class TrainStep:
         def update_many(
             train: TrainState, replay_state: ReplayState, key: jax.Array, iteration: jax.Array
         ) -> tuple[TrainState, Metrics]:
-            return self.pure_update(train, layout.unfolded(replay_state), key, iteration)
+            return self.pure_update(train, layout.unfold_replay(replay_state), key, iteration)
 
         return layout.spread(
             jax.vmap(update_many, (0, 0, 0, None)),
@@ -222,7 +222,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         empty = jax.tree.map(lambda leaf: jnp.zeros((len(keys), *leaf.shape), leaf.dtype), replay_spec)
         return LoopState(
             train=jax.vmap(init_learner)(keys),
-            replay=jax.vmap(lambda replay_state: layout.folded(replay_state, replay.num_envs))(empty),
+            replay=jax.vmap(lambda replay_state: layout.fold_replay(replay_state, replay.num_envs))(empty),
             key=keys,
             iteration=jnp.zeros((), jnp.int32),
         )

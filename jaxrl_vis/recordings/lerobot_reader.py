@@ -34,7 +34,7 @@ def read(folder: Path) -> Recordings:
         RequestError: It is missing, damaged, of another version, or has episodes of different lengths or several cameras.
     """
     check_packages()
-    info = read_json(folder / form.INFO, mend="export it again")
+    info = read_json(folder / form.INFO, hint="export it again")
     if not str(info.get("codebase_version")).startswith("v3."):
         raise RequestError(
             f"{folder} is a LeRobot dataset of version {info.get('codebase_version')}: convert it to {form.VERSION}"
@@ -77,7 +77,7 @@ class _Reader:
             success = np.array([row[form.SUCCESS] for row in rows], np.bool_)
         about = {"task": self._info.get("robot_type"), "control_period": 1.0 / float(self._info["fps"])}
         if (self._folder / form.ABOUT).is_file():
-            about |= read_json(self._folder / form.ABOUT, mend="export it again")
+            about |= read_json(self._folder / form.ABOUT, hint="export it again")
         return Recordings(seen, actions if is_ours else actions[:, :-1], goals, states, goal_states, success, about)
 
     def _table(self, folder: str) -> Any:

@@ -105,29 +105,29 @@ class RunLoop:
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """Run to the end, yielding reports; see `Trainer.run`."""
         reserve_standard_files()
-        goes_on = self._folder.check(self._config, resume, overwrite)
-        if resume and not goes_on:
+        is_resumed = self._folder.check(self._config, resume, overwrite)
+        if resume and not is_resumed:
             self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
         steps = self._program.steps_per_iteration
         shapes, layout = self._programs.shapes, self._programs.layout
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
         distributed.meet("checked")  # before the first process writes anything that the others would detect
-        if goes_on:
+        if is_resumed:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with run_lock(self._folder.path, self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
-            if goes_on and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._say):
+            if is_resumed and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._say):
                 if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
                     self._say(said)
-                self._say(earlier.say_finished(self._folder, self._checkpoints, self._config, self._total))
+                self._say(earlier.print_finished(self._folder, self._checkpoints, self._config, self._total))
                 return
             interruption = Interruption()
             try:
                 with safe_streams():  # for warnings of libraries during compilation
-                    compiled = self._prepare(goes_on, memory)
+                    compiled = self._prepare(is_resumed, memory)
                 # Not before: while XLA compiles, no Python code can check the flag, and there is nothing to save.
                 with interruption:
-                    self._begin(compiled, goes_on, overwrite)
+                    self._begin(compiled, is_resumed, overwrite)
                     yield from self._train(interruption)
                     self._finish(interruption)
                 self._checkpoints.close()
@@ -189,26 +189,26 @@ class RunLoop:
 
     # -- Before
 
-    def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
+    def _prepare(self, is_resumed: bool, memory: str) -> dict[str, Any]:
         """Restore and compile; return the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
         self._say(f"{self._config.environment.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
         self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
-        restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
+        restored = self._checkpoints.restore_for_resume(programs.shapes) if is_resumed else None
         if restored is not None:
             earlier.refuse_missing_rows(self._folder, restored)
             self._take_over(restored)
-        elif goes_on:
+        elif is_resumed:
             self._say("no usable checkpoint: starting at the beginning")
 
         started = time.monotonic()
-        self._say(f"compiling ({programs.says_of_cache()}) ...")
+        self._say(f"compiling ({programs.cache_message()}) ...")
         compiled = programs.compile(meanwhile=import_saving_libraries)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s
         return compiled
 
-    def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
+    def _begin(self, compiled: dict[str, Any], is_resumed: bool, overwrite: bool) -> None:
         """Check the memory again, the last check that can refuse the run; then prepare folder and state."""
         self._say(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
@@ -216,7 +216,7 @@ class RunLoop:
         has_room = not distributed.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
-            self._open(goes_on, overwrite)
+            self._open(is_resumed, overwrite)
             if trust.is_own(self._config):  # and here it runs
                 trust.trust(self._folder.path, self._config, was_trained_here=True)
         distributed.meet("opened")
@@ -226,18 +226,18 @@ class RunLoop:
         self._milestones.begin()
         with self._saver.writing():
             foreign = self._checkpoints.set_foreign_aside()
-            damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
+            damaged = self._checkpoints.set_aside_after(self._done) if is_resumed else []
             if self._writes:
                 self._checkpoints.recent.resume_from(self._recent_at)
                 self._goodput.begin(self._done, self._replay_lost)
-                self._begin_log(goes_on, damaged, foreign)
+                self._begin_log(is_resumed, damaged, foreign)
         distributed.meet("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
         self._pace.begin(self._done)
 
-    def _open(self, goes_on: bool, overwrite: bool) -> None:
+    def _open(self, is_resumed: bool, overwrite: bool) -> None:
         """Prepare the folder, unless it was moved or deleted during compilation."""
         assert self._held is not None
         self._folder.check_place(self._held)
@@ -246,27 +246,27 @@ class RunLoop:
                 with self._saver.writing():
                     for line in earlier.set_others_aside(self._folder, self._checkpoints):
                         self._say(line)
-            self._folder.open(self._config, goes_on, overwrite, self._log)
+            self._folder.open(self._config, is_resumed, overwrite, self._log)
         except RequestError:
             self._folder.check_place(self._held)
             raise
 
-    def _begin_log(self, goes_on: bool, damaged: list[Path], foreign: list[Path]) -> None:
+    def _begin_log(self, is_resumed: bool, damaged: list[Path], foreign: list[Path]) -> None:
         """Truncate the metrics to the iteration from which the run continues, and open the loggers.
 
         Args:
-            goes_on: True if the run resumes.
+            is_resumed: True if the run resumes.
             damaged: Damaged checkpoints that were set aside.
             foreign: Checkpoints of other runs that were set aside.
         """
-        if goes_on:
+        if is_resumed:
             if said := earlier.cut_back(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
                 self._say(said)
             self._evaluated_there = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
         for path in damaged:
             self._say(f"kept for inspection: {path}")
         for path in foreign:
-            self._say(earlier.say_foreign(path))
+            self._say(earlier.print_foreign_warning(path))
         self._loggers.open(read_record(self._folder.path), self._programs.seeds, self._folder.rows())
 
     def _take_over(self, restored: Restored) -> None:

@@ -195,8 +195,8 @@ class Saver:
         good = "there is no checkpoint yet" if newest is None else f"the last checkpoint is of iteration {newest}"
         cause = error.__cause__
         is_full = "no space left" in str(error).lower() or getattr(cause, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        mend = "make room" if is_full else "fix that"
-        return StorageError(f"{error}; {good}: {mend}, then {self.resume}")
+        hint = "make room" if is_full else "fix that"
+        return StorageError(f"{error}; {good}: {hint}, then {self.resume}")
 
     def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
         # The guard checks losses and states; a parameter that breaks in the very last update appears in those of the next

@@ -156,10 +156,10 @@ class Trainer:
             Terminated: A signal other than Ctrl-C, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
-        loop = RunLoop(self.programs, self.folder, self._log, self._go_on_next_time, callbacks)
+        loop = RunLoop(self.programs, self.folder, self._log, self._allow_resume, callbacks)
         return loop.reports(self._resume, self._overwrite)
 
-    def _go_on_next_time(self) -> None:
+    def _allow_resume(self) -> None:
         """Prepare the next call of `run`, which resumes; after a finished run, it reports that nothing is left to do."""
         self._resume, self._overwrite = True, False
 

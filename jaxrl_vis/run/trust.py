@@ -61,14 +61,14 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
             path.unlink(missing_ok=True)
 
 
-def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True") -> None:
+def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True") -> None:
     """Check that the code of a run may be imported; the permission ``may`` is stored.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
         may: Permission by the user.
-        mend: Hint on how to give the permission, for the message.
+        hint: Hint on how to give the permission, for the message.
 
     Raises:
         RequestError: Permission is missing.
@@ -76,7 +76,7 @@ def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True
     if not is_own(config) or is_trusted(run_dir, config):
         return
     if not may:
-        raise RequestError(f"{question(run_dir, config)}: look at it, and if you trust it, {mend}")
+        raise RequestError(f"{question(run_dir, config)}: look at it, and if you trust it, {hint}")
     trust(run_dir, config)
 
 

@@ -178,8 +178,8 @@ def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
     losses, extra = result if has_aux and is_pair else (result, None)
     if not isinstance(losses, Mapping) or (has_aux and not is_pair):
         wanted = "losses by name, and what is beside them" if has_aux else "a dictionary of losses by name"
-        mend = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
-        raise RequestError(f"losses_fn must return {wanted}, not a {type(result).__name__}{mend}")
+        hint = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
+        raise RequestError(f"losses_fn must return {wanted}, not a {type(result).__name__}{hint}")
     for name, loss in losses.items():
         if shape := getattr(loss, "shape", ()):
             raise RequestError(f"loss {name!r} has shape {shape} and must be one number, such as its mean")

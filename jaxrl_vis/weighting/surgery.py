@@ -25,7 +25,7 @@ def pcgrad(seed: int = 0, **options: Unpack[Options]) -> Weighting:
     """
 
     def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, None]:
-        return pcgrad_weights(gramian, _orders(state, len(gramian))), None
+        return pcgrad_weights(gramian, _random_orders(state, len(gramian))), None
 
     return of_gramian("pcgrad", solve, seed=seed, **options)
 
@@ -67,7 +67,7 @@ def gradvac(beta: float = 0.01, seed: int = 0, **options: Unpack[Options]) -> We
         raise RequestError(f"beta of weighting gradvac must be between 0 and 1, not {beta}")
 
     def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, jax.Array]:
-        return gradvac_weights(gramian, state.memory, _orders(state, len(gramian)), beta)
+        return gradvac_weights(gramian, state.memory, _random_orders(state, len(gramian)), beta)
 
     return of_gramian("gradvac", solve, memory=lambda count, dtype: jnp.zeros((count, count), dtype), seed=seed, **options)
 
@@ -102,7 +102,7 @@ def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, bet
     return jnp.sum(changed, axis=0), usual
 
 
-def _orders(state: WeightingState, count: int) -> jax.Array:
+def _random_orders(state: WeightingState, count: int) -> jax.Array:
     """Sample a random order of the losses for each loss: [K, K] int."""
     keys = jax.random.split(jax.random.fold_in(state.key, state.updates), count)
     return jax.vmap(lambda key: jax.random.permutation(key, count))(keys)

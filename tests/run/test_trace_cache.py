@@ -225,7 +225,7 @@ def kept(folder) -> trace_cache.TraceCache:
     made = trace_cache.TraceCache(folder, "0" * 64)
     made._fresh["play"] = b"a program"
     made.write()
-    trace_cache._say_once.cache_clear()
+    trace_cache._print_once.cache_clear()
     return made
 
 

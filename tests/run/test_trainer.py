@@ -161,8 +161,8 @@ def test_bad_episodes_of_a_replay_that_devices_share_are_dumped(tmp_path):
     made = make_fake_trainer(small_config(), None)
     loop = made.init(made.run_keys)
     states, actions = loop.replay.episodes.states, loop.replay.episodes.actions
-    folded = [array.reshape(2, -1, 2, *array.shape[2:]) for array in (states.at[1, 3].set(np.nan), actions)]
-    episodes = loop.replay.episodes.replace(states=folded[0], actions=folded[1])
+    fold_replay = [array.reshape(2, -1, 2, *array.shape[2:]) for array in (states.at[1, 3].set(np.nan), actions)]
+    episodes = loop.replay.episodes.replace(states=fold_replay[0], actions=fold_replay[1])
     dump(tmp_path / "dump.npz", loop.replace(replay=loop.replay.replace(episodes=episodes)), {}, [])
     dumped = np.load(tmp_path / "dump.npz")
     assert dumped["episodes.seed_index"].tolist() == [1] and dumped["episodes.slot"].tolist() == [3]

@@ -14,7 +14,7 @@ from jaxrl_vis.host.weights_file import write_parameters
 from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals
-from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
+from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste
@@ -112,14 +112,14 @@ def test_a_stalk_that_two_finds_outline_is_one():
     half = np.where(np.arange(120)[:, None] < 55, crossing, upright)  # the first of one and the rest of the other
     pieces = [piece(0, 0, upright), piece(0, 0, crossing), piece(20, 30, part), piece(0, 0, half), piece(0, 0, image[:0, :0])]
     scores = np.array([0.8, 0.9, 0.7, 0.5, 0.4])
-    assert without_duplicates(pieces, scores).tolist() == [True, True, False, True, True]
-    assert without_duplicates(pieces, scores[[0, 2, 1, 3, 4]]).tolist() == [True, False, True, True, True]
-    assert without_duplicates(pieces, scores, max_shared=0.4).tolist() == [True, True, False, False, True]
+    assert suppress_duplicates(pieces, scores).tolist() == [True, True, False, True, True]
+    assert suppress_duplicates(pieces, scores[[0, 2, 1, 3, 4]]).tolist() == [True, False, True, True, True]
+    assert suppress_duplicates(pieces, scores, max_shared=0.4).tolist() == [True, True, False, False, True]
     # Of three in a row that each share most of their neighbour's mask, the first and the last are two.
     chain = [piece(0, left, np.ones((50, 20), bool)) for left in (0, 7, 14)]
-    assert without_duplicates(chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
-    assert without_duplicates(chain, np.array([0.8, 0.9, 0.7])).tolist() == [False, True, False]
-    assert without_duplicates([], np.zeros(0)).tolist() == []
+    assert suppress_duplicates(chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
+    assert suppress_duplicates(chain, np.array([0.8, 0.9, 0.7])).tolist() == [False, True, False]
+    assert suppress_duplicates([], np.zeros(0)).tolist() == []
 
 
 def test_codes_are_inverted():

@@ -9,7 +9,14 @@ import pytest
 from PIL import Image, ImageOps
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, _is_shown, _moved, _without_border, resize, usual_lines
+from jaxrl_vis.stalks.phenotyping.detector.finder import (
+    Detection,
+    _is_shown,
+    _moved,
+    _without_border,
+    pad_to_training_height,
+    resize,
+)
 from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
@@ -55,7 +62,7 @@ def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
 def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, added):
     """The middle of a wide lens's image; a long lens's image between black lines."""
     image = np.repeat(np.arange(1, lines + 1)[:, None, None], 40, axis=1) * np.ones(3, int)
-    usual, above = usual_lines(image, Settings())
+    usual, above = pad_to_training_height(image, Settings())
     assert usual.shape == (kept, 40, 3) and above == added
     middle = usual[kept // 2, 0, 0]
     assert abs(middle - (lines // 2 + 1)) <= 1

@@ -12,7 +12,7 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match, summary
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries, read_odometry, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries, read_odometry
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, follow
@@ -82,12 +82,12 @@ def test_odometry_by_distance_time_and_name(tmp_path):
     table.write_text("left,distance_m\nleft_9.png,0.5\nleft_0.png,0.25\n")
     driven = read_odometry(plot)
     assert driven == {"0": 0.25}
-    assert "has no row for left_1.png:" in str(why_no_odometry(plot, driven, plot.pairs))
-    assert why_no_odometry(plot, driven, plot.pairs[:1]) is None
+    assert "has no row for left_1.png:" in str(odometry_fault(plot, driven, plot.pairs))
+    assert odometry_fault(plot, driven, plot.pairs[:1]) is None
     with pytest.raises(RequestError, match="leave it out"):
         read_odometries([plot], speed=0.05)
     table.write_text("time_s\n1\n3\n")
-    assert "--speed" in str(why_no_odometry(plot, None, plot.pairs))
+    assert "--speed" in str(odometry_fault(plot, None, plot.pairs))
     assert read_odometries([plot], speed=0.05)[plot.name] is not None
     assert read_odometry(plot) is None
     assert read_odometry(plot, speed=0.05) == {"0": 0.05, "1": pytest.approx(0.15)}

@@ -73,10 +73,10 @@ class Script:
     def __init__(self, **behaviour: str):
         self.behaviour, self.calls = behaviour, []
 
-    def __call__(self, cell: Cell, folder: Path, goes_on: bool) -> Sequence[str]:
-        self.calls.append((cell.family, goes_on))
+    def __call__(self, cell: Cell, folder: Path, is_resumed: bool) -> Sequence[str]:
+        self.calls.append((cell.family, is_resumed))
         words = [str(folder), str(cell.config.run.env_steps), str(cell.config.run.seeds), saved(cell)]
-        return [sys.executable, "-c", SCRIPT, *words, self.behaviour.get(cell.family, ""), *["--resume"] * goes_on]
+        return [sys.executable, "-c", SCRIPT, *words, self.behaviour.get(cell.family, ""), *["--resume"] * is_resumed]
 
 
 def seen(runs: Path, cell: Cell) -> list[list]:
@@ -117,8 +117,8 @@ def test_a_cell_that_trained_with_other_settings_says_which(tmp_path: Path) -> N
     cell = make_cell("a")
     script = Script()
 
-    def trains_another(_: Cell, folder: Path, goes_on: bool) -> Sequence[str]:
-        return script(dataclasses.replace(cell, config=cell.config.replace(discount=0.5)), folder, goes_on)
+    def trains_another(_: Cell, folder: Path, is_resumed: bool) -> Sequence[str]:
+        return script(dataclasses.replace(cell, config=cell.config.replace(discount=0.5)), folder, is_resumed)
 
     (failure,) = run_cells([cell], tmp_path, lambda: CPU, command=trains_another, say=lambda _: None)
     assert "ended before it was finished" in failure and "discount (saved 0.5, asked" in failure

@@ -165,12 +165,12 @@ def _bracketed_root(slope_at: Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 
 
 @jax.custom_jvp
-def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Solve a small positive definite system, ``matrix`` [N, N] and ``right`` [N]: [N].
+def solve_positive(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    """Solve a small positive definite system, ``matrix`` [N, N] and ``rhs`` [N]: [N].
 
     Forward and reverse derivatives are defined here, since JAX cannot derive them through a batching rule.
     """
-    return _eliminate(matrix[None], right[None])[0]
+    return _eliminate(matrix[None], rhs[None])[0]
 
 
 @solve_positive.defjvp

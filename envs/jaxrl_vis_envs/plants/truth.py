@@ -110,7 +110,7 @@ def stalks_in_view(
         projection = _area(outline(stalk, pose, camera, np.linspace(0.0, tall, 120)), camera)
         if projection is None:
             continue
-        box, area = _down_to_ground(projection[0], stalk, pose, camera), projection[1]
+        box, area = _extended_to_ground(projection[0], stalk, pose, camera), projection[1]
         rows, columns = _pixels(box, camera)
         line, column = np.nonzero(instance[rows, columns] == index)
         line, column = line + rows.start, column + columns.start
@@ -158,7 +158,7 @@ def _area(edges: np.ndarray, camera: Calibration) -> tuple[Box, float] | None:
     return tuple(map(float, box)), float(wide.sum())  # pyright: ignore[reportReturnType]
 
 
-def _down_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> Box:
+def _extended_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> Box:
     """Extend a box down to the front of the stalk's foot, which is nearer than its edges."""
     towards = (pose.position - stalk.points[0])[:2]
     foot = stalk.points[0].copy()

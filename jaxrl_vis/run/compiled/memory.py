@@ -126,14 +126,14 @@ def check_memory(
     if replay + other > available:
         fitting = int((available - other) // bytes_per_rollout) * steps_per_iteration
         if fitting > 0:
-            mend = f"--replay-transitions {fitting} fits"
+            hint = f"--replay-transitions {fitting} fits"
         else:
-            mend = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
+            hint = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
         seeds = "1 seed" if config.run.seeds == 1 else f"{config.run.seeds} seeds"
         raise RequestError(
             f"a replay of {config.run.replay_transitions} transitions for {seeds} needs "
             f"{show_bytes(replay)}{suffix}, and networks and rollouts {show_bytes(other)} more; there are "
-            f"{show_bytes(available)}{suffix}: {mend}"
+            f"{show_bytes(available)}{suffix}: {hint}"
         )
     return f"replay {show_bytes(replay)} of {show_bytes(available)}{suffix}"
 

@@ -101,7 +101,7 @@ class Programs:
     @functools.cached_property
     def shows_images(self) -> bool:
         """True if observations can be shown in a video."""
-        replay = jax.eval_shape(jax.vmap(self.layout.unfolded), self.shapes.replay)
+        replay = jax.eval_shape(jax.vmap(self.layout.unfold_replay), self.shapes.replay)
         _, episodes, slots, *image = replay.episodes.observations.shape
         return videos.shows_images((episodes, slots, *image))
 
@@ -276,7 +276,7 @@ class Programs:
         """List the floating-point leaves of the loop state that hold a NaN or an infinity."""
         return [name for name, is_broken in jax.device_get(self.compiled("broken_leaves")(loop)).items() if is_broken]
 
-    def says_of_cache(self) -> str:
+    def cache_message(self) -> str:
         """Describe, for messages, whether the next start will find the programs compiled now in the cache."""
         folder, fault = enable_compilation_cache(), cache_fault()
         if fault is not None:

@@ -165,7 +165,7 @@ class TraceCache:
             return False
         reason = stranger_to(status)
         if reason is not None:
-            _say_once(
+            _print_once(
                 f"programs kept in {self._folder} are not used: it {reason}; JAX_COMPILATION_CACHE_DIR names another folder"
             )
         return reason is None
@@ -192,6 +192,6 @@ def _register(tree: Any) -> None:
 
 
 @functools.cache
-def _say_once(line: str) -> None:
+def _print_once(line: str) -> None:
     with contextlib.suppress(OSError, ValueError, AttributeError):  # a stream that is closed, or none
         print(line, file=sys.stderr)

@@ -76,7 +76,7 @@ class WeightsAndBiases:
     def _read_state(self) -> dict[str, dict[str, Any]]:
         if not self._state_file.exists():
             return {}
-        state = read_json(self._state_file, mend="delete it to begin new runs there")
+        state = read_json(self._state_file, hint="delete it to begin new runs there")
         return {seed: known for seed, known in state.items() if isinstance(known, dict) and known.get(RUN_ID) == self._run_id}
 
     def _write_state(self) -> None:

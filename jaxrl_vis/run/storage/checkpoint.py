@@ -449,8 +449,8 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         try:
-            manager = self._manager(tier)  # first, because `hushed` restores the hooks that it finds
-            with hush.hushed():
+            manager = self._manager(tier)  # first, because `silenced` restores the hooks that it finds
+            with hush.silenced():
                 return manager.restore(iteration, args=ocp.args.Composite(**arguments))
         # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
         except Exception as error:

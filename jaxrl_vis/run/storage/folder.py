@@ -217,8 +217,8 @@ class RunFolder:
         Raises:
             RequestError: As in `check`; or the folder is not writable, or something in it cannot be deleted.
         """
-        goes_on = self.check(config, resume, overwrite)
-        run_id = read_run_id(self.path) if goes_on else secrets.token_hex(16)
+        is_resumed = self.check(config, resume, overwrite)
+        run_id = read_run_id(self.path) if is_resumed else secrets.token_hex(16)
         if overwrite:
             self._delete_run()
         try:
@@ -229,7 +229,7 @@ class RunFolder:
             write_atomically(self.config, json.dumps(_record(config, log, run_id), indent=2) + "\n")
         except OSError as error:
             raise RequestError(f"cannot write to {self.path} ({error.strerror}): choose another --run-dir") from error
-        return goes_on
+        return is_resumed
 
     def _delete_run(self) -> None:
         """Delete a run's files, checkpoints first: after a failure, the rest is still a run.
@@ -304,7 +304,7 @@ def read_record(path: Path) -> dict[str, Any]:
     _check_run_path(path)
     if not file.exists():
         raise RequestError(f"no run in {path}: there is no config.json")
-    record = read_json(file, mend="put back what it held, or train --overwrite")
+    record = read_json(file, hint="put back what it held, or train --overwrite")
     if record.get("schema") != SCHEMA:
         raise RequestError(
             f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or train --overwrite"

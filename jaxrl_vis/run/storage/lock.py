@@ -267,8 +267,8 @@ def _is_alive_or_elsewhere(text: str) -> bool:
     return True
 
 
-def _in_use(path: Path, text: str, mend: str = "") -> RequestError:
-    return RequestError(f"{path.parent} is in use by {_holder(text)}: {mend}{_MEND}")
+def _in_use(path: Path, text: str, hint: str = "") -> RequestError:
+    return RequestError(f"{path.parent} is in use by {_holder(text)}: {hint}{_MEND}")
 
 
 def _unwritable(folder: Path, error: OSError) -> RequestError:

@@ -142,7 +142,7 @@ class Recent:
             file.write(f"{zlib.crc32(text.encode()):08x} {text}\n".encode())
             for array in arrays.values():
                 file.write(_bytes(array))
-        self._tidy()
+        self._remove_stale_files()
 
     def _write_rollout(self, number: int, parts: Arrays) -> int:
         """Write the episodes of one rollout, arrays [S, E, ...] one after the other; return their checksum."""
@@ -154,7 +154,7 @@ class Recent:
                 file.write(contents)
         return checksum
 
-    def _tidy(self) -> None:
+    def _remove_stale_files(self) -> None:
         """Delete all but the newest states, and older rollouts that these do not need."""
         for number in self.iterations()[:-_KEPT]:
             self._path(number, "state").unlink(missing_ok=True)

@@ -119,7 +119,7 @@ class _Verifier:
     def verify(self, iterations: int | None) -> Verification:
         """Run all checks, see `verify_run`."""
         try:
-            self._say_origin()
+            self._print_origin()
             is_written = (self._folder.path / LOCK_NAME).exists()
             if is_written:
                 self._report.notes.append("another process may be writing into the folder: verified as far as it is there")
@@ -143,7 +143,7 @@ class _Verifier:
 
     # -- Provenance
 
-    def _say_origin(self) -> None:
+    def _print_origin(self) -> None:
         record, report = self._record, self._report
         device, versions = _mapping(record.get("device")), _mapping(record.get("versions"))
         name = provenance.device_name()
@@ -253,7 +253,7 @@ class _Verifier:
             repeater.repeat("the seed", 0, seed, programs.init(programs.run_keys), compared_iterations)
         for number in starts:
             self._repeat_after(number, repeater, iterations)
-        self._say_rest(repeater.repeated)
+        self._print_remaining(repeater.repeated)
         return repeater
 
     def _repeat_after(self, number: int, repeater: Repeater, iterations: int | None) -> None:
@@ -299,7 +299,7 @@ class _Verifier:
         near = [number for number in compared_iterations if number <= begin + iterations]
         return near or compared_iterations[:1]
 
-    def _say_rest(self, repeated: set[int]) -> None:
+    def _print_remaining(self, repeated: set[int]) -> None:
         """Report rows and checkpoints that no repetition has reached."""
         unverified = self._report.unverified
         rest = [row["iteration"] for row in self._rows if row["iteration"] not in repeated]

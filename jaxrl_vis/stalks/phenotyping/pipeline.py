@@ -29,7 +29,7 @@ from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, known_disparity, read_pair, read_side
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries
 from jaxrl_vis.stalks.phenotyping.measure.lens import UNTRIED, LensRange, lens_fault
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
@@ -184,10 +184,10 @@ def _run(
     return rows, skipped
 
 
-def _why_no_count(flag: str, frames: list[list[Sighting]], plot: PlotFolder, driven: dict[str, float] | None) -> str:
+def _missing_count_reason(flag: str, frames: list[list[Sighting]], plot: PlotFolder, driven: dict[str, float] | None) -> str:
     """Return an explanation beyond the flag of why a plot has no count; empty if there is none."""
     if flag == NO_ODOMETRY:
-        return why_no_odometry(plot, driven, plot.pairs) or ""
+        return odometry_fault(plot, driven, plot.pairs) or ""
     if PARTLY_SEEN in flag:
         return "its pairs do not show all of the row that the robot passed: take some before its beginning and beyond its end"
     if flag == NO_FIT:
@@ -282,7 +282,7 @@ def _finish(
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
     known = driven is not None and all(pair.name in driven for pair, _ in usable)
-    flag, tracks, start = _what_is_missing(len(usable), calibration), [], 0.0
+    flag, tracks, start = _missing_outputs(len(usable), calibration), [], 0.0
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     drive = None
     why = _lens_fault(request, frames, [record for _, record in usable], plot.name)
@@ -305,7 +305,7 @@ def _finish(
         row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
     width = usable[0][1]["size"][1] if usable else 0
-    why = why or (_why_no_count(row["flag"], frames, plot, driven) if row["stalks"] == "" else "")
+    why = why or (_missing_count_reason(row["flag"], frames, plot, driven) if row["stalks"] == "" else "")
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
 
 
@@ -361,7 +361,7 @@ def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[
     write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
 
 
-def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
+def _missing_outputs(pairs: int, calibration: Calibration | None) -> str:
     """Return a flag on why the stalks of a plot cannot be tracked."""
     if pairs == 0:
         return "no usable pairs"

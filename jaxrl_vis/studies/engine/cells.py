@@ -112,12 +112,12 @@ def differences(cell: Cell, runs: Path) -> list[str]:
 
 def contradiction(cell: Cell, runs: Path) -> str | None:
     """Return the reason why a cell's folder cannot be used, in one line; None if it can, or does not exist yet."""
-    folder, mend = find_folder(cell, runs), "move it away, or choose another --runs"
+    folder, hint = find_folder(cell, runs), "move it away, or choose another --runs"
     try:
         changes = differences(cell, runs)
     except RequestError:  # its remedy names options of `train` that studies and sweeps do not have
-        return f"{folder} holds a config.json that is damaged, or of another version: {mend}"
-    return f"{folder} holds another run, with {'; '.join(changes)}: {mend}" if changes else None
+        return f"{folder} holds a config.json that is damaged, or of another version: {hint}"
+    return f"{folder} holds another run, with {'; '.join(changes)}: {hint}" if changes else None
 
 
 def is_finished(cell: Cell, runs: Path) -> bool:

@@ -94,7 +94,7 @@ def prepare_on_gpu(
     patches, pixels = rows * columns * of_block, math.prod(shape)
     moves = () if shift is None else (shift,)
 
-    def of_images(numbers: int) -> pl.BlockSpec:
+    def image_block(numbers: int) -> pl.BlockSpec:
         return pl.BlockSpec((together, numbers), lambda _, image: (image, 0))
 
     all_pixels = pl.BlockSpec((pixels,), lambda patch, image: (0,))
@@ -102,7 +102,7 @@ def prepare_on_gpu(
         functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
         out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
         grid=(patches // tile, batch // together),
-        in_specs=[of_images(pixels), all_pixels, all_pixels, *(of_images(2) for _ in moves)],
+        in_specs=[image_block(pixels), all_pixels, all_pixels, *(image_block(2) for _ in moves)],
         out_specs=pl.BlockSpec((together, tile, size), lambda patch, image: (image, patch, 0)),
         compiler_params=_PREPARE,
         interpret=interpret,

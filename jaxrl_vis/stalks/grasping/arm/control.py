@@ -103,8 +103,8 @@ def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> j
     bearings = [jnp.arctan2(-(place - shoulder)[0], (place - shoulder)[1]) for place in (start[:2], target[:2])]
     radii = [jnp.linalg.norm(place - shoulder) for place in (start[:2], target[:2])]
     bearing = bearings[0] + turned * (bearings[1] - bearings[0])
-    folded = radii[0] + turned * (FOLDED - radii[0])
-    radius = folded + extended * (radii[1] - FOLDED)
+    fold_replay = radii[0] + turned * (FOLDED - radii[0])
+    radius = fold_replay + extended * (radii[1] - FOLDED)
     height = start[2] + turned * (target[2] - start[2])
     return jnp.stack([shoulder[0] - radius * jnp.sin(bearing), shoulder[1] + radius * jnp.cos(bearing), height])
 

@@ -100,11 +100,11 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
         if (stalk in known if stalk >= 0 else low <= target[0] <= high)
     ]
     off = np.array([_off(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
-    chords = {
+    segments = {
         stop: stalk_segments(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))
     }
     again = [
-        off[index] + _offset_at_stop(chosen[place], points[place], perception, chords) for index, place in enumerate(scored)
+        off[index] + _offset_at_stop(chosen[place], points[place], perception, segments) for index, place in enumerate(scored)
     ]
     at = origins[[chosen[place].stop for place in scored], 0]
     detected = [_detected_around(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
@@ -149,7 +149,9 @@ def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
     return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
 
 
-def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, chords: dict[int, StalkSegments]) -> np.ndarray:
+def _offset_at_stop(
+    choice: Choice, point: GraspPoint, perception: Perception, segments: dict[int, StalkSegments]
+) -> np.ndarray:
     """Return the horizontal offset [2] m between the stalk as detected by the pair at the stop alone and by all pairs.
 
     NaN if there is no stop or its pair does not show the stalk. Axes are those of the robot at the last pair, which differ
@@ -158,7 +160,7 @@ def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, c
     if choice.stop < 0:
         return np.full(2, np.nan)
     motion: Motion = perception.to_last[choice.stop]
-    middles_here = motion(chords[choice.stop].middle)
+    middles_here = motion(segments[choice.stop].middle)
     offsets = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
     near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(offsets, axis=1) < _BESIDE)
     return np.median(offsets[near], axis=0) if near.sum() >= _MIN_SEGMENTS else np.full(2, np.nan)
@@ -194,7 +196,7 @@ def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, .
     return tuple(standing)
 
 
-def carry_out(
+def execute_plans(
     plans: Iterable[Plan], wind_mm: float, loop: Loop = "open", policy: Policy | None = None, seed: int = 0
 ) -> list[Attempt]:
     """Simulate an arm for each target of all runs, in batches.

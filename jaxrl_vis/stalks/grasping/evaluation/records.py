@@ -18,7 +18,7 @@ from jaxrl_vis.host.provenance import device_name
 from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all
 from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.digests import value_digest
-from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, carry_out, plan
+from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, execute_plans, plan
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
 from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summary
 from jaxrl_vis.stalks.grasping.masks.loading import load_painter
@@ -179,7 +179,7 @@ def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> No
     name = str(reaches)
     missing = [number for number in numbers if name not in table.records[number].get("reaches", {})]
     plans = [read_plan(number, table.records[number], reaches.plan) for number in missing]
-    attempts = carry_out(plans, reaches.wind_mm, reaches.loop, reaches.policy)
+    attempts = execute_plans(plans, reaches.wind_mm, reaches.loop, reaches.policy)
     changed = {}
     for number in missing:
         record = table.records[number]

@@ -80,40 +80,40 @@ class _Line(NamedTuple):
     shown: int
 
 
-def grasp_points(chords: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
+def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
     """Detect stalks and return their grasp points, from left to right.
 
     Args:
-        chords: Segments of all pairs, in the robot frame of the last one.
+        segments: Segments of all pairs, in the robot frame of the last one.
         visibility: Visibility of points in all pairs.
         heights: Minimum and maximum height of a grasp, m above the ground.
     """
-    free = np.ones(len(chords), bool)
+    free = np.ones(len(segments), bool)
     lines: list[_Line] = []
-    for seed in _seeds(chords):
+    for seed in _seeds(segments):
         members = seed[free[seed]]
-        if np.ptp(chords.middle[members, 2]) < _MIN_PIECE if len(members) else True:
+        if np.ptp(segments.middle[members, 2]) < _MIN_PIECE if len(members) else True:
             continue
-        members = _grow(chords, members, free)
+        members = _grow(segments, members, free)
         if not len(members):
             continue
         free[members] = False
-        point = _grasp(chords, members, min(2, len(visibility.clouds)), heights)
+        point = _grasp(segments, members, min(2, len(visibility.clouds)), heights)
         if point is None:
             continue
         count = _agreed(point, visibility)
         if count:
             lines.append(_Line(point, members, count))
     lines.sort(key=lambda line: -line.shown)
-    return sorted((line.point for line in _distinct(lines, chords)), key=lambda point: float(point.point[0]))
+    return sorted((line.point for line in _distinct(lines, segments)), key=lambda point: float(point.point[0]))
 
 
-def _seeds(chords: StalkSegments) -> list[np.ndarray]:
+def _seeds(segments: StalkSegments) -> list[np.ndarray]:
     """Return the indices of the chords of each piece with at least 5, tall pieces first."""
-    order = np.argsort(chords.piece, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(chords.piece[order])) + 1) if len(order) else []
+    order = np.argsort(segments.piece, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(segments.piece[order])) + 1) if len(order) else []
     parts = [part for part in parts if len(part) >= 5]
-    return sorted(parts, key=lambda part: -float(np.ptp(chords.middle[part, 2])))
+    return sorted(parts, key=lambda part: -float(np.ptp(segments.middle[part, 2])))
 
 
 def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
@@ -153,12 +153,12 @@ def _robust(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
     return coefficients, middle
 
 
-def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.ndarray:
+def _grow(segments: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Return the indices of all free chords along the line through ``members``; none if the line is too steep."""
     candidates = np.flatnonzero(free)
-    points = chords.middle[candidates]
+    points = segments.middle[candidates]
     for _ in range(6):
-        known = chords.middle[members]
+        known = segments.middle[members]
         low, high = known[:, 2].min(), known[:, 2].max()
         coefficients, middle = _robust(known, bent=high - low > _BENT_LENGTH)
         if np.abs(coefficients[1]).max() > _STEEPEST:
@@ -174,20 +174,20 @@ def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.nd
     return members
 
 
-def _support(chords: StalkSegments, members: np.ndarray) -> tuple[float, int]:
+def _support(segments: StalkSegments, members: np.ndarray) -> tuple[float, int]:
     """Return the visible length summed over pairs, m, and the number of pairs with chords in at least two height bins."""
-    bins = np.floor(chords.middle[members, 2] / _BIN).astype(int)
-    occupied = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
+    bins = np.floor(segments.middle[members, 2] / _BIN).astype(int)
+    occupied = np.unique(np.stack([segments.frame[members], bins], axis=1), axis=0)
     frames, counts = np.unique(occupied[:, 0], return_counts=True)
     return _BIN * len(occupied), int((counts >= 2).sum())
 
 
-def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
+def _grasp(segments: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
     """Return the grasp point of a stalk; None if the pairs show too little of it."""
-    length, frames = _support(chords, members)
+    length, frames = _support(segments, members)
     if length < _MIN_SUPPORT or frames < least_frames:
         return None
-    points = chords.middle[members]
+    points = segments.middle[members]
     places = np.arange(heights[0], heights[1] + 1e-9, _BIN)
     within = np.abs(points[None, :, 2] - places[:, None]) < _WINDOW
     count = within.sum(axis=1) * np.exp(-0.5 * ((places - PREFERRED) / 0.3) ** 2)
@@ -198,7 +198,7 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
     local, middle = _robust(points[near], bent=False)
     x, y = local[0] + local[1] * (places[best] - middle)
     spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _LINE_RADIUS) ** 2)))
-    thickness = float(np.median(chords.thickness[members[near]]))
+    thickness = float(np.median(segments.thickness[members[near]]))
     # Direction and curvature are fitted to the whole line.
     curve, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
     bend = curve[2] if len(curve) > 2 else np.zeros(2)
@@ -210,7 +210,7 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
         frames,
         spread,
         (float(bend[0]), float(bend[1])),
-        _taper(points[:, 2], chords.thickness[members]),
+        _taper(points[:, 2], segments.thickness[members]),
     )
 
 
@@ -236,11 +236,11 @@ def _agreed(point: GraspPoint, visibility: Visibility) -> int:
     return count if agreed else 0
 
 
-def _distinct(lines: list[_Line], chords: StalkSegments) -> list[_Line]:
+def _distinct(lines: list[_Line], segments: StalkSegments) -> list[_Line]:
     """Return the lines without those that are the same stalk as an earlier one."""
     distinct: list[_Line] = []
     for line in lines:
-        if not any(_same(line.point, other.point) and not _side_by_side(chords, line, other) for other in distinct):
+        if not any(_same(line.point, other.point) and not _side_by_side(segments, line, other) for other in distinct):
             distinct.append(line)
     return distinct
 
@@ -253,11 +253,11 @@ def _same(point: GraspPoint, other: GraspPoint) -> bool:
     return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
 
 
-def _side_by_side(chords: StalkSegments, one: _Line, other: _Line) -> bool:
+def _side_by_side(segments: StalkSegments, one: _Line, other: _Line) -> bool:
     """Return True if pairs show two lines side by side in the same image rows: these are distinct stalks, however near."""
     apart = [np.zeros(0)]
-    for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
-        mine, theirs = (chords.middle[line.members[chords.frame[line.members] == frame]] for line in (one, other))
+    for frame in np.intersect1d(segments.frame[one.members], segments.frame[other.members]):
+        mine, theirs = (segments.middle[line.members[segments.frame[line.members] == frame]] for line in (one, other))
         theirs = theirs[np.argsort(theirs[:, 2])]
         place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
         level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL

@@ -153,15 +153,15 @@ def stitch(source: Thinned, target: Thinned, driven: float, method: Method = DEF
     if len(source.points) < 10 or len(target.points) < 10:
         return Stitch(prior, math.nan, 0.0, "a cloud is empty")
     motion, residual, overlap = closest_points(source.points, target, start, method)
-    refused = _why_refused(motion, prior, driven, overlap) if method.from_odometry else ""
+    refused = _rejection_reason(motion, prior, driven, overlap) if method.from_odometry else ""
     if refused and len(method.gates) > 1:
         # With little overlap, points of one pair alone bias the widest gate; the odometry may be good enough for the next one.
         motion, residual, overlap = closest_points(source.points, target, start, method.after_first_gate())
-        refused = _why_refused(motion, prior, driven, overlap)
+        refused = _rejection_reason(motion, prior, driven, overlap)
     return Stitch(prior if refused else motion, residual, overlap, refused)
 
 
-def _why_refused(motion: Motion, prior: Motion, driven: float, overlap: float) -> str:
+def _rejection_reason(motion: Motion, prior: Motion, driven: float, overlap: float) -> str:
     """Return the reason to refuse a result, by overlap and odometry; empty to accept it."""
     # Compare displacements at a point of the row, so that rotations count as well.
     place = np.array([0.0, 0.6, 0.8])

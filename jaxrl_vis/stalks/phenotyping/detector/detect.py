@@ -59,7 +59,7 @@ class Settings:
     threshold: float = 0.4
     min_score: float = 0.05
 
-    def resizing(self, width: int, pixels_per_metre: float | None) -> float:
+    def scale_for(self, width: int, pixels_per_metre: float | None) -> float:
         """Return the factor by which an image is resized before detection.
 
         Args:

@@ -15,7 +15,7 @@ Piece = tuple[np.ndarray, tuple[int, int]]
 """Mask [h, w] of a part of the image, and the image row and column of its first pixel."""
 
 
-def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, max_shared: float = MAX_SHARED) -> np.ndarray:
+def suppress_duplicates(pieces: Sequence[Piece], scores: np.ndarray, max_shared: float = MAX_SHARED) -> np.ndarray:
     """Apply greedy non-maximum suppression by mask overlap.
 
     Args:

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
+from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste, smoothed
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
@@ -66,7 +66,7 @@ UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
 """Distance from the middle of the band up to the upper height, as a multiple of the height of the band."""
 
 
-def higher_up(stalk: np.ndarray) -> np.ndarray:
+def upper_segment(stalk: np.ndarray) -> np.ndarray:
     """Extrapolate a stalk [6] in the band along its axis to its segment [6] around the upper height, of half its height."""
     left, top, right, bottom, above, below = stalk
     tall = bottom - top
@@ -84,7 +84,7 @@ def resize_factor(width: int, settings: Settings, pixels_per_metre: float | None
     An image is enlarged only if its ``pixels_per_metre`` is known or the networks were trained on images of unknown cameras.
     """
     return min(
-        settings.resizing(width, pixels_per_metre), _MAX_ENLARGED if pixels_per_metre or not settings.pixels_per_metre else 1.0
+        settings.scale_for(width, pixels_per_metre), _MAX_ENLARGED if pixels_per_metre or not settings.pixels_per_metre else 1.0
     )
 
 
@@ -108,7 +108,7 @@ def resize(image: np.ndarray, settings: Settings, pixels_per_metre: float | None
     return cv2.resize(image, (columns, lines), interpolation=how), (height / lines, across / columns)
 
 
-def usual_lines(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
+def pad_to_training_height(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
     """Crop or pad an image to the height of the training images.
 
     The networks also recognise the band by its position in the image. With another field of view, the centre of the image is
@@ -197,7 +197,7 @@ class Finder:
         reduced, scale = resize(image, settings, pixels_per_metre)
         added = 0
         if pixels_per_metre and settings.pixels_per_metre:
-            reduced, added = usual_lines(reduced, settings)
+            reduced, added = pad_to_training_height(reduced, settings)
         detected = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
         assert detected.pooled is not None
         moved = detected.stalks[detected.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
@@ -206,7 +206,7 @@ class Finder:
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
         settings = self._settings
-        relative_scale = settings.width / settings.full_width / settings.resizing(image.shape[1], pixels_per_metre)
+        relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
         stalks, scores, pooled = self.look(image, pixels_per_metre)
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
         selected = scores >= self._min_score
@@ -216,7 +216,7 @@ class Finder:
         on_device = jnp.asarray(image)
         pieces = self._pieces(on_device, stalks, settings.crop_height, relative_scale)
         pieces = [(_without_border(mask, corner, frame), corner) for mask, corner in pieces]
-        once = np.flatnonzero(without_duplicates(pieces, scores))
+        once = np.flatnonzero(suppress_duplicates(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
         strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
         higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
@@ -299,5 +299,5 @@ def _follow(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> 
         return None
     # Half a pixel from pixel centres to the continuous coordinates of stalks.
     axis = [0.5 * sum(strip.edges(line - 0.5 - corner[0])) + corner[1] + 0.5 for line in (stalk[1], stalk[3])]
-    upper = higher_up(np.array([*stalk[:4], *axis], np.float32))
+    upper = upper_segment(np.array([*stalk[:4], *axis], np.float32))
     return upper if upper[1] > 0 else None

@@ -53,7 +53,7 @@ def load_finder(weights: Path, min_score: float) -> Finder:
 
 
 @functools.cache
-def _shared_finder(weights: Path, min_score: float) -> Finder:
+def _cached_finder(weights: Path, min_score: float) -> Finder:
     return load_finder(weights, min_score)
 
 
@@ -69,4 +69,4 @@ def find_stalks(
         pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
         plot, pair: Folder and files of the image; unused.
     """
-    return _shared_finder(weights, min_score)(image, pixels_per_metre)
+    return _cached_finder(weights, min_score)(image, pixels_per_metre)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, higher_up
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, upper_segment
 
 
 def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray, min_visible: float = 0.3) -> list[Detection]:
@@ -43,7 +43,7 @@ def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndar
         instance: Index of the stalk that each pixel shows, [H, W] int.
         index: Index of the stalk.
     """
-    left, top, right, bottom = higher_up(stalk)[:4]
+    left, top, right, bottom = upper_segment(stalk)[:4]
     margin = right - left  # margin, as the stalk may bend
     first, last = max(round(left - margin), 0), min(round(right + margin), instance.shape[1])
     if top <= 0 or last <= first:

@@ -102,7 +102,7 @@ def score_plot(
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         stalks = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
         started = time.monotonic()
-        finder = find or functools.partial(_perfectly, stalks, instance)
+        finder = find or functools.partial(_true_detections, stalks, instance)
         detections, ground = find_with_ground(finder, left, right, drive.stated)
         selected = [place for place, detection in enumerate(detections) if detection.score >= min_score]
         finds_kept = [detections[place] for place in selected]
@@ -142,7 +142,7 @@ def score_plot(
     )
 
 
-def _perfectly(
+def _true_detections(
     stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, pixels_per_metre: float | None
 ) -> list[Detection]:
     """Return ground-truth detections, with the signature of a detector; the image and its resolution are ignored."""

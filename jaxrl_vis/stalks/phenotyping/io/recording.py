@@ -161,7 +161,9 @@ def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) 
     message = None if info is None else next(messages(info), None)
     if message is None:
         return
-    distortion, matrix, projection = ([float(value) for value in _either(message, name)] for name in ("D", "K", "P"))
+    distortion, matrix, projection = (
+        [float(value) for value in _field_of_either_case(message, name)] for name in ("D", "K", "P")
+    )
     as_built = any(abs(value) > 1e-9 for value in distortion) or not np.allclose(matrix[:3], projection[:3], rtol=1e-6)
     if "rect" not in topic and as_built:
         raise RequestError(f"{topic} has raw images, which its camera_info says are distorted: record or name rectified ones")
@@ -171,7 +173,7 @@ def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) 
     write_atomically(path, json.dumps(values))
 
 
-def _either(message: Any, name: str) -> Any:
+def _field_of_either_case(message: Any, name: str) -> Any:
     """Return a field whose name is upper case in ROS 1 and lower case in ROS 2."""
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
 

@@ -41,7 +41,7 @@ def find_frame(image: np.ndarray) -> Frame:
     lit = ~dark
     lines, columns = (_extent(image, lit.any(axis=1 - axis), axis) for axis in (0, 1))
     part = image[slice(*lines), slice(*columns)]
-    outside = _wedges(part, dark[slice(*lines), slice(*columns)])
+    outside = _border_wedges(part, dark[slice(*lines), slice(*columns)])
     if not outside.any():
         return Frame(lines, columns)
     shown = np.zeros(dark.shape, bool)
@@ -69,7 +69,7 @@ def _is_filled(part: np.ndarray) -> bool:
     return bool(part.size) and float(part.mean()) <= _FILLED
 
 
-def _wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
+def _border_wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
     """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image."""
     outside = np.zeros(dark.shape, bool)
     for turns in range(4):

@@ -254,7 +254,7 @@ def measure_pair(
         if ground is not None and detection.upper is not None:
             upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((measurement, upper))
-    measured = _without_strangers(measured, calibration, find_frame(grey_right).columns[0])
+    measured = _without_mismatches(measured, calibration, find_frame(grey_right).columns[0])
     occluded = _occluded_edges([measurement for measurement, _ in measured])
     above = _occluded_edges([upper or Measurement() for _, upper in measured])
     occluded = [behind or not measurement.here for behind, (measurement, _) in zip(occluded, measured)]
@@ -266,7 +266,7 @@ def measure_pair(
     return sightings
 
 
-def _without_strangers(
+def _without_mismatches(
     measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, begin: int
 ) -> list[tuple[Measurement, Measurement | None]]:
     """Invalidate measurements of stalks outside the right image, which were matched with something else.

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-from jaxrl_vis.stalks.phenotyping.detector.finder import higher_up, resize, resize_factor
+from jaxrl_vis.stalks.phenotyping.detector.finder import resize, resize_factor, upper_segment
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
@@ -200,7 +200,7 @@ def _example(
     """Build the example of an image [H, W, 3]; a fraction ``higher`` of its stalks also gets a crop around the upper height."""
     full_image = np.asarray(image)
     reduced, scale = resize(full_image, settings, pixels_per_metre)
-    relative_scale = settings.width / settings.full_width / settings.resizing(full_image.shape[1], pixels_per_metre)
+    relative_scale = settings.width / settings.full_width / settings.scale_for(full_image.shape[1], pixels_per_metre)
     shape = crop_shape((settings.crop_height, settings.crop_width), relative_scale)
     clear = np.flatnonzero(kinds == STALK)
     # Jitter the positions, as detections are not exact.
@@ -209,7 +209,7 @@ def _example(
     moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
     moved[:, 1::2][:, :2] += 2.0 * wide * rng.normal(size=(len(clear), 1))
     drawn = rng.random(len(clear)) < higher
-    above = np.array([higher_up(stalk) for stalk in moved[drawn]], np.float32).reshape(-1, 6)
+    above = np.array([upper_segment(stalk) for stalk in moved[drawn]], np.float32).reshape(-1, 6)
     shown = above[:, 1] > 0
     clear, moved = np.concatenate([clear, clear[drawn][shown]]), np.concatenate([moved, above[shown]])
     on_device, places = jnp.asarray(image), moved

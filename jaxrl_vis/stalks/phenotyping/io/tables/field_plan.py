@@ -61,7 +61,7 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
         matched, place = _by_range(small, table, plots), None
     if not matched:
         raise RequestError(
-            _none_there(path, [columns[one] for one in ids], [row[ids[0]] for row in table] if ids else [], plots)
+            _no_plot_message(path, [columns[one] for one in ids], [row[ids[0]] for row in table] if ids else [], plots)
         )
     others = [one for one in range(len(columns)) if one != place and small[one] not in _OBSERVED]
     plan: dict[str, dict[str, str]] = {}
@@ -126,7 +126,7 @@ def _by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plots: Seq
     return matched
 
 
-def _none_there(path: Path, columns: Sequence[str], names: Sequence[str], plots: Sequence[str]) -> str:
+def _no_plot_message(path: Path, columns: Sequence[str], names: Sequence[str], plots: Sequence[str]) -> str:
     own = ", ".join(map(readable, plots[:_SHOWN]))
     if not columns:
         return f"{path} names no plots: it needs a column plot_id (or plot, or range and row) with names as {own}"

@@ -84,7 +84,7 @@ def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[st
 
 
 def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
-    """Read the distance driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
+    """Read the distance driven at each pair, by the pair's name, m; None if unknown, see `odometry_fault`.
 
     Args:
         plot: Plot, whose folder may hold ``odometry.csv`` or one of the alternatives, see `odometry_file`.
@@ -99,7 +99,7 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
     return _of_pairs(plot, _read(odometry_file(plot.folder)), speed)
 
 
-def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
+def odometry_fault(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
     """Return a message that states why the distance driven is unknown; None if it is known.
 
     Args:
