@@ -158,7 +158,7 @@ def run(options: Train) -> int:
         check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
     if options.show_config:
-        streams.say("\n".join(config_lines(config, set(options.changes))))
+        streams.echo("\n".join(config_lines(config, set(options.changes))))
         return 0
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)

@@ -17,7 +17,7 @@ from jaxrl_vis.types import LoopState
 
 
 def is_finished(
-    folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
+    folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, echo: Callable[[str], None]
 ) -> bool:
     """Return True if a run is complete, with a valid last checkpoint, its evaluation, and its images.
 
@@ -28,7 +28,7 @@ def is_finished(
         return False
     restored = checkpoints.restore_train(programs.shapes)
     if restored is None or restored.iteration < min(last, total):
-        say("the last checkpoint is not usable, so the run is not finished: resuming from the last good one")
+        echo("the last checkpoint is not usable, so the run is not finished: resuming from the last good one")
         return False
     files = [folder.curve, folder.video] if programs.shows_images else [folder.curve]
     return is_evaluated(folder, programs.seeds, restored) and all(file.exists() for file in files)

@@ -44,7 +44,7 @@ class Saver:
         programs: Programs of the run.
         folder: Folder of its files.
         checkpoints: Checkpoints of that folder.
-        say: Called with one line about each event.
+        echo: Called with one line about each event.
         check: Raises a `StorageError` if the folder no longer belongs to this run; called before anything is written.
     """
 
@@ -53,10 +53,10 @@ class Saver:
         programs: Programs,
         folder: RunFolder,
         checkpoints: Checkpoints,
-        say: Callable[[str], None],
+        echo: Callable[[str], None],
         check: Callable[[], None],
     ):
-        self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
+        self._programs, self._folder, self._checkpoints, self._echo = programs, folder, checkpoints, echo
         self._check = check
         self._keeps_full = programs.config.run.full_checkpoint_interval > 0
 
@@ -142,7 +142,7 @@ class Saver:
             NonFiniteError, StorageError: As `light`.
         """
         hint = f"{interruption.hurry} at once, without the replay"
-        self._say(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
+        self._echo(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
         if self.is_recent_due(light=True):  # in case the user does not wait
             self.recent(loop, iteration, progress)
         self._checkpoints.wait()  # one of this iteration may still be on its way: it is not written twice
@@ -154,11 +154,11 @@ class Saver:
                 self.full(loop, iteration, progress)
             except StorageError as error:
                 missing = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
-                self._say(f"the networks are saved, {missing}: {error}; {self.resume}")
+                self._echo(f"the networks are saved, {missing}: {error}; {self.resume}")
                 return
         if distributed.is_first():
             self._checkpoints.recent.clear()
-        self._say(f"saved; {self.resume}")
+        self._echo(f"saved; {self.resume}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
         """Try to save the learner after an unexpected error; failures are not reported."""

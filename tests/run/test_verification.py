@@ -47,10 +47,10 @@ def run_trainer(straight) -> Callable[..., Trainer]:
 def verified(run_trainer) -> Callable[..., Verification]:
     """Verifies a folder."""
 
-    def function(path: Path, iterations: int | None = None, say: Callable[[str], None] = lambda line: None) -> Verification:
+    def function(path: Path, iterations: int | None = None, echo: Callable[[str], None] = lambda line: None) -> Verification:
         record, config, report = read_record(path), read_config(path), Verification()
         check_record(record, config, report)
-        return verify(run_trainer(config), path, record, iterations, report, say)
+        return verify(run_trainer(config), path, record, iterations, report, echo)
 
     return function
 
@@ -310,7 +310,7 @@ def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, run
 
 def test_the_command_says_what_it_found(copy, verified, monkeypatch, capsys):
     monkeypatch.setattr(
-        verification, "verify_run", lambda path, iterations, cache_programs, say, trust: verified(path, iterations, say)
+        verification, "verify_run", lambda path, iterations, cache_programs, echo, trust: verified(path, iterations, echo)
     )
     assert cli.main(["verify", str(copy)]) == 0
     out = capsys.readouterr().out

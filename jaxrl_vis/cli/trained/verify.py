@@ -33,7 +33,7 @@ def run(options: Verify) -> int:
     check_counts(iterations=options.iterations)
     from jaxrl_vis.run.verifying.verification import verify_run
 
-    report = verify_run(run_dir, options.iterations, cache_programs=True, say=print, trust=trust)
+    report = verify_run(run_dir, options.iterations, cache_programs=True, echo=print, trust=trust)
     for title, lines in (("not verified", report.unverified), ("note", report.notes), ("elsewhere", report.elsewhere)):
         for line in lines:
             print(f"{title}: {line}")

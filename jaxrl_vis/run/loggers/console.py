@@ -58,14 +58,14 @@ class RunConsole:
         self._bar: FittingProgress | None = None
         self._task = None
 
-    def say(self, line: str) -> None:
+    def echo(self, line: str) -> None:
         """Print one line."""
         if self._quiet:
             return
         if self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         else:
-            streams.say(line)
+            streams.echo(line)
 
     def start(self, total: int, done: int) -> None:
         """Start the progress bar, on a terminal.

@@ -93,7 +93,7 @@ class Checkpoints:
 
     Args:
         folder: Folder of the tiers; created by the first save.
-        say: Called with one line about each unusable checkpoint.
+        echo: Called with one line about each unusable checkpoint.
         read_only: Never save: nothing is created or cleaned up.
 
     Attributes:
@@ -104,14 +104,14 @@ class Checkpoints:
     def __init__(
         self,
         folder: Path,
-        say: Callable[[str], None] = streams.say,
+        echo: Callable[[str], None] = streams.echo,
         read_only: bool = False,
         run_id: str = ANY_RUN,
     ):
         self._folder = folder.absolute()  # orbax refuses relative names
-        self._say = say
+        self._echo = echo
         self._read_only = read_only
-        self.recent = Recent(self._folder / RECENT, say)
+        self.recent = Recent(self._folder / RECENT, echo)
         self.run_id = run_id
         self._managers: dict[str, ocp.CheckpointManager] = {}
         self._reported: set[tuple[str, int]] = set()  # damaged ones
@@ -409,7 +409,7 @@ class Checkpoints:
                 return self._restored(tier, iteration, template, with_rest and tier == FULL, manifest)
             except Unusable as damage:
                 if (tier, iteration) not in self._reported:
-                    self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
+                    self._echo(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
                 self._reported.add((tier, iteration))
         return None
 

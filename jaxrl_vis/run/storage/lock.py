@@ -100,12 +100,12 @@ class Held:
 
 
 @contextlib.contextmanager
-def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]:
+def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[Held]:
     """Lock a run folder; create it if missing, and remove it again if it is still empty at the end.
 
     Args:
         folder: The folder.
-        say: Called with one line if the file system has no locks, and if a dead holder's lock is taken over.
+        echo: Called with one line if the file system has no locks, and if a dead holder's lock is taken over.
 
     Raises:
         RequestError: Another process holds the folder, or it cannot be written to.
@@ -120,7 +120,7 @@ def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]
         with contextlib.ExitStack() as stack:
             try:
                 if not _lock_by_system(path, stack):
-                    _lock_by_marker(path, held, say, stack)
+                    _lock_by_marker(path, held, echo, stack)
             except OSError as error:
                 raise _unwritable(folder, error) from error
             yield held
@@ -175,7 +175,7 @@ def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) ->
     lock.release()
 
 
-def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: contextlib.ExitStack) -> None:
+def _lock_by_marker(path: Path, held: Held, echo: Callable[[str], None], stack: contextlib.ExitStack) -> None:
     """Use the file itself as the lock until the end of ``stack``.
 
     Raises:
@@ -183,7 +183,7 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
         OSError: It cannot be written.
     """
     if not _read(path).startswith(_MARKER):
-        say(f"the file system of {path.parent} has no locks: {FILE_NAME} is the lock itself, touched every {HEARTBEAT_S:g} s")
+        echo(f"the file system of {path.parent} has no locks: {FILE_NAME} is the lock itself, touched every {HEARTBEAT_S:g} s")
     lease = filelock.SoftFileLease(
         path,
         lease_duration=LEASE_S,
@@ -204,7 +204,7 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
         except filelock.Timeout:
             now, text = _touched(path), _read(path)
             if last_touch is None and now is not None:
-                say(f"{path} belongs to {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life")
+                echo(f"{path} belongs to {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life")
                 last_touch, last_touch_at = now, time.monotonic()
             elif now is not None and now != last_touch and text:  # a new file is empty until its holder writes into it
                 raise _in_use(path, text) from None
@@ -216,7 +216,7 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
     stack.callback(lease.release)
     held.watch(path)
     if before:
-        say(f"took over {path} of {_holder(before)}, which is dead")
+        echo(f"took over {path} of {_holder(before)}, which is dead")
 
 
 def _touched(path: Path) -> tuple[float, int] | None:

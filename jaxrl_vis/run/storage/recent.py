@@ -51,15 +51,15 @@ class Recent:
 
     Args:
         folder: Folder of the states; created by the first save.
-        say: Called with one line when there is no more space for them.
+        echo: Called with one line when there is no more space for them.
 
     Attributes:
         run_id: Id of the run: other runs' states are ignored, except by `set_foreign_aside`. `ANY_RUN`:
             all states.
     """
 
-    def __init__(self, folder: Path, say: Callable[[str], None]):
-        self._folder, self._say = folder, say
+    def __init__(self, folder: Path, echo: Callable[[str], None]):
+        self._folder, self._echo = folder, echo
         self.run_id = ANY_RUN
         self._rollouts: dict[int, int] = {}  # rollouts known to exist, and their checksums
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
@@ -109,7 +109,7 @@ class Recent:
         except OSError as error:
             self._is_off = True
             self._drop_unfinished()
-            self._say(
+            self._echo(
                 f"the replay is not kept up to date any more ({error.strerror or type(error).__name__}): "
                 "if this process is killed, the run goes on without it"
             )

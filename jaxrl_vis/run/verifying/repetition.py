@@ -60,7 +60,7 @@ class Repeater:
         rows: Rows of its file.
         manifests: Manifests of its checkpoints, by tier and iteration.
         report: Receives the results.
-        say: Called with a line about each step.
+        echo: Called with a line about each step.
 
     Attributes:
         repeated: Iterations whose rows were compared.
@@ -74,10 +74,10 @@ class Repeater:
         rows: Sequence[Row],
         manifests: Mapping[tuple[str, int], dict[str, Any]],
         report: Verification,
-        say: Callable[[str], None],
+        echo: Callable[[str], None],
     ):
         self._programs, self._expected, self._rows = programs, expected, rows
-        self._manifests, self._report, self._say = manifests, report, say
+        self._manifests, self._report, self._echo = manifests, report, echo
         self.repeated: set[int] = set()
         self.without_evaluation: set[int] = set()
 
@@ -91,7 +91,7 @@ class Repeater:
             loop: State at the start; donated.
             compared_iterations: Iterations whose rows are compared, ascending; the repetition ends at the last one.
         """
-        self._say(f"repeating iterations {begin + 1} to {compared_iterations[-1]} from {name} ...")
+        self._echo(f"repeating iterations {begin + 1} to {compared_iterations[-1]} from {name} ...")
         history = {begin - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
         if begin in compared_iterations:
             self._compare(name, begin, loop, history)
@@ -110,7 +110,7 @@ class Repeater:
     def _differ(self, line: str) -> None:
         self._report.differences.append(line)
         self._report.problems.append(line)
-        self._say(f"  {line}")
+        self._echo(f"  {line}")
 
     def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
         """Compare the rows of an iteration with the repetition."""
@@ -142,7 +142,7 @@ class Repeater:
             self._report_differences(name, iteration, best)
         else:
             seeds = "1 seed" if len(there) == 1 else f"{len(there)} seeds"
-            self._say(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
+            self._echo(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
 
     def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
         self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
@@ -190,7 +190,7 @@ class Repeater:
             if differing:
                 self._differ(f"checkpoint {tier}/{iteration} differs from the repetition: {listed(differing)} differ")
             else:
-                self._say(f"  checkpoint {tier}/{iteration}: equal")
+                self._echo(f"  checkpoint {tier}/{iteration}: equal")
 
 
 def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:

@@ -52,7 +52,7 @@ def verify_run(
     run_dir: Path | str,
     iterations: int | None = None,
     cache_programs: bool = False,
-    say: Callable[[str], None] = lambda line: None,
+    echo: Callable[[str], None] = lambda line: None,
     trust: bool = False,
 ) -> Verification:
     """Repeat the beginning of a run and the continuation of each full checkpoint; its folder is not modified.
@@ -61,7 +61,7 @@ def verify_run(
         run_dir: The run folder; the run may still be in progress.
         iterations: Number of iterations to repeat from each start; None: up to the second evaluation.
         cache_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
-        say: Called with a line about each step.
+        echo: Called with a line about each step.
         trust: Allow the run's own code, if its task is module:Name and was trained by another user.
 
     Raises:
@@ -82,7 +82,7 @@ def verify_run(
         findings.elsewhere.append(f"the run was on {config.run.devices} devices, and is repeated on one")
         config = config.replace(devices=1, data_devices=None)
     trainer = make_trainer(config, cache_programs=cache_programs)
-    return verify(trainer, path, record, iterations, findings, say)
+    return verify(trainer, path, record, iterations, findings, echo)
 
 
 def verify(
@@ -91,18 +91,18 @@ def verify(
     record: Mapping[str, Any],
     iterations: int | None,
     report: Verification,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
 ) -> Verification:
     """Verify a run with an existing trainer of its configuration and the contents of its config.json."""
-    return _Verifier(trainer, RunFolder(path), record, report, say).verify(iterations)
+    return _Verifier(trainer, RunFolder(path), record, report, echo).verify(iterations)
 
 
 class _Verifier:
     def __init__(
-        self, trainer: Trainer, folder: RunFolder, record: Mapping[str, Any], report: Verification, say: Callable[[str], None]
+        self, trainer: Trainer, folder: RunFolder, record: Mapping[str, Any], report: Verification, echo: Callable[[str], None]
     ):
         self._programs, self._config, self._folder = trainer.programs, trainer.config, folder
-        self._record, self._report, self._say = record, report, say
+        self._record, self._report, self._echo = record, report, echo
         program = trainer.program
         self._expected = Expected(
             seeds=list(trainer.seeds),
@@ -112,7 +112,7 @@ class _Verifier:
             run_id=read_run_id(folder.path),
         )
         self._total: int = program.num_iterations
-        self._checkpoints = Checkpoints(folder.checkpoints, self._say, read_only=True)
+        self._checkpoints = Checkpoints(folder.checkpoints, self._echo, read_only=True)
         self._manifests: dict[tuple[str, int], dict[str, Any]] = {}
         self._rows: list[Row] = []
 
@@ -153,10 +153,12 @@ class _Verifier:
             **_flat(provenance.device_record() | {"name": name}),
         }
         recorded = {"revision": record.get("git_revision"), **versions, **_flat(device)}
-        self._say(f"{self._folder.path}: {self._config.environment.env}, {describe(self._config)}, run {self._expected.run_id}")
+        self._echo(
+            f"{self._folder.path}: {self._config.environment.env}, {describe(self._config)}, run {self._expected.run_id}"
+        )
         libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
-        self._say(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
+        self._echo(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
         other = [name for name in recorded if recorded[name] != current.get(name)]
         report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in other]
         if recorded["revision"] is None:
@@ -244,7 +246,7 @@ class _Verifier:
     def _repeat_all(self, iterations: int | None) -> Repeater:
         """Repeat the run from the seed, and from each full checkpoint."""
         programs, seed = self._programs, Progress()
-        repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._say)
+        repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._echo)
         compared_iterations = self._plan(0, seed, iterations)
         starts = [number for tier, number in self._manifests if tier == FULL]
         if compared_iterations or starts:
@@ -284,7 +286,7 @@ class _Verifier:
             layout,
             program.replay.frame_stack,
         )
-        self._say("compiling ...")
+        self._echo("compiling ...")
         check_compiled(self._programs.compile(), is_allocated=False, layout=layout)
 
     def _plan(self, begin: int, progress: Progress, iterations: int | None) -> list[int]:

@@ -93,7 +93,7 @@ def run(
     request: Request,
     done: Callable[[str, int, int], None] = lambda plot, pair, of: None,
     workers: int = 1,
-    say: Callable[[str, str], None] = lambda plot, why: None,
+    echo: Callable[[str, str], None] = lambda plot, why: None,
 ) -> tuple[list[Row], list[Row]]:
     """Process plots and write their results, resuming from those that are already there.
 
@@ -103,7 +103,7 @@ def run(
         request: Options of the run.
         done: Progress callback, called after each pair with the plot's name, and the numbers of finished and of all its pairs.
         workers: Number of processes that measure pairs and render overlays; 1 to use the calling process.
-        say: Callback for each plot without a count, with its name and the reason.
+        echo: Callback for each plot without a count, with its name and the reason.
 
     Returns:
         Rows of plots.csv, and rows of skipped.csv.
@@ -137,7 +137,7 @@ def run(
             "from top to bottom; on no real row."
         )
     with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
-        return _run(plots, find, request, driven, page, done, say, run_all)
+        return _run(plots, find, request, driven, page, done, echo, run_all)
 
 
 def _run(
@@ -147,7 +147,7 @@ def _run(
     driven: dict[str, dict[str, float] | None],
     page: Page,
     done: Callable[[str, int, int], None],
-    say: Callable[[str, str], None],
+    echo: Callable[[str, str], None],
     run_all: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
     """Process plots one by one; see `run`."""
@@ -174,7 +174,7 @@ def _run(
         ]
         result = _finish(plot, records, driven[plot.name], request, run_all)
         if result.row["stalks"] == "":
-            say(plot.name, result.row["flag"] + (f" ({result.why})" if result.why else ""))
+            echo(plot.name, result.row["flag"] + (f" ({result.why})" if result.why else ""))
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)

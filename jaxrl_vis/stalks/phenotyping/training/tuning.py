@@ -93,7 +93,7 @@ def tune(
     settings: Settings,
     tuning: Tuning,
     start: Any,
-    say: Say,
+    echo: Say,
     keep: Callable[[Any, int], None] = lambda params, step: None,
 ) -> Tuned:
     """Fine-tune the networks on annotated images.
@@ -104,7 +104,7 @@ def tune(
         settings: Settings of the networks.
         tuning: Fine-tuning schedule.
         start: Initial parameters, whose first layers are frozen; None for random initialisation.
-        say: Progress callback, see `Say`.
+        echo: Progress callback, see `Say`.
         keep: Called with the best parameters so far and their update, so that they survive an interruption. Without images for
             early stopping, called with the latest parameters at each evaluation.
 
@@ -121,16 +121,16 @@ def tune(
 
     began = time.monotonic()
     words = f"compiling for images of {shape[1]} x {shape[0]} pixels on {jax.default_backend()}"
-    with heartbeat(words, say):
+    with heartbeat(words, echo):
         zeros = jnp.float32(0.0), jnp.float32(0.0)
         update = update_networks.lower(state, batches.draw(), steps_key, zeros, settings, dtype, frozen).compile()
         before = find_in(state[1]["detector"], test, shape, settings, dtype)
     compile_s = time.monotonic() - began
-    say(f"compiled in {compile_s:.0f} s; --minutes count from here")
+    echo(f"compiled in {compile_s:.0f} s; --minutes count from here")
 
     watch = _Watch(stop, shape, settings, dtype, state[1], tuning.patience)
     if stop:
-        say(f"before: score {watch.best:.3f} on {len(stop)} images that decide when to stop")
+        echo(f"before: score {watch.best:.3f} on {len(stop)} images that decide when to stop")
     started, step, why = time.monotonic(), 0, f"{tuning.steps} updates are made"
     last = started
     while step < tuning.steps:
@@ -152,7 +152,7 @@ def tune(
             looked = watch.look(state[1], step) if step % tuning.look == 0 else ""
             if step % tuning.look == 0 and (watch.step == step or not stop):
                 keep(state[1], step)
-            say(f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {line}{looked}")
+            echo(f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {line}{looked}")
             last = time.monotonic()
         if watch.over:
             why = f"the score has not become better for {tuning.patience * tuning.look} updates"
@@ -235,15 +235,15 @@ def _largest(examples: Sequence[Example]) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def heartbeat(words: str, say: Say) -> Iterator[None]:
-    """Report progress through ``say`` at the start and every ten seconds while the context is active."""
+def heartbeat(words: str, echo: Say) -> Iterator[None]:
+    """Report progress through ``echo`` at the start and every ten seconds while the context is active."""
     over, began = threading.Event(), time.monotonic()
 
     def beat() -> None:
         while not over.wait(_HEARTBEAT):
-            say(f"{words}: {time.monotonic() - began:.0f} s")
+            echo(f"{words}: {time.monotonic() - began:.0f} s")
 
-    say(f"{words} ...")
+    echo(f"{words} ...")
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()
     try:
