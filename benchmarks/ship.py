@@ -25,7 +25,7 @@ from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 
 FRESH_KEY = 59_000_000
 """Seed of the fresh episodes: larger than all seeds of runs, and different from that of evaluations."""
-MOST_BYTES = 2 * 1024**2
+MAX_BYTES = 2 * 1024**2
 
 
 def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, episodes: int) -> Score:
@@ -52,9 +52,9 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
         record = public_record(run_dir)
         write_atomically(folder / RunFolder(folder).config.name, json.dumps(record, indent=2) + "\n")
         size = (folder / policy_file.FILE_NAME).stat().st_size
-        if size > MOST_BYTES:
+        if size > MAX_BYTES:
             raise RequestError(
-                f"the policy of {run_dir} takes {size / 2**20:.1f} MiB: ship one of {MOST_BYTES / 2**20:.0f} MiB or less"
+                f"the policy of {run_dir} takes {size / 2**20:.1f} MiB: ship one of {MAX_BYTES / 2**20:.0f} MiB or less"
             )
         score_float16 = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
         remark = (

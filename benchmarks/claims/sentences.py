@@ -329,7 +329,7 @@ def _decays() -> Iterator[Sentence]:
     def run(task: str, variant: str, decay: float) -> Record:
         if decay == 0.98 and task == FETCH:
             return study("target_decay", f"{task}-{variant}-paper-decay0.98", fresh=True)
-        return ol_aux.run(task, variant) if decay == 0.98 and task == FINGER else thesis.decayed(task, variant, decay)
+        return ol_aux.run(task, variant) if decay == 0.98 and task == FINGER else thesis.with_decay(task, variant, decay)
 
     def times(task: str, level: float, decay: float) -> str:
         return c.speed_up(run(task, "ol_aux_5", decay), run(task, "none", decay), level)

@@ -66,7 +66,7 @@ def _command(words: Sequence[str], folder: Path, **variables: str) -> Part:
     return Part.command([*_CLI, *words], folder, variables)
 
 
-def _finished(part: Part, *statuses: int) -> Part:
+def _wait_until_finished(part: Part, *statuses: int) -> Part:
     with killed_afterwards(part):
         status = part.end()
     part.check_words()
@@ -83,7 +83,7 @@ def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
     options = ["broken_task:BrokenReach", "--env-folder", str(folder), "--preset", "debug", "--seeds", "2"]
     options += ["--env-steps", str(400 * steps), "--seed", str(rng.randrange(10**6)), "--checkpoint-interval", "3"]
     part = Part.start(run, {"SOAK_NAN": str(1.0 / rng.uniform(100, 800))}, options)
-    _finished(part, 4)
+    _wait_until_finished(part, 4)
     (line,) = [line for line in part.lines if "non-finite" in line]
     seeds = re.search(r"seeds? ([\d, ]+)", line)
     if seeds is None or "," in seeds.group(1):
@@ -94,7 +94,7 @@ def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
     if not saved:
         return  # in the very first iterations there is nothing to resume from, which the line reports
     rows = read_rows(run)
-    again = _finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
+    again = _wait_until_finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
     if not again.count("resumed at iteration"):
         raise Broken(f"it did not go on from the last good checkpoint: {again.lines}")
     if [row for row in read_rows(run) if row in rows] != rows:
@@ -138,7 +138,7 @@ def _kill_a_worker(part: Part, words: str, rng: random.Random, delay: float, is_
     return True
 
 
-def _of_one_line(part: Part, words: str) -> None:
+def _parse_single_line(part: Part, words: str) -> None:
     if sum(words in line for line in part.lines) != 1:
         raise Broken(f"not one line says {words!r}: {part.lines[-8:]}")
 
@@ -157,8 +157,8 @@ def worker_of_a_study(folder: Path, rng: random.Random, references: "References"
             raise NotStruck
         if part.process.returncode not in (1, 3):
             raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
-        _of_one_line(part, "failed with exit status")
-    _finished(_command(words, folder), 0)
+        _parse_single_line(part, "failed with exit status")
+    _wait_until_finished(_command(words, folder), 0)
     if _cell_rows(folder) != references.study():
         raise Broken(f"rows differ from those of an undisturbed study: {part.lines}")
     if not struck:
@@ -233,8 +233,8 @@ def _pool(words: Sequence[str], folder: Path, rng: random.Random) -> None:
     if struck:
         if part.process.returncode not in (1, 2):
             raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
-        _of_one_line(part, "processes was killed from outside")
-    _finished(_command(words, folder), 0)
+        _parse_single_line(part, "processes was killed from outside")
+    _wait_until_finished(_command(words, folder), 0)
     if not struck:
         raise NotStruck
 
@@ -261,7 +261,7 @@ class References:
         """Return rows by name of the cell."""
 
         def make(folder: Path) -> dict[str, list]:
-            _finished(_command(_sweep(folder), folder), 0)
+            _wait_until_finished(_command(_sweep(folder), folder), 0)
             return _cell_rows(folder)
 
         return self._once("study", make)
@@ -272,8 +272,8 @@ class References:
         def make(folder: Path) -> tuple[Path, dict[str, bytes]]:
             (folder / "few.json").write_text(json.dumps(FEW_STALKS))
             words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(folder / "few.json"), "--width", "422"]
-            _finished(_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
-            _finished(_command(_phenotype(folder, folder / "plots"), folder), 0)
+            _wait_until_finished(_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
+            _wait_until_finished(_command(_phenotype(folder, folder / "plots"), folder), 0)
             return folder / "plots", _tables(folder / "out")
 
         return self._once("phenotyping", make)
@@ -284,7 +284,7 @@ class References:
         def make(folder: Path) -> tuple[Path, list]:
             spec = folder / "few.json"
             spec.write_text(json.dumps(FEW_TO_GRASP))
-            _finished(_command(_grasp(folder, spec), folder), 0)
+            _wait_until_finished(_command(_grasp(folder, spec), folder), 0)
             return spec, _figures(folder / "eval.json")
 
         return self._once("grasping", make)

@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes
-from jaxrl_vis.stalks.phenotyping.training.held_out import LEAST_SCORE, match_finds
+from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_finds
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants.pairs import Sequence
 
@@ -37,7 +37,7 @@ FIRST_SEEDS = {"fit": 20_000, "test": 30_000}
 WIDTH, FRAMES = 844, 2
 RIGHT = 0.8
 """Minimum F1 of the detections of an image that counts as correct."""
-MOST_FLAGGED = 0.04
+MAX_FLAGGED = 0.04
 AXES = 8
 Photograph = tuple[np.ndarray, int, Callable[[np.ndarray], int]]
 
@@ -116,7 +116,7 @@ def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
             image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
             stalks, scores, pooled = see(finder, image, float(data["density"]))
             right, ignored = match_finds(stalks, scores, truth, kinds)
-            counted = (scores >= LEAST_SCORE) & ~ignored
+            counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
             yield Seen("", pooled, scores, f1, plain_measures(image))
 
@@ -125,7 +125,7 @@ def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> It
     """Evaluate photographs, whose cameras are unknown."""
     for image, count, find_boxes in photographs:
         stalks, scores, pooled = see(finder, image, None)
-        boxes = stalks[scores >= LEAST_SCORE][:, :4]
+        boxes = stalks[scores >= MIN_SCORE][:, :4]
         yield Seen("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
 
 
@@ -162,8 +162,8 @@ def report(name: str, images: list[Seen], gate: Gate, doubts_of_control: np.ndar
     print(f"{name:14} " + "; ".join(parts), flush=True)
 
 
-def _made(folder: Path, tasks: list[tuple[str, str, int]], place: int) -> dict[str, str]:
-    return {"path": str(draw(folder, *tasks[place]))}
+def _made(folder: Path, tasks: list[tuple[str, str, int]], index: int) -> dict[str, str]:
+    return {"path": str(draw(folder, *tasks[index]))}
 
 
 def main() -> None:
@@ -189,7 +189,7 @@ def main() -> None:
         done = functools.partial(_made, options.folder, tasks)
         evaluate_all(done, range(len(tasks)), options.workers, lambda place, made: print(made["path"], flush=True))
     enable_compilation_cache()
-    finder = load_finder(options.weights, LEAST_SCORE)
+    finder = load_finder(options.weights, MIN_SCORE)
     seen: dict[str, list[Seen]] = {part: [] for part in FIRST_SEEDS}
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
@@ -198,7 +198,7 @@ def main() -> None:
     fitted, tried = seen["fit"], seen["test"]
     wrong = np.array([image.f1 < RIGHT for image in fitted])
     pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES
-    gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MOST_FLAGGED)
+    gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MAX_FLAGGED)
     about = {"images": len(fitted), "families": list(PLOTS), "origin": "synthetic images alone"}
     write_gate(options.weights, gate, about)
     if options.photographs:

@@ -41,8 +41,8 @@ Randomized = Literal["camera", "lights", "colours", "dynamics"]
 BestBy = Literal["success", "goal_distance", "goal_distance_median"]
 ComputeDtype = Literal["auto", "float32", "bfloat16"]
 
-LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without bound
-Count = Annotated[int, Bounds(1, LARGEST_COUNT)]
+MAX_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without bound
+Count = Annotated[int, Bounds(1, MAX_COUNT)]
 Fraction = Annotated[float, Bounds(0.0, 1.0)]
 Positive = Annotated[float, Bounds(0.0, exclusive=True)]
 T = TypeVar("T")
@@ -83,7 +83,7 @@ class RunOptions:
     """Number of episodes in an evaluation; they are the same every time."""
     checkpoint_interval: Annotated[Count, HOST, RESUMABLE, UNMEASURED] = 5
     """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
-    full_checkpoint_interval: Annotated[int, Bounds(0, LARGEST_COUNT), HOST, RESUMABLE, UNMEASURED] = 0
+    full_checkpoint_interval: Annotated[int, Bounds(0, MAX_COUNT), HOST, RESUMABLE, UNMEASURED] = 0
     """Iterations between full checkpoints (with the replay, for an exact resume). 0: only when a run is interrupted."""
     best_by: Annotated[BestBy | None, HOST, RESUMABLE, UNMEASURED] = None
     """Evaluation metric (mean over seeds) by which the best learner is kept as an additional checkpoint, for
@@ -228,7 +228,7 @@ class NetworkOptions:
     """Encoder of the actor: its own (separate), or the critic's, which the actor's loss does not update (shared)."""
     target_encoder: bool = True
     """Use slowly updated target encoders; if false, the target heads read the latents of the online encoders."""
-    random_shift: Annotated[int, Bounds(0, LARGEST_COUNT)] = 0
+    random_shift: Annotated[int, Bounds(0, MAX_COUNT)] = 0
     """Random shift augmentation: maximum shift in pixels per axis, the same for the three images of a transition (Kostrikov et
     al., 2020)."""
     compute_dtype: ComputeDtype = "auto"

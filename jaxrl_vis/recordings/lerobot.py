@@ -198,9 +198,9 @@ class _Writer:
         for name, feature in self._features.items():
             if feature["dtype"] in ("image", "video"):
                 shown = [self._images(name, episode)[:-1] for episode in episodes]
-                statistics[name] = _of_images(shown)
+                statistics[name] = _image_statistics(shown)
             else:
-                statistics[name] = _of_numbers(numbers[name].reshape(-1, *feature["shape"]))
+                statistics[name] = _number_statistics(numbers[name].reshape(-1, *feature["shape"]))
         return statistics
 
     def _write_tables(self, videos: list[str]) -> None:
@@ -231,7 +231,7 @@ class _Writer:
         return f"{self._recordings.about.get('task', 'recordings')}: reach the goal"
 
 
-def _of_numbers(values: np.ndarray) -> dict[str, Any]:
+def _number_statistics(values: np.ndarray) -> dict[str, Any]:
     """Return statistics of values [steps, D], as lists of D numbers."""
     quantiles = np.quantile(values, list(_QUANTILES.values()), axis=0)
     return {
@@ -243,7 +243,7 @@ def _of_numbers(values: np.ndarray) -> dict[str, Any]:
     } | dict(zip(_QUANTILES, quantiles.tolist(), strict=True))
 
 
-def _of_images(episodes: list[np.ndarray]) -> dict[str, Any]:
+def _image_statistics(episodes: list[np.ndarray]) -> dict[str, Any]:
     """Return statistics of images [..., H, W, C] uint8, scaled by 1/255, [3, 1, 1] each; computed from exact histograms."""
     channels = episodes[0].shape[-1]
     counts = sum(np.stack([np.bincount(part[..., c].ravel(), minlength=256) for c in range(channels)]) for part in episodes)

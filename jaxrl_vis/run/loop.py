@@ -422,8 +422,8 @@ class RunLoop:
                 words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")
         self._echo("  ".join(words))
 
-    def _warn_if_filtered(self, means: PerSeed) -> None:
-        too_much = max(means.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
+    def _warn_if_filtered(self, metrics: PerSeed) -> None:
+        too_much = max(metrics.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
         self._progress.filtered = self._progress.filtered + 1 if too_much else 0
         if self._progress.filtered == _FILTERED_EVALUATIONS:
             self._echo(
@@ -449,11 +449,11 @@ class RunLoop:
                 self._results.draw_curve(self._done)
         interruption.end()
 
-    def _stop_nonfinite(self, where: str, values: PerSeed) -> None:
+    def _stop_nonfinite(self, place: str, values: PerSeed) -> None:
         """Dump the state and raise NonFiniteError."""
         assert self._loop is not None
         self._console.stop()
-        self._saver.stop_nonfinite(self._loop, self._done, where, values)
+        self._saver.stop_nonfinite(self._loop, self._done, place, values)
 
     # -- After
 

@@ -205,7 +205,7 @@ class Saver:
             self.stop_nonfinite(loop, iteration, f"the state after iteration {iteration}", {}, broken)
 
     def stop_nonfinite(
-        self, loop: LoopState, iteration: int, where: str, values: PerSeed, broken: list[str] | None = None
+        self, loop: LoopState, iteration: int, place: str, values: PerSeed, broken: list[str] | None = None
     ) -> None:
         """Dump the state and raise NonFiniteError."""
         with contextlib.suppress(StorageError):
@@ -228,4 +228,4 @@ class Saver:
         shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
         good = "there is no checkpoint yet" if newest is None else f"the last good checkpoint is of iteration {newest}"
         origin = f"they come from the simulation, not from the learner ({simulated}); " if simulated else ""
-        raise NonFiniteError(f"non-finite numbers in {where}{shown}: {origin}{dumped}; {good}")
+        raise NonFiniteError(f"non-finite numbers in {place}{shown}: {origin}{dumped}; {good}")

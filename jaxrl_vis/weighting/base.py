@@ -244,9 +244,9 @@ def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
     return {name: vector[index] for index, name in enumerate(loss_order(names))}
 
 
-def settled(after: WeightingState, before: WeightingState) -> WeightingState:
+def settled(updated: WeightingState, previous: WeightingState) -> WeightingState:
     """Cast a state to the dtypes of the previous one, as required for the carry of a scan."""
-    return jax.tree.map(lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype), after, before)
+    return jax.tree.map(lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype), updated, previous)
 
 
 def all_names(weighting: str, names: Iterable[str]) -> tuple[str, ...]:
@@ -331,7 +331,7 @@ def start_alike(label: str, names: Iterable[str], **more: Any) -> WeightingState
     return WeightingState(weights=weights, updates=jnp.zeros((), jnp.int32), **more)
 
 
-def moved(state: WeightingState, weights: Weights, **more: Any) -> tuple[WeightingState, Metrics]:
+def next_state(state: WeightingState, weights: Weights, **more: Any) -> tuple[WeightingState, Metrics]:
     """Return the state after an update, and metrics ``weight/NAME`` of all losses.
 
     Args:

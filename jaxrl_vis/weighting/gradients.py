@@ -199,9 +199,9 @@ def weighted_grad(
         combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
         if weighting.heads == "always":
             in_heads = weighted_sum(gradients, weighting.coefficients(weighting.head_weights(weights), losses))
-            combined = _replaced(shared, params, combined, in_heads)
+            combined = _replace_subtree(shared, params, combined, in_heads)
         if isinstance(step, Direction):
-            combined = _replaced(shared, params, _embed(shared, params, step.shared), combined)
+            combined = _replace_subtree(shared, params, _embed(shared, params, step.shared), combined)
         return Weighted(combined, state, losses, metrics, weights, extra)
 
     def find_by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
@@ -239,7 +239,7 @@ def weighted_grad(
     return find_per_loss if mode == "per_loss" else find_by_latents
 
 
-def _replaced(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
+def _replace_subtree(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
     """Merge two trees like the parameters: shared parameters from ``inside``, all others from ``outside``."""
     is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(outside)))
     return jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, inside, outside)

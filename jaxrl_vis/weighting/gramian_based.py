@@ -24,7 +24,7 @@ from jaxrl_vis.weighting.base import (
     Weights,
     by_name,
     checked,
-    moved,
+    next_state,
     start_alike,
     to_vector,
 )
@@ -78,7 +78,7 @@ def of_gramian(
         slopes = to_vector(weighting.slopes(losses))
         vector, remembered = solve(slopes[:, None] * statistics * slopes[None, :] if log else statistics, state)
         weights = by_name(losses, vector)
-        return weights, *moved(state, weights, memory=remembered)
+        return weights, *next_state(state, weights, memory=remembered)
 
     weighting = checked(
         Weighting(

@@ -19,13 +19,13 @@ from jaxrl_vis.weighting.base import (
     auxiliary_names,
     by_name,
     loss_order,
-    moved,
+    next_state,
     start_alike,
     to_vector,
 )
 from jaxrl_vis.weighting.gramian_based import Options, of_gramian
 
-_LEAST_SHARE = 1e-4  # minimum weight of GradNorm before rescaling to mean 1: its rule may overshoot 0
+_MIN_FRACTION = 1e-4  # minimum weight of GradNorm before rescaling to mean 1: its rule may overshoot 0
 
 
 def gradnorm(alpha: float = 1.5, learning_rate: float = 0.025, heads: Heads = "weighted") -> Weighting:
@@ -59,9 +59,9 @@ def gradnorm(alpha: float = 1.5, learning_rate: float = 0.025, heads: Heads = "w
         slope = jnp.sign(weights * lengths - jnp.mean(weights * lengths) * relative**alpha) * lengths
         changes, rule_state = rule.update(slope.astype(weights.dtype), state.memory["rule"])
         stepped: Any = optax.apply_updates(weights, changes)
-        after = jnp.maximum(stepped, _LEAST_SHARE)
+        after = jnp.maximum(stepped, _MIN_FRACTION)
         after = after * (len(losses) / jnp.sum(after))
-        later, _ = moved(state, by_name(losses, after), memory={"first": first, "rule": rule_state})
+        later, _ = next_state(state, by_name(losses, after), memory={"first": first, "rule": rule_state})
         return state.weights, later, {f"weight/{name}": weight for name, weight in state.weights.items()}
 
     return Weighting("gradnorm", init, update, needs="gramian", heads=heads, main=False)

@@ -72,12 +72,14 @@ def gradvac(beta: float = 0.01, seed: int = 0, **options: Unpack[Options]) -> We
     return of_gramian("gradvac", solve, memory=lambda count, dtype: jnp.zeros((count, count), dtype), seed=seed, **options)
 
 
-def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, beta: float) -> tuple[jax.Array, jax.Array]:
+def gradvac_weights(
+    gramian: jax.Array, target_cosines: jax.Array, orders: jax.Array, beta: float
+) -> tuple[jax.Array, jax.Array]:
     """Compute the weights of `gradvac`, [K], and the updated running means of cosines, [K, K].
 
     Args:
         gramian: [K, K] float.
-        usual: [K, K] float, running means of the cosines between modified gradients (rows) and original ones (columns).
+        target_cosines: [K, K] float, running means of the cosines of modified gradients (rows) and original ones (columns).
         orders: See `pcgrad_weights`.
         beta: See `gradvac`.
     """
@@ -93,13 +95,13 @@ def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, bet
         is_pair = (others != rows) & is_some & (other > 0.0)
         safe = jnp.where(is_pair, other, 1.0)
         cosine = jnp.clip(jnp.where(is_pair, dots[rows, others] / (jnp.where(is_pair, length, 1.0) * safe), 0.0), -1.0, 1.0)
-        wanted = usual[rows, others]
+        wanted = target_cosines[rows, others]
         sine, wanted_sine = jnp.sqrt(1.0 - cosine**2), jnp.sqrt(1.0 - jnp.minimum(wanted**2, 1.0))
         gains = is_pair & (cosine < wanted) & (wanted_sine > 0.0)
         gain = length * (wanted * sine - cosine * wanted_sine) / (safe * jnp.where(gains, wanted_sine, 1.0))
         changed = changed.at[rows, others].add(jnp.where(gains, gain, 0.0))
-        usual = usual.at[rows, others].add(jnp.where(others != rows, beta * (cosine - wanted), 0.0))
-    return jnp.sum(changed, axis=0), usual
+        target_cosines = target_cosines.at[rows, others].add(jnp.where(others != rows, beta * (cosine - wanted), 0.0))
+    return jnp.sum(changed, axis=0), target_cosines
 
 
 def _random_orders(state: WeightingState, count: int) -> jax.Array:

@@ -157,7 +157,7 @@ def test_every_kept_record_has_a_list_of_files() -> None:
 @pytest.mark.parametrize("page", pages.PAGES)
 def test_a_page_says_what_the_records_say(page: str) -> None:
     text = (records.CHECKOUT / page).read_text()
-    assert pages.filled(text, pages.PAGES[page]) == text, "make tables"
+    assert pages.fill_page(text, pages.PAGES[page]) == text, "make tables"
 
 
 def test_every_table_between_markers_has_a_writer() -> None:

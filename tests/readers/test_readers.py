@@ -225,8 +225,8 @@ def test_annotations_of_labelme(worker):
     hold(worker, "labelme", named("a.json", also_as_text(trees(LABELME).map(json_text), json_text(LABELME))))
 
 
-_SHARE = {"x": 20.0, "y": 10.0, "width": 30.0, "height": 50.0, "rotation": 0.0, "rectanglelabels": ["stalk"]}
-_SHAPE = {"value": _SHARE, "original_width": ANNOTATED[1], "original_height": ANNOTATED[0]}
+_FRACTION = {"x": 20.0, "y": 10.0, "width": 30.0, "height": 50.0, "rotation": 0.0, "rectanglelabels": ["stalk"]}
+_SHAPE = {"value": _FRACTION, "original_width": ANNOTATED[1], "original_height": ANNOTATED[0]}
 _OUTLINE = {"points": [[10, 10], [40, 10], [40, 80]], "polygonlabels": ["stalk"]}
 LABEL_STUDIO = [{"data": {"image": "/data/a.png"}, "annotations": [{"result": [_SHAPE, {**_SHAPE, "value": _OUTLINE}]}]}]
 _MASK = base64.b64encode(cv2.imencode(".png", np.full((30, 6), 255, np.uint8))[1].tobytes()).decode()

@@ -281,12 +281,12 @@ def test_wind_moves_stalks_away_from_blind_jaws_and_looking_helps():
         times.append(sight.time)
         return sight.stalks[:, slot]
 
-    seeing = reach(scenes, targets, key, wind, look=look)
+    seeing = reach(scenes, targets, key, wind, observer=look)
     assert times == pytest.approx([LOOK * count for count in range(1, 24)])
     assert seeing.held[:, slot].sum() > blind.held[:, slot].sum()
     assert not blind.held[:, slot].all()
     # Nothing seen, nothing changed.
-    idle = reach(scenes, targets, key, wind, look=lambda sight: np.full((8, 3), np.nan))
+    idle = reach(scenes, targets, key, wind, observer=lambda sight: np.full((8, 3), np.nan))
     np.testing.assert_array_equal(idle.taken, blind.taken)
 
 

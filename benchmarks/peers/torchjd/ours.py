@@ -68,7 +68,7 @@ def path_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], 
     return path
 
 
-def vaccinated(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
+def gradvac_with_state(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
     """Compute the direction of GradVac's second step."""
     gramian, usual, weights = jacobian @ jacobian.T, jnp.zeros(2 * (len(jacobian),)), jnp.zeros(len(jacobian))
     for _ in range(2):
@@ -91,7 +91,7 @@ def results(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             directions[f"{count}/{name}"] = path(jnp.asarray(arrays[f"{count}/losses"]))
         drawn: dict[str, Any] = {
             "pcgrad": lambda jacobian, order: surgery.pcgrad_weights(jacobian @ jacobian.T, order) @ jacobian,
-            "gradvac": vaccinated,
+            "gradvac": gradvac_with_state,
             "graddrop": lambda jacobian, uniform: graddrop_direction(
                 dict(zip(names_of(len(jacobian)), jacobian, strict=True)), uniform
             ),

@@ -76,9 +76,9 @@ def _touch(
     middle, rotation, size = _where(is_first, (position_1, rotation_1, size_1), (position_2, rotation_2, size_2))
     other, other_rotation, other_size = _where(is_first, (position_2, rotation_2, size_2), (position_1, rotation_1, size_1))
     # Axes are permuted: in the frame at the centre of each box, z becomes the normal of the reference or the nearest face.
-    rotation, size = _as_last(face % 3, rotation, size)
+    rotation, size = _move_axis_last(face % 3, rotation, size)
     offset, turn = rotation.T @ (other - middle), rotation.T @ other_rotation
-    turn, other_size = _as_last(jnp.argmax(jnp.abs(turn[2])), turn, other_size)
+    turn, other_size = _move_axis_last(jnp.argmax(jnp.abs(turn[2])), turn, other_size)
     side = jnp.where(offset[2] >= 0, 1.0, -1.0)
     centre = offset - side * jnp.sign(turn[2, 2]) * other_size[2] * turn[:, 2]
     along = turn[:, :2] * other_size[:2]  # columns: half edges of the other face
@@ -103,7 +103,7 @@ def _where(condition: jax.Array, yes: tuple, no: tuple) -> tuple[jax.Array, ...]
     return tuple(jnp.where(condition, one, other) for one, other in zip(yes, no, strict=True))
 
 
-def _as_last(axis: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _move_axis_last(axis: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Permute the axes of a box cyclically, so that ``axis`` is the last."""
     order = (axis + jnp.arange(1, 4)) % 3
     return rotation[:, order], size[order]

@@ -271,7 +271,7 @@ def _dot(a: tuple[jax.Array, ...], b: tuple[jax.Array, ...]) -> jax.Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
+def _intersect_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
     """Compute the surface point on cones; ``c`` [..., columns] are rows of the table."""
     axis, major = (tuple(c[..., k + i] for i in range(3)) for k in (3, 6))
     start = tuple(c[..., CONE_HIT + i] for i in range(3))
@@ -290,7 +290,7 @@ def _on_cone(c: jax.Array, point: tuple[jax.Array, ...]) -> _Point:
     return _Point(1.5 * radius * around, arc + arc_rate * travelled, normal, over, node + node_rate * travelled, over * 0.0)
 
 
-def _on_triangle(m: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -> _Point:
+def _intersect_triangle(m: jax.Array, x: jax.Array, y: jax.Array, depth: jax.Array) -> _Point:
     """Compute the surface point on leaves, which have a midrib."""
 
     def interpolate(first: int) -> jax.Array:
@@ -317,7 +317,7 @@ def _colour(tables: _Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: _Hit) 
     is_cone, is_leaf, is_ground = kind == 2, kind == 3, kind == 1
     point = (x * depth, y * depth, depth)
     cone_row, leaf_row = jnp.where(is_cone, hit.row, 0), jnp.where(is_leaf, hit.row, 0)
-    stalk, leaf = _on_cone(tables.cones[cone_row], point), _on_triangle(tables.triangles[leaf_row], x, y, depth)
+    stalk, leaf = _intersect_cone(tables.cones[cone_row], point), _intersect_triangle(tables.triangles[leaf_row], x, y, depth)
     world = [sum(point[i] * shot.rotation[i, k] for i in range(3)) + shot.position[k] for k in range(2)]
     flat = tuple(jnp.broadcast_to(shot.rotation[i, 2], x.shape) for i in range(3))
     ground = _Point(world[0], world[1], flat, x * 0.0, x * 0.0, x * 0.0)
@@ -350,14 +350,14 @@ def _daylight(
     shot: Shot,
     day: Day,
     point: tuple[jax.Array, ...],
-    at: _Point,
+    surface: _Point,
     is_leaf: jax.Array,
     albedo: list[jax.Array],
     gloss: jax.Array,
 ) -> list[jax.Array]:
     """Compute radiance by sun and sky at points of the camera's frame, m: red, green and blue."""
     sun = tuple(shot.rotation[i] @ day.sun for i in range(3))
-    facing = _dot(at.normal, sun)
+    facing = _dot(surface.normal, sun)
     # Leaves transmit light.
     lit = jnp.maximum(facing, jnp.where(is_leaf, -0.45, 0.0) * facing)
     place = [sum(point[i] * shot.rotation[i, k] for i in range(3)) + shot.position[k] for k in range(3)]
@@ -367,11 +367,11 @@ def _daylight(
     depth, cover, size, gap = day.shadow
     pattern = 0.65 * noise(u / size, v / size, 6) + 0.35 * noise(u / gap, v / gap, 7)
     sunny = 1.0 - depth * ramp(1.0 - cover - 0.03, 1.0 - cover + 0.03, pattern)
-    upward = sum(at.normal[i] * shot.rotation[i, 2] for i in range(3))
+    upward = sum(surface.normal[i] * shot.rotation[i, 2] for i in range(3))
     open_sky = 0.55 + 0.45 * upward
     to_camera = _unit(tuple(-part for part in point))
     halfway = _unit(tuple(a + b for a, b in zip(sun, to_camera)))
-    shine = gloss * jnp.maximum(_dot(at.normal, halfway), 0.0) ** 24
+    shine = gloss * jnp.maximum(_dot(surface.normal, halfway), 0.0) ** 24
     return [
         sunlight * sunny * (channel * lit + shine) + skylight * channel * open_sky
         for channel, sunlight, skylight in zip(albedo, day.sunlight, day.skylight)
@@ -394,14 +394,14 @@ def _backdrop(shot: Shot, day: Day, x: jax.Array, y: jax.Array) -> list[jax.Arra
 
 
 def _albedo(
-    m: jax.Array, at: _Point, is_cone: jax.Array, is_leaf: jax.Array, is_ground: jax.Array
+    m: jax.Array, surface: _Point, is_cone: jax.Array, is_leaf: jax.Array, is_ground: jax.Array
 ) -> tuple[list[jax.Array], jax.Array]:
     """Compute the reflectance of surfaces (three channels), and the intensity of their highlights."""
     base, over = [m[..., k] for k in range(3)], [m[..., 3 + k] for k in range(3)]
     fibre_f, fibre_c, blotch_f, blotch_c, speckles, speckle_f, bands, band_f, bloom, gloss, texture_shift, edge = (
         m[..., 6 + k] for k in range(12)
     )
-    u, v = at.u + texture_shift, at.v + texture_shift
+    u, v = surface.u + texture_shift, surface.v + texture_shift
     # Fibres run along a stalk or leaf; the ground's grains have no direction.
     stretch = jnp.where(is_ground, 1.0, 0.03)
     fibres = 0.6 * noise(u * fibre_f, v * fibre_f * stretch, 0) + 0.4 * noise(u * fibre_f * 2.7, v * fibre_f * stretch * 2.0, 1)
@@ -411,19 +411,19 @@ def _albedo(
     )
     spots = noise(u * speckle_f, v * speckle_f * 0.8, 4)
     # Ragged ends: sheaths and dry leaf edges do not end in a straight line.
-    cover = jnp.where(is_leaf, ramp(0.75, 1.0, 0.8 * at.edge * edge + 0.75 * blotches), at.over)
+    cover = jnp.where(is_leaf, ramp(0.75, 1.0, 0.8 * surface.edge * edge + 0.75 * blotches), surface.over)
     cover = jnp.where(is_ground, ramp(0.5, 0.75, blotches), cover)
     spot = ramp(1.0 - 0.55 * speckles, 1.12 - 0.55 * speckles, spots)
     wave = 0.5 + 0.5 * jnp.sin(2.0 * jnp.pi * (v * band_f + 1.5 * blotches))
     dark = (
-        (1.0 - fibre_c * fibres * jnp.where(is_cone, 1.8 + at.over, 1.6))
+        (1.0 - fibre_c * fibres * jnp.where(is_cone, 1.8 + surface.over, 1.6))
         * (1.0 - blotch_c * ramp(0.35, 0.75, blotches))
         * (1.0 - 0.6 * spot)
         * (1.0 - bands * wave)
     )
     # A node is a dark scar under a pale ring; a leaf's rib is pale.
-    ring = jnp.where(is_cone, 1.0 - 0.55 * at.ring, 1.0 + 0.5 * at.ring)
-    wax = jnp.where(is_cone, bloom * ramp(0.3, 0.7, noise(u * 90.0, v * 9.0, 5)) * (1.0 - at.over), 0.0)
+    ring = jnp.where(is_cone, 1.0 - 0.55 * surface.ring, 1.0 + 0.5 * surface.ring)
+    wax = jnp.where(is_cone, bloom * ramp(0.3, 0.7, noise(u * 90.0, v * 9.0, 5)) * (1.0 - surface.over), 0.0)
     scale = dark * ring
     mixed = [(b + (o - b) * cover) * scale for b, o in zip(base, over)]
     return [channel + (0.62 - channel) * 0.45 * wax for channel in mixed], gloss * (1.0 - 0.5 * blotches)

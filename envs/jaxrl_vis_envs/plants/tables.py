@@ -92,22 +92,22 @@ def build_view(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float
     triangle_list, triangle_ranges = _lists(triangle_boxes, columns, lines)
     line, column = np.divmod(np.arange(columns * lines), columns)
     return View(
-        cones=_padded(cones, _CONES),
-        cone_instance=_padded(surfaces.cone_stalk[visible_cones], _CONES),
-        cone_material=_padded(surfaces.cone_material[visible_cones], _CONES),
-        triangles=_padded(triangles, _TRIANGLES),
-        triangle_instance=_padded(surfaces.triangle_instance[visible_triangles], _TRIANGLES),
-        triangle_material=_padded(surfaces.triangle_material[visible_triangles], _TRIANGLES),
-        materials=_padded(surfaces.materials, _MATERIALS),
+        cones=_pad_rows(cones, _CONES),
+        cone_instance=_pad_rows(surfaces.cone_stalk[visible_cones], _CONES),
+        cone_material=_pad_rows(surfaces.cone_material[visible_cones], _CONES),
+        triangles=_pad_rows(triangles, _TRIANGLES),
+        triangle_instance=_pad_rows(surfaces.triangle_instance[visible_triangles], _TRIANGLES),
+        triangle_material=_pad_rows(surfaces.triangle_material[visible_triangles], _TRIANGLES),
+        materials=_pad_rows(surfaces.materials, _MATERIALS),
         tiles=(tile * np.stack([column, line], axis=1)).astype(np.int32),
         cone_ranges=cone_ranges,
         triangle_ranges=triangle_ranges,
-        cone_list=_padded(cone_list, _LIST),
-        triangle_list=_padded(triangle_list, _LIST),
+        cone_list=_pad_rows(cone_list, _LIST),
+        triangle_list=_pad_rows(triangle_list, _LIST),
     )
 
 
-def _padded(table: np.ndarray, minimum: int) -> np.ndarray:
+def _pad_rows(table: np.ndarray, minimum: int) -> np.ndarray:
     """Append zero rows to a table, up to ``minimum`` rows or the smallest sufficient multiple of it by a power of two."""
     size = minimum
     while size < len(table):

@@ -109,7 +109,7 @@ class FetchReach(FetchArm):
         """
         self._has_cross_hair = isinstance(config, VisualFetchReachConfig) and config.cross_hair
         self._is_their_view = self.select_camera(config) == _THEIR_CAMERA
-        change = _add_cross_hair if self._has_cross_hair else _add_their_camera if self._is_their_view else None
+        change = _add_cross_hair if self._has_cross_hair else _add_original_camera if self._is_their_view else None
         mj_model = mjx_model.load_model("fetch_reach.xml", change)
         if isinstance(config, VisualFetchReachConfig) and config.finger_colour == "grey":
             for name in ("left_finger", "right_finger"):
@@ -199,7 +199,7 @@ def _add_cross_hair(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_their_camera(spec: mujoco.MjSpec) -> None:
+def _add_original_camera(spec: mujoco.MjSpec) -> None:
     """Add the camera of contrastive RL's task, fixed in the world."""
     azimuth, elevation = np.deg2rad([_AZIMUTH, _ELEVATION])
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

@@ -42,7 +42,7 @@ _PLAIN = (0.88, 0.88, 0.9, 1.0)  # colour of a finger's last link, if not the fi
 _MEETING_OFFSET = (0.0, -0.09, 0.05)
 _MEETING_SCATTER = 0.005
 _MEETING_DISTANCE = 0.005
-_RETURN_SHARE = 0.1
+_RETURN_FRACTION = 0.1
 _IK_STEPS = 30
 _IK_DAMPING = 1e-3  # m
 _IK_LARGEST_STEP = 0.2  # rad
@@ -211,7 +211,7 @@ class HandReach(MjxGoalEnv):
         near_meeting = meeting - _MEETING_DISTANCE * away / jnp.linalg.norm(away, axis=-1, keepdims=True)
         finger = jax.random.randint(finger_key, (), 0, _THUMB)
         meets = (jnp.arange(len(_FINGERTIPS)) == finger) | (jnp.arange(len(_FINGERTIPS)) == _THUMB)
-        meets &= jax.random.uniform(return_key) >= _RETURN_SHARE
+        meets &= jax.random.uniform(return_key) >= _RETURN_FRACTION
         return jnp.where(meets[:, None], near_meeting, start)
 
 

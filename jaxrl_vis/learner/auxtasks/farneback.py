@@ -106,15 +106,15 @@ def _mean_in_window(plane: jax.Array, window: int) -> jax.Array:
 
 def _product(left: np.ndarray, plane: jax.Array, right: np.ndarray) -> jax.Array:
     """Compute ``left @ plane @ right`` for a plane [H, W]."""
-    return _by_rows(left, _by_columns(plane, right))
+    return _map_rows(left, _map_columns(plane, right))
 
 
 # In full float32: determinants are differences of large numbers.
-def _by_columns(plane: jax.Array, right: np.ndarray) -> jax.Array:
+def _map_columns(plane: jax.Array, right: np.ndarray) -> jax.Array:
     return jnp.matmul(plane, right.astype(np.float32), precision=jax.lax.Precision.HIGHEST)
 
 
-def _by_rows(left: np.ndarray, plane: jax.Array) -> jax.Array:
+def _map_rows(left: np.ndarray, plane: jax.Array) -> jax.Array:
     return jnp.matmul(left.astype(np.float32), plane, precision=jax.lax.Precision.HIGHEST)
 
 
@@ -180,9 +180,9 @@ def _expansions(image: jax.Array, settings: Settings) -> list[Planes]:
     for scale in _scales(height, width, settings):
         value_y, slope_y, curvature_y = _fits(round(height * scale), height, scale, *shape)
         value_x, slope_x, curvature_x = _fits(round(width * scale), width, scale, *shape)
-        value, slope, curvature = (_by_columns(image, fit.T) for fit in (value_x, slope_x, curvature_x))
+        value, slope, curvature = (_map_columns(image, fit.T) for fit in (value_x, slope_x, curvature_x))
         pairs = (value_y, slope), (slope_y, value), (value_y, curvature), (curvature_y, value), (0.5 * slope_y, slope)
-        expansions.append(tuple(_by_rows(of_rows, planes) for of_rows, planes in pairs))
+        expansions.append(tuple(_map_rows(of_rows, planes) for of_rows, planes in pairs))
     return expansions
 
 

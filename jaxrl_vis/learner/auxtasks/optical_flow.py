@@ -42,12 +42,12 @@ def make(spec: Spec) -> AuxTask:
     )
 
 
-_BYTES_PER_PIXEL, _LARGEST_BYTE = 16.0, 255.0
+_BYTES_PER_PIXEL, _MAX_BYTE = 16.0, 255.0
 
 
 def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
     """Quantize strengths [...] for the replay: uint8, in steps of 1/16 pixel up to 15.9; stretched masks in 255 steps."""
-    return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _LARGEST_BYTE).astype(jnp.uint8)
+    return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _MAX_BYTE).astype(jnp.uint8)
 
 
 def from_bytes(flow: jax.Array, stretch: bool = False) -> jax.Array:
@@ -56,7 +56,7 @@ def from_bytes(flow: jax.Array, stretch: bool = False) -> jax.Array:
 
 
 def _scale(stretch: bool) -> float:
-    return _LARGEST_BYTE if stretch else _BYTES_PER_PIXEL
+    return _MAX_BYTE if stretch else _BYTES_PER_PIXEL
 
 
 def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:

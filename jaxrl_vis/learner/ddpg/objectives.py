@@ -105,20 +105,20 @@ def _together(auxiliary: Auxiliary, encoded: Latents | dict[str, jax.Array]) -> 
     return _with_others(auxiliary, encoded[_MAIN_READS], before, others)
 
 
-def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
+def _next_latents(networks: Networks, copies: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
     """Encode the next observation and the goal for the target actor and the target critic: [2, B, latent] each.
 
     Heads take them in this order; inputs are stored as (goal, after). ``latents`` are the online critic's.
     """
     if networks.config.network.target_encoder:
-        of_critic = _encode(networks, now.target_critic, inputs, "goal", "after")[::-1]
+        of_critic = _encode(networks, copies.target_critic, inputs, "goal", "after")[::-1]
     else:
         after = latents.after
-        after = _encode(networks, now.critic, inputs, "after") if after is None else after[None]
+        after = _encode(networks, copies.critic, inputs, "after") if after is None else after[None]
         of_critic = jnp.concatenate([after, latents.pair[1:]])
     if networks.config.network.encoders == "shared":
         return of_critic, of_critic
-    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, "goal", "after")[::-1]
+    of_actor = _encode(networks, networks.with_encoder(copies.target_actor, copies.actor), inputs, "goal", "after")[::-1]
     return of_actor, of_critic
 
 
@@ -148,7 +148,7 @@ class Objectives:
         return self.shards.count > 1 and (weighting.needs != "losses" or weighting.reads_losses)
 
     def critic_gradient(
-        self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch, noise: jax.Array | None = None
+        self, copies: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch, noise: jax.Array | None = None
     ) -> Callable[[Params, WeightingState], Weighted]:
         """Build the function that computes the critic's losses and gradient; ``extra`` is (latents, values [B], keep [B]).
 
@@ -162,7 +162,7 @@ class Objectives:
         def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
             latents = _together(self.auxiliary, encoded)
-            target = self._target(now, inputs, latents, batch, noise)
+            target = self._target(copies, inputs, latents, batch, noise)
             values = networks.values(critic, latents.pair, batch.action)
             value = _minimum(values)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
@@ -184,15 +184,17 @@ class Objectives:
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
 
-    def _target(self, now: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch, noise: jax.Array | None) -> jax.Array:
+    def _target(
+        self, copies: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch, noise: jax.Array | None
+    ) -> jax.Array:
         """Compute the critic's targets [B]; ``noise`` [B, A], unless None, is added to the next actions."""
         assert batch.reward is not None
         networks, resolved = self.networks, self.resolved
-        of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
-        action = networks.act(now.target_actor, of_actor)
+        of_actor, of_critic = _next_latents(networks, copies, inputs, jax.lax.stop_gradient(latents))
+        action = networks.act(copies.target_actor, of_actor)
         if noise is not None:
             action = jnp.clip(action + noise, -1.0, 1.0)
-        value_tp1 = _minimum(networks.values(now.target_critic, of_critic, action))
+        value_tp1 = _minimum(networks.values(copies.target_critic, of_critic, action))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 

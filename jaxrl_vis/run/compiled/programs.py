@@ -124,14 +124,14 @@ class Programs:
         """Names of the programs that a run needs, slowest to compile first: they compile while others are traced."""
         return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "broken_leaves", "keys")))
 
-    def compile(self, names: Sequence[str] | None = None, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    def compile(self, names: Sequence[str] | None = None, concurrent_work: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Compile programs in parallel, including the small operations of saving and evaluating.
 
         Each function is traced once, here, and the programs compiled here are the ones that run later.
 
         Args:
             names: Names of the programs; None for all that a run needs. Compiled ones are skipped.
-            meanwhile: Called after tracing, while XLA compiles.
+            concurrent_work: Called after tracing, while XLA compiles.
 
         Returns:
             All programs compiled so far, by name.
@@ -154,7 +154,7 @@ class Programs:
                             else:
                                 lowered = function.lower(*arguments)
                         futures[name] = pool.submit(lowered.compile)
-                    self._finish(missing, meanwhile)
+                    self._finish(missing, concurrent_work)
                     self._keep({name: future.result() for name, future in futures.items()})
                 if traces is not None:
                     traces.write()
@@ -177,12 +177,12 @@ class Programs:
             return None
         return TraceCache(Path(cache) / "programs", identity, self.shapes, JIT_OPTIONS)
 
-    def _finish(self, names: Sequence[str], meanwhile: Callable[[], None]) -> None:
+    def _finish(self, names: Sequence[str], concurrent_work: Callable[[], None]) -> None:
         """Do all work that can overlap with XLA's compilation."""
         if "init" in names and not distributed.are_several():
             # Extracting the data of keys, as in saving, is also a compiled program.
             to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
-        meanwhile()
+        concurrent_work()
 
     def _keep(self, compiled: dict[str, Any]) -> None:
         """Store compiled programs, and compile the stacking of their metrics."""

@@ -39,7 +39,7 @@ from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_default_device, use_gpu_kernels
 
 VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
-MOST_FILES = 300
+MAX_FILES = 300
 """Maximum number of files, of half a megabyte each; the oldest are deleted."""
 
 _PACKAGES = ("jaxrl_vis", "jaxrl_vis_envs")
@@ -129,7 +129,7 @@ class TraceCache:
             for name, data in self._fresh.items() if self._is_private() else ():
                 with replacing(self._path(name), durable=False, mode=0o600) as file:
                     file.write(self._digest(name, data) + data)
-            for path in sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-MOST_FILES]:
+            for path in sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-MAX_FILES]:
                 path.unlink(missing_ok=True)
         self._fresh.clear()
 

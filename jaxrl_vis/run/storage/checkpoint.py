@@ -364,11 +364,11 @@ class Checkpoints:
             RequestError: A checkpoint has another structure.
         """
         self._recover()
-        return self._newest_good(template, with_rest=True)
+        return self._newest_good(template, with_replay=True)
 
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
         """Restore the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
-        return self._newest_good(template, with_rest=False, only=iteration)
+        return self._newest_good(template, with_replay=False, requested=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         """Return the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
@@ -396,17 +396,19 @@ class Checkpoints:
         except Unusable as damage:
             raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
 
-    def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
+    def _newest_good(self, template: LoopState, with_replay: bool, requested: int | None = None) -> Restored | None:
         # A light checkpoint is smaller, and a recent one may be deleted by the run while it is read.
-        tiers = _PRECEDENCE if with_rest else (LIGHT, FULL)
-        candidates = [(iteration, tier) for tier in tiers for iteration in self.iterations(tier) if only in (None, iteration)]
+        tiers = _PRECEDENCE if with_replay else (LIGHT, FULL)
+        candidates = [
+            (iteration, tier) for tier in tiers for iteration in self.iterations(tier) if requested in (None, iteration)
+        ]
         for iteration, tier in sorted(candidates, key=lambda item: (-item[0], tiers.index(item[1]))):
             try:
                 if tier == RECENT:
                     loop, progress = self.recent.restore(iteration, template)
                     return Restored(RECENT, iteration, loop.train, loop, progress)
                 manifest = self._read_manifest(tier, iteration)
-                return self._restored(tier, iteration, template, with_rest and tier == FULL, manifest)
+                return self._restored(tier, iteration, template, with_replay and tier == FULL, manifest)
             except Unusable as damage:
                 if (tier, iteration) not in self._reported:
                     self._echo(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
@@ -425,10 +427,12 @@ class Checkpoints:
                 raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
         return manifest
 
-    def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
+    def _restored(
+        self, tier: str, iteration: int, template: LoopState, with_replay: bool, manifest: dict[str, Any]
+    ) -> Restored:
         import orbax.checkpoint as ocp
 
-        templates = {"train": template.train} | ({"rest": state_without_learner(template)} if with_rest else {})
+        templates = {"train": template.train} | ({"rest": state_without_learner(template)} if with_replay else {})
         specs = {name: host_specs(tree) for name, tree in templates.items()}
         where = self._folder / tier / str(iteration)
         for name, spec in specs.items():
@@ -442,7 +446,7 @@ class Checkpoints:
                 if not is_intact(array, manifest["items"][name][leaf_name]):
                     raise Unusable(f"wrong checksum of {leaf_name}")
             trees[name] = rebuild(tree, read[name])
-        loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
+        loop = LoopState(train=trees["train"], **trees["rest"]) if with_replay else None
         return Restored(tier, iteration, trees["train"], loop, manifest["progress"])
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:

@@ -28,7 +28,7 @@ _POLL_S = 0.1
 # Errors of file systems without locks: Lustre and FUSE, NFS without its lock daemon, 9p.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, *(getattr(errno, name, None) for name in ("ENOTSUP", "EOPNOTSUPP"))}
 _MARKER = "filelock/"  # first bytes of a file that is itself the lock
-_MEND = "wait for it, stop it, or choose another --run-dir"
+_HINT = "wait for it, stop it, or choose another --run-dir"
 
 
 class FolderGoneError(StorageError):
@@ -175,7 +175,7 @@ def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) ->
     lock.release()
 
 
-def _lock_by_marker(path: Path, held: Held, echo: Callable[[str], None], stack: contextlib.ExitStack) -> None:
+def _lock_by_marker(path: Path, lock: Held, echo: Callable[[str], None], stack: contextlib.ExitStack) -> None:
     """Use the file itself as the lock until the end of ``stack``.
 
     Raises:
@@ -188,7 +188,7 @@ def _lock_by_marker(path: Path, held: Held, echo: Callable[[str], None], stack: 
         path,
         lease_duration=LEASE_S,
         heartbeat_interval=HEARTBEAT_S,
-        on_compromise=held.note_loss,
+        on_compromise=lock.note_loss,
         thread_local=False,
     )
     last_touch: tuple[float, int] | None = None
@@ -214,7 +214,7 @@ def _lock_by_marker(path: Path, held: Held, echo: Callable[[str], None], stack: 
         except filelock.LeaseSettingsMismatch:
             raise _in_use(path, _read(path)) from None
     stack.callback(lease.release)
-    held.watch(path)
+    lock.watch(path)
     if before:
         echo(f"took over {path} of {_holder(before)}, which is dead")
 
@@ -268,7 +268,7 @@ def _is_alive_or_elsewhere(text: str) -> bool:
 
 
 def _in_use(path: Path, text: str, hint: str = "") -> RequestError:
-    return RequestError(f"{path.parent} is in use by {_holder(text)}: {hint}{_MEND}")
+    return RequestError(f"{path.parent} is in use by {_holder(text)}: {hint}{_HINT}")
 
 
 def _unwritable(folder: Path, error: OSError) -> RequestError:

@@ -32,14 +32,14 @@ from jaxrl_vis.types import LoopState, ReplayState
 SCHEMA = 1
 ANY_RUN = "*"
 _KEPT = 2
-_MOST_BYTES = 2**30  # maximum size of a replay
-_SHARE = 0.03  # maximum fraction of the time spent on saving: about every iteration of `cpu` on two cores
+_MAX_BYTES = 2**30  # maximum size of a replay
+_FRACTION = 0.03  # maximum fraction of the time spent on saving: about every iteration of `cpu` on two cores
 _EPISODES = "replay.episodes."
 
 
 def is_cheap(replay: ReplayState) -> bool:
     """Return True if a replay (arrays or shapes) is cheap to keep up to date in files, in time and disk space."""
-    return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
+    return jax.default_backend() == "cpu" and num_bytes(replay) <= _MAX_BYTES
 
 
 class Unusable(Exception):
@@ -70,7 +70,7 @@ class Recent:
         Args:
             in_any_case: Ignore the time since the last save.
         """
-        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
+        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _FRACTION)
 
     def iterations(self) -> list[int]:
         """Return the iterations of this run's states, ascending, including damaged ones."""

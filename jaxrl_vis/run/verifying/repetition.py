@@ -81,21 +81,23 @@ class Repeater:
         self.repeated: set[int] = set()
         self.without_evaluation: set[int] = set()
 
-    def repeat(self, name: str, begin: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]) -> None:
+    def repeat(
+        self, name: str, first_iteration: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]
+    ) -> None:
         """Repeat iterations and compare the results.
 
         Args:
             name: Name of the starting point, for messages.
-            begin: Iterations completed at the start.
+            first_iteration: Iterations completed at the start.
             progress: Progress of the host at the start.
             loop: State at the start; donated.
             compared_iterations: Iterations whose rows are compared, ascending; the repetition ends at the last one.
         """
-        self._echo(f"repeating iterations {begin + 1} to {compared_iterations[-1]} from {name} ...")
-        history = {begin - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
-        if begin in compared_iterations:
-            self._compare(name, begin, loop, history)
-        for iteration in range(begin + 1, compared_iterations[-1] + 1):
+        self._echo(f"repeating iterations {first_iteration + 1} to {compared_iterations[-1]} from {name} ...")
+        history = {first_iteration - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
+        if first_iteration in compared_iterations:
+            self._compare(name, first_iteration, loop, history)
+        for iteration in range(first_iteration + 1, compared_iterations[-1] + 1):
             loop, values = self._programs.train_iteration(loop)
             read = self._programs.pending(values).read_per_seed(len(self._expected.seeds))
             broken = [key for key, counts in read.items() if key.startswith(GUARD) and any(counts)]
@@ -240,8 +242,8 @@ def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tu
             yield name, value, again
 
 
-def _relative(value: Any, again: Any) -> float:
+def _relative(value: Any, repeated: Any) -> float:
     """Return the difference of two numbers relative to the larger one; infinite if either value is not numeric."""
-    if not (isinstance(value, int | float) and isinstance(again, int | float)):
+    if not (isinstance(value, int | float) and isinstance(repeated, int | float)):
         return math.inf
-    return abs(value - again) / max(abs(value), abs(again)) if value != again else 0.0
+    return abs(value - repeated) / max(abs(value), abs(repeated)) if value != repeated else 0.0

@@ -289,16 +289,16 @@ class _Verifier:
         self._echo("compiling ...")
         check_compiled(self._programs.compile(), is_allocated=False, layout=layout)
 
-    def _plan(self, begin: int, progress: Progress, iterations: int | None) -> list[int]:
-        """List iterations whose rows can be repeated from a state after ``begin`` iterations."""
-        mark, first = progress.replay_lost_at, begin if progress.evaluation_due else begin + 1
+    def _plan(self, first_iteration: int, progress: Progress, iterations: int | None) -> list[int]:
+        """List iterations whose rows can be repeated from a state after ``first_iteration`` iterations."""
+        mark, first = progress.replay_lost_at, first_iteration if progress.evaluation_due else first_iteration + 1
         # Up to the next loss of the replay: what follows it started from a state that was not saved.
-        losses = [row[LOST] for row in self._rows if LOST in row and row[LOST] != mark and row[LOST] >= begin]
+        losses = [row[LOST] for row in self._rows if LOST in row and row[LOST] != mark and row[LOST] >= first_iteration]
         last = min(losses, default=math.inf)
         compared_iterations = sorted({row["iteration"] for row in self._rows if first <= row["iteration"] <= last})
         if iterations is None:
             return compared_iterations[:EVALUATIONS]
-        near = [number for number in compared_iterations if number <= begin + iterations]
+        near = [number for number in compared_iterations if number <= first_iteration + iterations]
         return near or compared_iterations[:1]
 
     def _print_remaining(self, repeated: set[int]) -> None:

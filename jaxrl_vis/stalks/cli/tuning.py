@@ -95,12 +95,13 @@ def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, 
 
 def _split(options: DetectorTraining, names: list[str], examples: list[Example], echo: Any) -> Split:
     """Split the images by photograph into training, early-stopping and test sets, and report their sizes."""
-    from jaxrl_vis.stalks.phenotyping.training.photographs import FEWEST, photographs_of, split
+    from jaxrl_vis.stalks.phenotyping.training.photographs import MIN_IMAGES, photographs_of, split
 
     parts = split(photographs_of(names, [example.image for example in examples]), options.seed)
     if not parts.test:
         echo(
-            f"{parts.photographs} photographs, fewer than {FEWEST}: none is held out, so nothing tells how good the weights are"
+            f"{parts.photographs} photographs, fewer than {MIN_IMAGES}: none is held out, "
+            "so nothing tells how good the weights are"
         )
     else:
         echo(

@@ -159,12 +159,12 @@ def _is_whole(record: dict[str, Any]) -> bool:
     return known and record["skipped"] == []
 
 
-def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
+def _record(folder: PlotFolder, distances: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
     """Compute the record of one run, and write its overlay.
 
     Args:
         folder: Folder of the run.
-        driven: Distance driven at each pair by the pair's name, m; None if unknown.
+        distances: Distance driven at each pair by the pair's name, m; None if unknown.
         find: Function that returns the mask of a pair.
         request: The request.
 
@@ -180,7 +180,7 @@ def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, req
         except Unusable as problem:
             skipped.append({"run": folder.name, "pair": pair.name, "why": str(problem)})
             continue
-        views.append(View(number, left, right, None if driven is None else driven.get(pair.name)))
+        views.append(View(number, left, right, None if distances is None else distances.get(pair.name)))
     if not views:
         return {"row": _row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
     perception = perceive(

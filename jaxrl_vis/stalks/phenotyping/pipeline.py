@@ -112,7 +112,7 @@ def run(
         RequestError: The folder holds other results, or a plot's odometry cannot be read.
         OSError: A file cannot be written.
     """
-    driven = read_odometries(plots, request.speed)
+    distances = read_odometries(plots, request.speed)
     claim(
         request.out,
         "plots",
@@ -137,14 +137,14 @@ def run(
             "from top to bottom; on no real row."
         )
     with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
-        return _run(plots, find, request, driven, page, done, echo, run_all)
+        return _run(plots, find, request, distances, page, done, echo, run_all)
 
 
 def _run(
     plots: list[PlotFolder],
     find: Find,
     request: Request,
-    driven: dict[str, dict[str, float] | None],
+    distances: dict[str, dict[str, float] | None],
     page: Page,
     done: Callable[[str, int, int], None],
     echo: Callable[[str, str], None],
@@ -172,7 +172,7 @@ def _run(
             for pair, record in zip(plot.pairs, records)
             if "skipped" in record
         ]
-        result = _finish(plot, records, driven[plot.name], request, run_all)
+        result = _finish(plot, records, distances[plot.name], request, run_all)
         if result.row["stalks"] == "":
             echo(plot.name, result.row["flag"] + (f" ({result.why})" if result.why else ""))
         page.add(result)
@@ -184,10 +184,10 @@ def _run(
     return rows, skipped
 
 
-def _missing_count_reason(flag: str, frames: list[list[Sighting]], plot: PlotFolder, driven: dict[str, float] | None) -> str:
+def _missing_count_reason(flag: str, frames: list[list[Sighting]], plot: PlotFolder, distances: dict[str, float] | None) -> str:
     """Return an explanation beyond the flag of why a plot has no count; empty if there is none."""
     if flag == NO_ODOMETRY:
-        return odometry_fault(plot, driven, plot.pairs) or ""
+        return odometry_fault(plot, distances, plot.pairs) or ""
     if PARTLY_SEEN in flag:
         return "its pairs do not show all of the row that the robot passed: take some before its beginning and beyond its end"
     if flag == NO_FIT:
@@ -273,7 +273,7 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
 
 
 def _finish(
-    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, run_all: UnorderedMap
+    plot: PlotFolder, records: list[dict[str, Any]], distances: dict[str, float] | None, request: Request, run_all: UnorderedMap
 ) -> PlotResult:
     """Track the stalks of a plot, compute its table rows, and render its overlays."""
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
@@ -281,16 +281,16 @@ def _finish(
     frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
-    known = driven is not None and all(pair.name in driven for pair, _ in usable)
+    known = distances is not None and all(pair.name in distances for pair, _ in usable)
     flag, tracks, start = _missing_outputs(len(usable), calibration), [], 0.0
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     drive = None
     why = _lens_fault(request, frames, [record for _, record in usable], plot.name)
     if why is not None:
         flag = UNTRIED
-    elif calibration is not None and driven is not None and known and len(usable) >= 2:
+    elif calibration is not None and distances is not None and known and len(usable) >= 2:
         first, last = np.median([record["columns"] for _, record in usable], axis=0)
-        driven_at = np.array([driven[pair.name] for pair, _ in usable])
+        driven_at = np.array([distances[pair.name] for pair, _ in usable])
         drive = follow_either_way(frames, driven_at, calibration, (float(first), float(last)))
         flag = NO_FIT
     if drive is None or not drive.fits:
@@ -305,7 +305,7 @@ def _finish(
         row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
     width = usable[0][1]["size"][1] if usable else 0
-    why = why or (_missing_count_reason(row["flag"], frames, plot, driven) if row["stalks"] == "" else "")
+    why = why or (_missing_count_reason(row["flag"], frames, plot, distances) if row["stalks"] == "" else "")
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
 
 
@@ -355,9 +355,9 @@ def _draw_overlays(
         write_atomically(index, json.dumps(shown) + "\n")
 
 
-def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
+def _draw_overlay(plot: str, job: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
     """Render and write the overlay of one pair."""
-    target, pair, frame, names = asked
+    target, pair, frame, names = job
     write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
 
 

@@ -21,13 +21,13 @@ BUILT_IN = ("indicator", "indicator_tolerance", "features")
 """Built-in rewards, which need neither true states nor a run."""
 
 
-def _as_batch(images: jax.Array, goals: jax.Array) -> Batch:
+def _make_batch(images: jax.Array, goals: jax.Array) -> Batch:
     """Return a batch with ``images`` [B, ...] as achieved observations, and placeholders for actions and true states."""
     nothing = jnp.zeros((len(images), 1))
     return Batch(jnp.stack([images, goals, images]), nothing, nothing, nothing)
 
 
-def _of_run(run_dir: Path, trust: bool) -> Reward:
+def _reward_of_run(run_dir: Path, trust: bool) -> Reward:
     """Return the reward of the model that the first seed of a run has trained, scaled to [0, 1].
 
     Raises:
@@ -52,7 +52,7 @@ def _of_run(run_dir: Path, trust: bool) -> Reward:
     def reward(images: jax.Array, goals: jax.Array) -> jax.Array:
         if images.shape[1:] != shape:
             raise RequestError(f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}: audit those")
-        batch = _as_batch(images, goals)
+        batch = _make_batch(images, goals)
         inputs = networks.prepare_batch(scaling, batch)
         return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - low) / (high - low)
 
@@ -72,9 +72,9 @@ def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
     """
     if name in BUILT_IN:
         function = make_reward(config, METHODS[name])
-        return lambda images, goals: function(_as_batch(images, goals), images, 1.0, 0.0)
+        return lambda images, goals: function(_make_batch(images, goals), images, 1.0, 0.0)
     if (Path(name) / "config.json").exists():
-        return _of_run(Path(name), trust)
+        return _reward_of_run(Path(name), trust)
     if ":" not in name:
         others = "run folders and module:function are rewards, too"
         raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} ({others})")

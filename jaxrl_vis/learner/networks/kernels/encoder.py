@@ -33,13 +33,13 @@ from jaxrl_vis.learner.networks.kernels.patches import LEVELS, padded_channels, 
 
 __all__ = ["LEVELS", "encode", "is_available", "make_weights", "prepare", "supports"]
 
-_MOST_CHANNELS = 16
+_MAX_CHANNELS = 16
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
     """Return True if the kernel supports encoders with these output channels, and images [C, H, W] of this shape."""
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
-    return len(filters) >= LEVELS and powers and shape[0] <= _MOST_CHANNELS
+    return len(filters) >= LEVELS and powers and shape[0] <= _MAX_CHANNELS
 
 
 def make_weights(params: dict[str, Any], channels: int) -> Weights:

@@ -114,21 +114,21 @@ def start_drive(joints: jax.Array) -> Drive:
     return Drive(jnp.zeros(3, jnp.float32), joints[1:3], jnp.zeros(2, jnp.float32))
 
 
-def drive(state: Drive, joints: jax.Array, velocity: jax.Array, wanted: jax.Array, gains: Gains) -> tuple[Drive, jax.Array]:
+def drive(state: Drive, joints: jax.Array, velocity: jax.Array, targets: jax.Array, gains: Gains) -> tuple[Drive, jax.Array]:
     """Advance the controllers by one period.
 
     Args:
         state: State of the controllers.
         joints: [3], positions of slide, shoulder and elbow, m and rad.
         velocity: [3], their velocities, m/s and rad/s.
-        wanted: [3], their setpoints, m and rad.
+        targets: [3], their setpoints, m and rad.
         gains: Gains of the controllers.
 
     Returns:
         The new state, and the generalised forces [3] on the joints, N and N m.
     """
     period = 1.0 / RATE
-    error = wanted - joints
+    error = targets - joints
     integral = jnp.clip(state.integral + period * error, -0.05, 0.05)
     parts = [jnp.asarray(part, jnp.float32) for part in gains[:5]]
     proportional, integrating, derivative, spring, max_torque = parts

@@ -111,7 +111,7 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
 
     def draw(shape: Shape, target: jax.Array) -> jax.Array:
         model = bending.fit(arms.model, arms.layout, shape)
-        data = bending.placed(arms.rest, arms.layout, shape)
+        data = bending.place_stands(arms.rest, arms.layout, shape)
         joints = stalk_arm.joints_at(target, 1.0)
         return image(model, mjx_model.kinematics(model, data.replace(qpos=data.qpos.at[: stalk_arm.ARM_JOINTS].set(joints))))
 

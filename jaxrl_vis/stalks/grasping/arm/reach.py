@@ -34,7 +34,7 @@ _POINTS_A_CALL = 5
 INTERVAL = _STEPS_A_POINT / control.RATE
 """Time between two points of a path, s."""
 LOOK = _POINTS_A_CALL * INTERVAL
-"""Time between two calls of ``look``, s."""
+"""Time between two calls of ``observer``, s."""
 _MIN_ARMS = 8  # minimum batch size of a compiled program
 _TOUCH = 0.0015  # m, a jaw nearer to a stalk presses on it: soft contacts give way by some tenths of a millimetre
 
@@ -67,7 +67,7 @@ class ReachResult:
 
 
 class ArmView(NamedTuple):
-    """True state of B reaches at one time, from which a ``look`` function may simulate detections.
+    """True state of B reaches at one time, from which a ``observer`` function may simulate detections.
 
     Attributes:
         time: Time since the start, s.
@@ -147,7 +147,7 @@ def reach(
     timing: Timing | None = None,
     gains: Gains | None = None,
     sides: np.ndarray | None = None,
-    look: Callable[[ArmView], np.ndarray] | None = None,
+    observer: Callable[[ArmView], np.ndarray] | None = None,
 ) -> ReachResult:
     """Simulate reaches: each arm moves to its target and closes its jaws there.
 
@@ -161,8 +161,8 @@ def reach(
         gains: Gains of the controllers; None for the default.
         sides: [B], 1 or -1, solution of the inverse kinematics of each arm (see `approach.room`); None for
             `control.better_side`.
-        look: Function called every `LOOK` s during the reach and while the jaws close, which returns new targets [B, 3], m in
-            the plot's frame, with NaN to keep the old one; None for an open loop.
+        observer: Function called every `LOOK` s during the reach and while the jaws close, which returns new targets [B, 3],
+            m in the plot's frame, with NaN to keep the old one; None for an open loop.
 
     Returns:
         Results of the reaches. Arms whose target is out of reach are not sent: they hold and touch nothing.
@@ -197,8 +197,8 @@ def reach(
     scene, reaching = start(shape, keys, winds, side[fill])
     parts, aimed_at = [], targets
     for call in range(_calls(timing.reach) + _calls(timing.close)):
-        if look is not None and call:
-            targets = _looked(look, stands, targets, can, call * LOOK, parts[-1])
+        if observer is not None and call:
+            targets = _looked(observer, stands, targets, can, call * LOOK, parts[-1])
         if call < _calls(timing.reach):
             aimed_at = targets
         reaching, report = advance(scene, reaching, (targets - stands.origin)[fill])
@@ -220,11 +220,11 @@ def reach(
 
 
 def _looked(
-    look: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
+    observer: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
     """Return the targets [B, 3] after another look, unchanged where it gives none or one that is out of reach."""
     places = np.where(stands.present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
-    updated = np.asarray(look(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
+    updated = np.asarray(observer(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
     if updated.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
     there = np.all(np.isfinite(updated), axis=-1)
@@ -262,7 +262,7 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
 def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
     """Return the initial state of an arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
     model = bending.fit(arms.model, arms.layout, scene.shape)
-    data = bending.placed(arms.rest, arms.layout, scene.shape)
+    data = bending.place_stands(arms.rest, arms.layout, scene.shape)
     swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
     joints = stalk_arm.joints_at(jnp.asarray(home, jnp.float32), scene.side)
     data = mjx_model.kinematics(model, data.replace(qpos=(data.qpos + swayed).at[: stalk_arm.ARM_JOINTS].set(joints)))
@@ -305,7 +305,7 @@ def _advance(
 
 
 def period(
-    arms: Arms, model: Any, scene: Scene, reaching: Reaching, wanted: jax.Array, is_closing: jax.Array, gains: Gains
+    arms: Arms, model: Any, scene: Scene, reaching: Reaching, targets: jax.Array, is_closing: jax.Array, gains: Gains
 ) -> Reaching:
     """Advance controllers and physics by one control period.
 
@@ -314,12 +314,14 @@ def period(
         model: Model with the stalks of the scene (`bending.fit`).
         scene: Constants of the reach.
         reaching: State of the arm.
-        wanted: [3], setpoint of the grip, m in the frame of the stand.
+        targets: [3], setpoint of the grip, m in the frame of the stand.
         is_closing: [] bool, whether the jaws close.
         gains: Gains of the controllers.
     """
     data = reaching.data
-    memory, forces = control.drive(reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(wanted, scene.side), gains)
+    memory, forces = control.drive(
+        reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(targets, scene.side), gains
+    )
     jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
     wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
     none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)

@@ -87,7 +87,7 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     low, high = driven_stretch(plot)
     masts, points = mast_positions(perception), perception.points
     chosen = choose_nearest(points, masts, POLICY_HEIGHTS) if for_policy else choose(points, masts)
-    targets = np.array([_from_stop(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
+    targets = np.array([_stop_plans(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
     places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
     places = places.reshape(len(targets), len(plot.measured), 2)
     stalks = match(targets[:, :2], places, RADIUS)
@@ -127,7 +127,7 @@ def mast_positions(perception: Perception) -> np.ndarray:
     return np.array([motion(np.array([0.0, MAST_DISTANCE, 0.0])) for motion in perception.to_last]) * [1.0, 1.0, 0.0]
 
 
-def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
+def _stop_plans(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
     """Map the chosen point, or ``points`` [..., 3], to the plot's frame by the stitches and the true pose at the stop.
 
     Points are in the robot frame of the last pair, m. The result [..., 3] contains the errors of the stitches.
@@ -140,7 +140,7 @@ def _detected_around(choice: Choice, x: float, target: np.ndarray, scene: Scene,
     """Return the detected stalks around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
     height = float(choice.point[2])
     ends = np.array([point.at_height(np.array([height, height + _AROUND])) for point in perception.points])
-    ends = _from_stop(choice, scene, perception, ends)
+    ends = _stop_plans(choice, scene, perception, ends)
     return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], stalk_radii(perception.points, height), x, target, POLICY_STALKS)
 
 
@@ -227,7 +227,7 @@ def execute_plans(
             result = reach_by_policy(stands, concatenated(detected), targets, policy, keys, wind_mm)
         else:
             look = follow(stands, stalks, again) if loop == "again" else None
-            result = reach(stands, targets, keys, wind_mm, sides=sides, look=look)
+            result = reach(stands, targets, keys, wind_mm, sides=sides, observer=look)
         attempts += to_attempts(stands, result, numbers, stalks, errors, refused)
     return attempts
 
@@ -267,7 +267,7 @@ def to_attempts(
     return attempts
 
 
-def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[ArmView], np.ndarray]:
+def follow(stands: Stands, stalks: np.ndarray, redetected: np.ndarray) -> Callable[[ArmView], np.ndarray]:
     """Return a ``look`` function for `reach` that simulates detecting the targets [B, 3] again on the way.
 
     The pair at the stop does not move. It detects the stalk at its true position plus the error that the pair alone makes with
@@ -278,11 +278,11 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[A
     Args:
         stands: True stalks around each arm.
         stalks: [B] int, index of the stalk that each arm reaches for; -1 for none.
-        again: [B, 2], see `Plan`.
+        redetected: [B, 2], see `Plan`.
     """
     known = (stands.stalk == stalks[:, None]) & (stalks >= 0)[:, None]
     slot = known.argmax(axis=1)
-    error = np.where(known.any(axis=1)[:, None], again, np.nan)
+    error = np.where(known.any(axis=1)[:, None], redetected, np.nan)
     places: list[np.ndarray] = []
 
     def look(sight: ArmView) -> np.ndarray:

@@ -174,24 +174,24 @@ class Score:
         )
 
 
-def wilson(count: int, of: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson interval of a proportion ``count / of``; (NaN, NaN) if ``of`` is 0.
+def wilson(count: int, total: int, z: float = 1.959964) -> tuple[float, float]:
+    """Return the Wilson interval of a proportion ``count / of``; (NaN, NaN) if ``total`` is 0.
 
     Args:
         count: Number of hits.
-        of: Total number.
+        total: Total number.
         z: Quantile of the standard normal distribution; the default gives 95 % coverage.
 
     Raises:
-        ValueError: ``count`` is not from 0 to ``of``.
+        ValueError: ``count`` is not from 0 to ``total``.
     """
-    if not 0 <= count <= of:
-        raise ValueError(f"a count must be from 0 to what it is of, got {count} of {of}")
-    if not of:
+    if not 0 <= count <= total:
+        raise ValueError(f"a count must be from 0 to what it is of, got {count} of {total}")
+    if not total:
         return math.nan, math.nan
-    value, square = count / of, z * z / of
+    value, square = count / total, z * z / total
     middle = (value + square / 2) / (1 + square)
-    half = z / (1 + square) * math.sqrt(value * (1 - value) / of + square / (4 * of))
+    half = z / (1 + square) * math.sqrt(value * (1 - value) / total + square / (4 * total))
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
@@ -247,8 +247,8 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
     reachable = [(stalk, stage) for stalk, stage in zip(stalks, stage_of) if stalk.reachable]
     sent = [attempt for attempt in attempts if attempt.sent]
 
-    def grasped(name: str, chosen: Sequence[str]) -> Proportion:
-        return Proportion(name, sum(stage == "grasped" for stage in chosen), len(chosen))
+    def grasped(name: str, subset: Sequence[str]) -> Proportion:
+        return Proportion(name, sum(stage == "grasped" for stage in subset), len(subset))
 
     outcomes = Counter(attempt.outcome for attempt in attempts)
     stages = Counter(stage for _, stage in reachable)

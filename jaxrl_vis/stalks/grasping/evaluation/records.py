@@ -225,19 +225,19 @@ def _stands_record(stands: Stands) -> Record:
     return {name: array.astype(float).round(_DIGITS).tolist() for name, array in arrays.items()}
 
 
-def _plan_record(made: Plan) -> Record:
+def _plan_record(plan: Plan) -> Record:
     return {
-        "targets": made.targets.round(_DIGITS).tolist(),
-        "stalks": made.stalks.tolist(),
-        "errors": made.errors.round(_DIGITS).tolist(),
-        "sides": made.sides.tolist(),
-        "refused": made.refused.tolist(),
-        "again": made.again.round(_DIGITS).tolist(),
-        "stands": _stands_record(made.stands),
-        "seen": None if made.detected is None else _stands_record(made.detected),
+        "targets": plan.targets.round(_DIGITS).tolist(),
+        "stalks": plan.stalks.tolist(),
+        "errors": plan.errors.round(_DIGITS).tolist(),
+        "sides": plan.sides.tolist(),
+        "refused": plan.refused.tolist(),
+        "again": plan.again.round(_DIGITS).tolist(),
+        "stands": _stands_record(plan.stands),
+        "seen": None if plan.detected is None else _stands_record(plan.detected),
         "standing": [
             [stalk.stalk, stalk.reachable, round(stalk.room, _DIGITS), round(stalk.neighbour, _DIGITS)]
-            for stalk in made.standing
+            for stalk in plan.standing
         ],
     }
 

@@ -155,7 +155,7 @@ def _initial(settings: Settings, crop: int, key: jax.Array) -> Any:
 
 
 def train(
-    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0
+    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, report_interval: float = 30.0
 ) -> tuple[Any, int]:
     """Train a generator.
 
@@ -164,7 +164,7 @@ def train(
         settings: Settings of the generator, including its loss.
         plan: Schedule of the training.
         report: Callback for reports, see `Report`.
-        every: Interval of reports, s.
+        report_interval: Interval of reports, s.
 
     Returns:
         The averaged parameters of the generator, and the number of updates.
@@ -189,7 +189,7 @@ def train(
     try:
         state = _initial(settings, plan.crop, start_key)
         pool.fill(plan.first)
-        step = repeat(update, pool, plan, started, report, every)
+        step = repeat(update, pool, plan, started, report, report_interval)
     finally:
         pool.close()
     return state[1], step

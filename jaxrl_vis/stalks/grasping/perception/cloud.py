@@ -67,13 +67,13 @@ class Cloud:
         return self.points[self.red & np.isfinite(self.depth)]
 
 
-def redness(painted: np.ndarray) -> np.ndarray:
+def redness(image: np.ndarray) -> np.ndarray:
     """Return the redness of RGB pixels [..., 3] uint8: red minus the maximum of green and blue.
 
     Returns:
         [...] float32, 1 for pure red, 0 for grey, negative where green or blue exceed red.
     """
-    values = painted.astype(np.float32) / 255.0
+    values = image.astype(np.float32) / 255.0
     return values[..., 0] - np.maximum(values[..., 1], values[..., 2])
 
 

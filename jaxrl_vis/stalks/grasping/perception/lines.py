@@ -57,18 +57,18 @@ _BENT_LENGTH = 0.3  # m: minimum height range of chords for fitting curvature or
 _USUAL_TAPER = -0.01  # m per m: taper of stalks with a smaller height range
 _OPENING = 0.03  # growth of the maximum distance per m beyond the known part of a line
 _MIN_PIECE = 0.03  # m: minimum height range of a seed
-_STEEPEST = 0.6  # m per m: maximum slope of a line against the vertical
+_MAX_SLOPE = 0.6  # m per m: maximum slope of a line against the vertical
 _BIN = 0.02  # m: bin width of heights
 _MIN_SUPPORT = 0.12  # m: minimum visible length, summed over pairs
 _WINDOW = 0.10  # m: half height of the window around the grasp point for the local fit
 _AROUND = 0.2  # m: half height of the range around the grasp point in which visibility is queried
 _MIN_SHOWN = 4  # minimum number of places at which a pair must show a stalk
-_MIN_SHARE = 0.4  # minimum fraction of places that show the stalk among those that show it or see through it
+_MIN_FRACTION = 0.4  # minimum fraction of places that show the stalk among those that show it or see through it
 _APART = 0.012  # m: lines nearer than this are the same stalk
 _BEND = 0.04  # growth of that distance per m between the heights of their grasp points
 _REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m: nearer lines with a greater spread are leftovers of the other stalk
 _LEVEL = 0.002  # m: chords of one pair that differ less in height are in the same image row
-_MIN_BESIDE, _SHARE_BESIDE = 20, 0.2  # minimum number, and fraction, of chords of two distinct stalks that are side by side
+_MIN_BESIDE, _FRACTION_BESIDE = 20, 0.2  # minimum number, and fraction, of chords of two distinct stalks that are side by side
 _APART_BESIDE = 0.008  # m: minimum median distance of such chords
 
 
@@ -101,7 +101,7 @@ def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple
         point = _grasp(segments, members, min(2, len(visibility.clouds)), heights)
         if point is None:
             continue
-        count = _agreed(point, visibility)
+        count = _is_consistent(point, visibility)
         if count:
             lines.append(_Line(point, members, count))
     lines.sort(key=lambda line: -line.shown)
@@ -161,7 +161,7 @@ def _grow(segments: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.
         known = segments.middle[members]
         low, high = known[:, 2].min(), known[:, 2].max()
         coefficients, middle = _robust(known, bent=high - low > _BENT_LENGTH)
-        if np.abs(coefficients[1]).max() > _STEEPEST:
+        if np.abs(coefficients[1]).max() > _MAX_SLOPE:
             return members[:0]
         beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
         # Extrapolate by at most the known height range of the line, or 0.15 m.
@@ -223,7 +223,7 @@ def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
     return float((parts[0][1] - parts[1][1]) / (parts[0][0] - parts[1][0]))
 
 
-def _agreed(point: GraspPoint, visibility: Visibility) -> int:
+def _is_consistent(point: GraspPoint, visibility: Visibility) -> int:
     """Count the places along a stalk's line at which pairs show it.
 
     Return 0 unless at least two pairs (or the only one) show it, and few enough see through it.
@@ -232,7 +232,7 @@ def _agreed(point: GraspPoint, visibility: Visibility) -> int:
     shown, through = visibility.query(point.at_height(places))
     count = int(shown.sum())
     frames = int((shown.sum(axis=1) >= _MIN_SHOWN).sum())
-    agreed = frames >= min(2, len(visibility.clouds)) and count >= _MIN_SHARE * (count + through.sum())
+    agreed = frames >= min(2, len(visibility.clouds)) and count >= _MIN_FRACTION * (count + through.sum())
     return count if agreed else 0
 
 
@@ -263,5 +263,5 @@ def _side_by_side(segments: StalkSegments, one: _Line, other: _Line) -> bool:
         level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
         apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
     distances = np.concatenate(apart)
-    enough = max(_MIN_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
+    enough = max(_MIN_BESIDE, _FRACTION_BESIDE * min(len(one.members), len(other.members)))
     return len(distances) >= enough and float(np.median(distances)) > _APART_BESIDE

@@ -151,9 +151,9 @@ def perceive(
     return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
 
 
-def _driven(here: View, there: View) -> float:
+def _driven(view: View, next_view: View) -> float:
     """Return the distance that the robot drove between two pairs, m; 0 if it is not known."""
-    return 0.0 if here.driven is None or there.driven is None else there.driven - here.driven
+    return 0.0 if view.driven is None or next_view.driven is None else next_view.driven - view.driven
 
 
 @contextlib.contextmanager

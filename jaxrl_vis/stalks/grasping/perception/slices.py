@@ -18,7 +18,7 @@ THICKNESS = 0.2
 CELL = 0.01
 """Edge of a cell of the heat map, m."""
 _VOXEL = 0.005  # m: downsampling, so that the density of points does not depend on the distance
-_SHARE = 0.25
+_FRACTION = 0.25
 _MIN_CELLS = 2
 
 
@@ -52,7 +52,7 @@ def slice_at(points: np.ndarray, low: float) -> Slice:
     counts = np.zeros(cell.max(axis=0) + 4)
     np.add.at(counts, tuple(cell.T), 1.0)
     heat = ndimage.gaussian_filter(counts, 0.7)
-    dense = heat >= _SHARE * np.quantile(heat[counts > 0], 0.9)
+    dense = heat >= _FRACTION * np.quantile(heat[counts > 0], 0.9)
     regions = np.zeros(dense.shape, np.int32)
     count = int(ndimage.label(dense, np.ones((3, 3)), output=regions))  # pyright: ignore
     of_point = regions[tuple(cell.T)]

@@ -88,7 +88,7 @@ DEFAULT = Method(
     pixels=512 * 512,
 )
 
-_ODOMETRY_SHARE = 0.05
+_ODOMETRY_FRACTION = 0.05
 _WOBBLE = 0.03  # m
 _TURN = math.radians(3.0)
 _MIN_OVERLAP = 0.2
@@ -140,33 +140,33 @@ class Thinned:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
-def stitch(source: Thinned, target: Thinned, driven: float, method: Method = DEFAULT) -> Stitch:
+def stitch(source: Thinned, target: Thinned, distance: float, method: Method = DEFAULT) -> Stitch:
     """Register the cloud of one pair with that of the next.
 
     Args:
         source, target: Clouds of the pair and the next one, each in its own robot frame.
-        driven: Distance that the robot drove along the row between the pairs by its odometry, m.
+        distance: Distance that the robot drove along the row between the pairs by its odometry, m.
         method: Method of stitching.
     """
-    prior = Motion.along(-driven)
+    prior = Motion.along(-distance)
     start = prior if method.from_odometry else Motion.along(0.0)
     if len(source.points) < 10 or len(target.points) < 10:
         return Stitch(prior, math.nan, 0.0, "a cloud is empty")
     motion, residual, overlap = closest_points(source.points, target, start, method)
-    refused = _rejection_reason(motion, prior, driven, overlap) if method.from_odometry else ""
+    refused = _rejection_reason(motion, prior, distance, overlap) if method.from_odometry else ""
     if refused and len(method.gates) > 1:
         # With little overlap, points of one pair alone bias the widest gate; the odometry may be good enough for the next one.
         motion, residual, overlap = closest_points(source.points, target, start, method.after_first_gate())
-        refused = _rejection_reason(motion, prior, driven, overlap)
+        refused = _rejection_reason(motion, prior, distance, overlap)
     return Stitch(prior if refused else motion, residual, overlap, refused)
 
 
-def _rejection_reason(motion: Motion, prior: Motion, driven: float, overlap: float) -> str:
+def _rejection_reason(motion: Motion, prior: Motion, distance: float, overlap: float) -> str:
     """Return the reason to refuse a result, by overlap and odometry; empty to accept it."""
     # Compare displacements at a point of the row, so that rotations count as well.
     place = np.array([0.0, 0.6, 0.8])
     moved = float(np.linalg.norm(motion(place) - prior(place)))
-    allowed = _ODOMETRY_SHARE * abs(driven) + _WOBBLE
+    allowed = _ODOMETRY_FRACTION * abs(distance) + _WOBBLE
     if overlap < _MIN_OVERLAP:
         return f"only {100 * overlap:.0f} % of the points overlap"
     if moved > allowed:

@@ -22,7 +22,7 @@ from jaxrl_vis.stalks.grasping.report.video import write_reaches
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Family
 
-THESIS_RATIO, CORNBOT_SHARE = 0.7413, 43 / 48
+THESIS_RATIO, CORNBOT_FRACTION = 0.7413, 43 / 48
 RUNS = 16
 """Number of runs in figure 4.6, as in the thesis."""
 _HELD, _OTHER, _LOST = "#2f855a", "#dd6b20", "#cbd5e0"
@@ -54,7 +54,7 @@ def draw_reach(
         raise RequestError(f"there is nothing that the arm can be sent to in run {seed}: choose another --seed")
     keys = wind_keys(np.full(len(made.targets), seed), np.arange(len(made.targets)))
     look = follow(made.stands, made.stalks, made.again)
-    result = reach(made.stands, made.targets, keys, wind_mm, sides=made.sides, look=look)
+    result = reach(made.stands, made.targets, keys, wind_mm, sides=made.sides, observer=look)
     draw_path(out, made.stands, made.targets, result, int(sent[len(sent) // 2]))
     if video is not None:
         write_reaches(video, made.stands, result, made.stalks.tolist(), sent.tolist(), size)
@@ -150,7 +150,7 @@ def _draw_proportions(figure: Figure, score: Score) -> None:
     place = len(rows)
     axes.plot(100 * score.thesis_ratio, place, "s", color="#2b6cb0")
     axes.plot(100 * THESIS_RATIO, place + 1, "D", color=_OTHER)
-    axes.plot(100 * CORNBOT_SHARE, place + 2, "D", color=_OTHER)
+    axes.plot(100 * CORNBOT_FRACTION, place + 2, "D", color=_OTHER)
     names = [name for name, _ in rows] + [
         "thesis's ratio,\nhere",
         "thesis's ratio,\nin its field",

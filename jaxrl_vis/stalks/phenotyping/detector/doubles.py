@@ -31,14 +31,14 @@ def suppress_duplicates(pieces: Sequence[Piece], scores: np.ndarray, max_shared:
     selected: list[int] = []
     for place in np.argsort(-np.asarray(scores), kind="stable").tolist():
         corner = pieces[place][1]
-        shared = (_shared(inside[place], corner, inside[other], pieces[other][1]) for other in selected)
+        shared = (_overlap(inside[place], corner, inside[other], pieces[other][1]) for other in selected)
         smaller = (min(sizes[place], sizes[other]) for other in selected)
         if not any(common > max_shared * size for common, size in zip(shared, smaller)):
             selected.append(place)
     return np.isin(np.arange(len(pieces)), selected)
 
 
-def _shared(first: np.ndarray, corner: tuple[int, int], second: np.ndarray, other: tuple[int, int]) -> int:
+def _overlap(first: np.ndarray, corner: tuple[int, int], second: np.ndarray, other: tuple[int, int]) -> int:
     """Count the pixels that two masks have in common."""
     low = np.maximum(corner, other)
     high = np.minimum(np.add(corner, first.shape), np.add(other, second.shape))

@@ -137,14 +137,14 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
-def segment(params: Any, crops: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
+def segment(params: Any, crops: jax.Array, settings: Settings, dtype: Any, full_shape: tuple[int, int]) -> jax.Array:
     """Compute probabilities [N, h, w] float32 that pixels of stalk crops [N, h, w, 3] uint8 show the stalk in the centre.
 
-    Crops are resized to the ``full`` size (height, width) for the network, and probabilities back to the size of the crops: the
+    Crops are resized to ``full_shape`` (height, width) for the network, and probabilities back to the size of the crops: the
     network was trained on stalks of that width in pixels.
     """
     count, *shape = crops.shape[:3]
-    enlarged = jax.image.resize(crops.astype(jnp.float32), (count, *full, 3), "linear")
+    enlarged = jax.image.resize(crops.astype(jnp.float32), (count, *full_shape, 3), "linear")
     logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(enlarged))
     assert isinstance(logits, jax.Array)
     return jax.image.resize(jax.nn.sigmoid(logits), (count, *shape), "linear")
@@ -180,7 +180,7 @@ class Finder:
         frame = find_frame(image)
         detections = self._find(fill_borders(image, frame), pixels_per_metre, frame)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
-        return Detections((_moved(detection, frame) for detection in ordered), doubt=detections.doubt)
+        return Detections((_in_whole_image(detection, frame) for detection in ordered), doubt=detections.doubt)
 
     def look(self, image: np.ndarray, pixels_per_metre: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Detect stalks without segmenting them.
@@ -211,19 +211,19 @@ class Finder:
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
         selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
-        inside = np.array([_is_shown(stalk, frame) for stalk in stalks], bool)
+        inside = np.array([_is_inside_frame(stalk, frame) for stalk in stalks], bool)
         stalks, scores = stalks[inside], scores[inside]
         on_device = jnp.asarray(image)
         pieces = self._pieces(on_device, stalks, settings.crop_height, relative_scale)
-        pieces = [(_without_border(mask, corner, frame), corner) for mask, corner in pieces]
+        pieces = [(_clear_border_rows(mask, corner, frame), corner) for mask, corner in pieces]
         once = np.flatnonzero(suppress_duplicates(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
         strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
-        higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
+        higher = [_extrapolate_upward(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
         shown = [place for place, upper in enumerate(higher) if upper is not None]
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
         above = self._pieces(on_device, some, settings.crop_height // 2, relative_scale)
-        upper = {place: (_without_border(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
+        upper = {place: (_clear_border_rows(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
         detections = Detections(doubt=doubt)
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
@@ -256,7 +256,7 @@ class Finder:
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 
-def _is_shown(stalk: np.ndarray, frame: Frame) -> bool:
+def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:
     """Return whether more than half of the axis of a stalk [6] lies outside the black borders."""
     if frame.shown is None:
         return True
@@ -266,7 +266,7 @@ def _is_shown(stalk: np.ndarray, frame: Frame) -> bool:
     return bool(np.mean(shown[line[there], column[there]]) > _SHOWN) if there.any() else False
 
 
-def _without_border(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
+def _clear_border_rows(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
     """Return a mask with the rows cleared in which it reaches a black border: the stalk may continue there."""
     if frame.shown is None or not mask.size:
         return mask
@@ -277,7 +277,7 @@ def _without_border(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> 
     return visible
 
 
-def _moved(detection: Detection, frame: Frame) -> Detection:
+def _in_whole_image(detection: Detection, frame: Frame) -> Detection:
     """Convert a detection from the coordinates of a frame to those of the whole image."""
     down, over = frame.lines[0], frame.columns[0]
     if not down and not over:
@@ -293,7 +293,7 @@ def _moved(detection: Detection, frame: Frame) -> Detection:
     )
 
 
-def _follow(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:
+def _extrapolate_upward(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:
     """Extrapolate a stalk to its upper segment [6] by the edges of its mask; None if outside the image or without edges."""
     if strip is None:
         return None

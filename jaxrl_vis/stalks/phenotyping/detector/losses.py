@@ -97,9 +97,9 @@ def _focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
     return (loss * (shows | none)).sum()
 
 
-def _distance(codes: jax.Array, wanted: jax.Array, shows: jax.Array) -> jax.Array:
+def _distance(codes: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
     """Compute the Huber loss of box offsets [K, 6], averaged over the positive boxes."""
-    loss = optax.huber_loss(codes, jnp.clip(wanted, -20.0, 20.0), delta=1.0).sum(axis=-1)
+    loss = optax.huber_loss(codes, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 
 

@@ -15,14 +15,14 @@ _ALONG = 15  # rows of a full-size stalk crop that are averaged
 _EXPONENT = 0.35
 
 
-def crop_shape(full: tuple[int, int], scale: float) -> tuple[int, int]:
+def crop_shape(full_shape: tuple[int, int], scale: float) -> tuple[int, int]:
     """Return the height and width of stalk crops, multiples of 8 and at least 16.
 
     Args:
-        full: Height and width of crops of a full-resolution image.
+        full_shape: Height and width of crops of a full-resolution image.
         scale: Resolution of the image relative to full resolution.
     """
-    lines, columns = (max(round(length * scale / 8), 2) * 8 for length in full)
+    lines, columns = (max(round(length * scale / 8), 2) * 8 for length in full_shape)
     return lines, columns
 
 
@@ -59,9 +59,9 @@ def cut(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Arr
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def _cut(image: jax.Array, top: jax.Array, left: jax.Array, across: int) -> jax.Array:
+def _cut(image: jax.Array, top: jax.Array, left: jax.Array, width: int) -> jax.Array:
     lines = top[:, None] + jnp.arange(left.shape[1])
-    columns = left[..., None] + jnp.arange(across)
+    columns = left[..., None] + jnp.arange(width)
     inside = ((lines >= 0) & (lines < image.shape[0]))[..., None] & (columns >= 0) & (columns < image.shape[1])
     taken = image[jnp.clip(lines, 0, image.shape[0] - 1)[..., None], jnp.clip(columns, 0, image.shape[1] - 1)]
     return jnp.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), taken, jnp.zeros((), image.dtype))

@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.phenotyping.io.names import readable
 
 STALK = 1
 """COCO category id of stalks."""
-_FARTHEST = 1e7  # pixels
+_MAX_COORDINATE = 1e7  # pixels
 
 
 def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
@@ -95,22 +95,22 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
     return {"images": images, "annotations": annotations, "summary": summary}
 
 
-def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
+def _checked_image(image: dict[str, Any], index: int) -> dict[str, Any]:
     """Return the entry of an image, with its width and height as integers.
 
     Args:
         image: The entry as read.
-        place: Index of the entry, for messages.
+        index: Index of the entry, for messages.
 
     Raises:
         RequestError: Its id, name or size is missing or invalid.
     """
     if not isinstance(image.get("id"), (int, str)) or not isinstance(image.get("file_name"), str):
-        raise RequestError(f"{image['source']}: image number {place + 1} needs an id and a file_name")
+        raise RequestError(f"{image['source']}: image number {index + 1} needs an id and a file_name")
     name = image["file_name"]
     if not _is_inside(name):
         raise RequestError(
-            f"{image['source']}: image number {place + 1} has the file_name {reprlib.repr(name)}: name a file in that folder"
+            f"{image['source']}: image number {index + 1} has the file_name {reprlib.repr(name)}: name a file in that folder"
         )
     sides = _numbers([image.get("width"), image.get("height")])
     if sides is None or min(sides) < 1 or any(side % 1 for side in sides):
@@ -155,7 +155,7 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
         raise ValueError("has neither a bbox nor a segmentation")
     if box is None or len(box) != 4:
         raise ValueError("has a bbox that is not 4 numbers (left, top, width, height)")
-    if max(map(abs, box)) > _FARTHEST:
+    if max(map(abs, box)) > _MAX_COORDINATE:
         raise ValueError("has a bbox that lies nowhere near an image")
     left, top, wide, tall = box
     if not (wide > 0 and tall > 0):
@@ -193,7 +193,7 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
     corners = [outline for outline in outlines if outline is not None and len(outline) >= 6 and len(outline) % 2 == 0]
     if len(corners) < len(outlines):
         raise ValueError("has a polygon that is not column, line, column, line, ... of 3 corners or more")
-    if any(abs(corner) > _FARTHEST for outline in corners for corner in outline):
+    if any(abs(corner) > _MAX_COORDINATE for outline in corners for corner in outline):
         raise ValueError("has a polygon that lies nowhere near an image")
     return corners
 

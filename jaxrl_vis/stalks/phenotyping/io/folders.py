@@ -22,7 +22,7 @@ SAMPLE = Path(__file__).parents[1] / "sample_row"
 """Folder of a short synthetic row that ships with the package."""
 _DEPTH = 6  # levels of nested folders searched for plots
 _MAX_FOLDERS = 20_000
-_LATEST = 0.005  # s, maximum median delay between the images of a pair: a robot at 0.3 m/s drives 1.5 mm
+_MAX_DELAY = 0.005  # s, maximum median delay between the images of a pair: a robot at 0.3 m/s drives 1.5 mm
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
@@ -88,7 +88,7 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
         if not pattern or PureWindowsPath(pattern).anchor or ".." in PureWindowsPath(pattern).parts:
             raise RequestError(f"--left and --right are patterns within each plot's folder, as 'left/*.png', not {pattern!r}")
     own = _pairs(folder, patterns)
-    folders = {folder: own} if own else _below(folder, patterns)
+    folders = {folder: own} if own else _search_subfolders(folder, patterns)
     plots: dict[str, PlotFolder] = {}
     for path, pairs in folders.items():
         check_length(path)
@@ -102,7 +102,7 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
     return list(plots.values())
 
 
-def _below(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
+def _search_subfolders(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
     """Return the pairs of all subfolders that hold some, depth first; folders inside those are not searched.
 
     Raises:
@@ -153,14 +153,14 @@ _Sides = dict[str, dict[str, Path]]
 
 def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
     if patterns is not None:
-        sides = _by_patterns(folder, patterns)
+        sides = _pair_by_patterns(folder, patterns)
     else:
-        sides = _by_folder(folder) or {}
-        for name, files in _by_name(folder).items():
+        sides = _pair_by_folder(folder) or {}
+        for name, files in _pair_by_name(folder).items():
             for side, path in files.items():
-                _put(sides, name, side, path)
+                _add_pair(sides, name, side, path)
         _check_rectified(folder, sides)
-    sides = _by_times(folder, sides)
+    sides = _pair_by_times(folder, sides)
     stored = _find_folder(folder, ("disparity",))
     inside = [] if stored is None else image_files(stored, _DISPARITIES)
     for path in [*inside, *image_files(folder, _DISPARITIES)]:
@@ -168,14 +168,14 @@ def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
         stem = readable(path.stem)
         name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if is_sibling else stem
         if name in sides and (not is_sibling or "disparity" in stem.lower()):
-            _put(sides, name, "disparity", path)
+            _add_pair(sides, name, "disparity", path)
     files = [
         PairFiles(name, by_side.get("left"), by_side.get("right"), by_side.get("disparity")) for name, by_side in sides.items()
     ]
     return tuple(sorted(files, key=lambda pair: _natural(pair.name)))
 
 
-def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
+def _add_pair(sides: _Sides, name: str, side: str, path: Path) -> None:
     """Add a file to ``sides``, in place.
 
     Raises:
@@ -189,7 +189,7 @@ def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
         raise RequestError(f"{both} are both the {what} of pair {name}: rename one of them, or move it elsewhere")
 
 
-def _by_patterns(folder: Path, patterns: Patterns) -> _Sides:
+def _pair_by_patterns(folder: Path, patterns: Patterns) -> _Sides:
     """Find the images that match two patterns; the text matched by the wildcards is the name of the pair."""
     sides: _Sides = {}
     for side, pattern in (("left", patterns.left), ("right", patterns.right)):
@@ -198,7 +198,7 @@ def _by_patterns(folder: Path, patterns: Patterns) -> _Sides:
             match = stars.fullmatch(path.relative_to(folder).as_posix())
             if path.is_file() and not path.name.startswith(".") and match is not None:
                 name = "_".join(part.replace("/", "_").strip("_") for part in match.groups() if part) or "pair"
-                _put(sides, readable(name), side, path)
+                _add_pair(sides, readable(name), side, path)
     return sides if any("left" in files for files in sides.values()) else {}
 
 
@@ -219,7 +219,7 @@ def _check_rectified(folder: Path, sides: _Sides) -> None:
         )
 
 
-def _by_times(folder: Path, sides: _Sides) -> _Sides:
+def _pair_by_times(folder: Path, sides: _Sides) -> _Sides:
     """Pair the images that have no partner of the same name by the timestamps in their names.
 
     Args:
@@ -236,7 +236,7 @@ def _by_times(folder: Path, sides: _Sides) -> _Sides:
     left, right = ({name: time or 0.0 for name, time in times[side].items()} for side in ("left", "right"))
     partner = nearest(left, right)
     apart = sorted(abs(left[name] - right[other]) for name, other in partner.items())
-    if apart and apart[len(apart) // 2] > _LATEST:
+    if apart and apart[len(apart) // 2] > _MAX_DELAY:
         raise RequestError(
             f"{readable(str(folder))}: left and right images are {1000 * apart[len(apart) // 2]:.0f} ms apart by their names, "
             "in which a robot moves on: cameras of a pair must take their images at the same time"
@@ -246,7 +246,7 @@ def _by_times(folder: Path, sides: _Sides) -> _Sides:
     return sides
 
 
-def _by_folder(folder: Path) -> _Sides:
+def _pair_by_folder(folder: Path) -> _Sides:
     """Find images in two subfolders, one per side; empty if there are none.
 
     Raises:
@@ -273,7 +273,7 @@ def _by_folder(folder: Path) -> _Sides:
         if _whole_pairs(path):
             return {}
         for image in nested[path]:
-            _put(sides, readable(image.stem), side, image)
+            _add_pair(sides, readable(image.stem), side, image)
     return sides
 
 
@@ -284,10 +284,10 @@ def _side_images(folder: Path) -> list[Path]:
 
 
 def _whole_pairs(folder: Path) -> bool:
-    return any(len(by_side) == 2 for by_side in _by_name(folder).values())
+    return any(len(by_side) == 2 for by_side in _pair_by_name(folder).values())
 
 
-def _by_name(folder: Path) -> _Sides:
+def _pair_by_name(folder: Path) -> _Sides:
     """Find images whose names tell their side, by a word, a letter or a camera number."""
     images = {path: readable(path.stem) for path in image_files(folder)}
     images = {path: stem for path, stem in images.items() if "disparity" not in stem.lower()}
@@ -297,12 +297,12 @@ def _by_name(folder: Path) -> _Sides:
         word = _side_in(stem, stems)
         if word is not None:
             name = (stem[: word.start()] + stem[word.end() :]).strip("_-. ") or "pair"
-            _put(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
+            _add_pair(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
         else:
             for side, other in _counted(stem, stems):
                 # The characters common to both names, without the number or letter of the side.
                 same = "".join(one for one, two in zip(stem, other) if one == two)
-                _put(sides, same.strip("_-. ") or "pair", side, image)
+                _add_pair(sides, same.strip("_-. ") or "pair", side, image)
     return sides
 
 

@@ -143,8 +143,8 @@ def _decoded(path: Path) -> np.ndarray | None:
     return upright(image, orientation) if image.shape[:2] == size else None
 
 
-def _unreadable(path: Path, why: str) -> OSError:
+def _unreadable(path: Path, reason: str) -> OSError:
     """Return an error whose message names the file and whose ``strerror`` does not, like errors of the operating system."""
-    error = OSError(f"{path} {why}")
-    error.strerror = f"it {why}"
+    error = OSError(f"{path} {reason}")
+    error.strerror = f"it {reason}"
     return error

@@ -102,10 +102,10 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
 
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         kinds: dict[str, str] = {connection.topic: connection.msgtype for connection in reader.connections}
-        pair = topics or _pair_of(kinds, path)
+        pair = topics or _topic_pair(kinds, path)
         for topic in (pair.left, pair.right):
             if kinds.get(topic) not in _IMAGE:
-                raise RequestError(f"{path} has no images on {topic}: {_listed(kinds)}")
+                raise RequestError(f"{path} has no images on {topic}: {_format_topics(kinds)}")
 
         def messages(topic: str) -> Iterator[Any]:
             wanted = [connection for connection in reader.connections if connection.topic == topic]
@@ -120,7 +120,7 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
         _write_odometry(folder / "odometry.csv", kinds, messages)
 
 
-def _pair_of(kinds: dict[str, str], path: Path) -> Topics:
+def _topic_pair(kinds: dict[str, str], path: Path) -> Topics:
     """Find the topics of the left and right images.
 
     Args:
@@ -138,11 +138,11 @@ def _pair_of(kinds: dict[str, str], path: Path) -> Topics:
         pairs = best or pairs
     if len(pairs) != 1:
         what = "several pairs of images" if pairs else "no pair of left and right images"
-        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_listed(kinds)}")
+        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_format_topics(kinds)}")
     return pairs.pop()
 
 
-def _listed(kinds: dict[str, str]) -> str:
+def _format_topics(kinds: dict[str, str]) -> str:
     images = sorted(topic for topic, kind in kinds.items() if kind in _IMAGE)
     others = f" and {len(images) - _SHOWN} others" if len(images) > _SHOWN else ""
     return f"images are on {', '.join(images[:_SHOWN])}{others}" if images else "no topic has images"

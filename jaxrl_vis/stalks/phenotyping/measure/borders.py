@@ -16,7 +16,7 @@ _RINGING = 16  # pixels: reach of JPEG ringing into a border
 _MIN_LINES = 0.08  # minimum length of a border's side, as a fraction of the image's
 _BEND = 2.5  # pixels: maximum distance of a border's side from a smooth curve
 _MIN_AGREEING = 0.9  # minimum fraction of a side's rows that lie on the curve
-_THINNEST = 8.0  # pixels: maximum width of a border at an end within the image
+_MIN_THICKNESS = 8.0  # pixels: maximum width of a border at an end within the image
 _INSIDE = 2  # pixels by which a detected border is widened
 
 
@@ -103,7 +103,7 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
         heavy = np.abs(reach - curve) <= max(_BEND, float(np.quantile(np.abs(reach - curve), 0.5)))
     # A border extends to the adjacent sides of the image, or tapers off.
     ends = [curve[end] for end, complete in ((0, first == 0), (-1, last == dark.shape[0])) if not complete]
-    if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _THINNEST:
+    if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _MIN_THICKNESS:
         return None
     columns = np.zeros(dark.shape[0])
     columns[first:last] = np.maximum(curve, 0.0) + _INSIDE

@@ -13,9 +13,9 @@ from jaxrl_vis.stalks.phenotyping.measure.width import Strip, median
 _SAMPLE_STEP = 0.25  # pixels between two samples across an edge
 _BESIDE = 40  # samples on each side of the edge
 _SMOOTHING = 2.0  # samples: standard deviation of the Gaussian filter
-_FURTHEST = 2.5  # pixels: maximum shift of an edge
+_MAX_OFFSET = 2.5  # pixels: maximum shift of an edge
 _MIN_CONTRAST = 3.0  # minimum ratio of the gradient at an edge to the median gradient
-_LINES_APART = 4
+_ROW_STEP = 4
 _MIN_LINES = 8
 
 
@@ -30,7 +30,7 @@ def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line:
         reach: Distance above and below that row, pixels.
     """
     low, high = max(line - reach + corner[0], 0.0), min(line + reach + corner[0], image.shape[0] - 1.0)
-    lines = np.arange(np.ceil(low), np.floor(high) + 1.0, _LINES_APART).astype(int)
+    lines = np.arange(np.ceil(low), np.floor(high) + 1.0, _ROW_STEP).astype(int)
     if lines.size < _MIN_LINES:
         return strip
     edges = []
@@ -53,7 +53,7 @@ def _shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
     reach = np.arange(-8, 9)
     kernel = np.exp(-0.5 * (reach / _SMOOTHING) ** 2)
     change = np.abs(np.gradient(np.convolve(np.pad(across, 8, mode="edge"), kernel / kernel.sum(), mode="valid")))
-    near = np.flatnonzero(np.abs(offsets) <= _FURTHEST)
+    near = np.flatnonzero(np.abs(offsets) <= _MAX_OFFSET)
     best = int(near[np.argmax(change[near])])
     before, peak, after = change[best - 1 : best + 2]
     if peak < _MIN_CONTRAST * max(median(change), 1e-6) or before > peak or after > peak:

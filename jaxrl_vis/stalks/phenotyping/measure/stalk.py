@@ -92,7 +92,7 @@ def measure(
     place = strip.reference if line is None else line - corner[0]
     matched = _disparity(strip, corner, left, right, calibration, depths, disparity)
     if ground is not None and height is not None:
-        place = _place_at(height, strip, corner, matched, calibration, ground)
+        place = _row_at_height(height, strip, corner, matched, calibration, ground)
     disparity_here = matched.at(place + corner[0])
     if disparity_here is None:
         return Measurement(line=place + corner[0], lean=strip.lean, reason="the right image does not show it clearly")
@@ -131,7 +131,7 @@ def measure(
     )
 
 
-def _place_at(
+def _row_at_height(
     height: float, strip: Strip, corner: tuple[int, int], matched: StalkDisparity, calibration: Calibration, ground: Ground
 ) -> float:
     """Return the row of the mask with visible edges nearest to a ``height`` in m; the reference row if heights are unknown."""

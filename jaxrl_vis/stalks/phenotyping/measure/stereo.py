@@ -144,11 +144,11 @@ class _Window:
 
 
 def _match(
-    left: np.ndarray, right: np.ndarray, window: _Window, within: tuple[int, int], half_height: int, spread: int
+    left: np.ndarray, right: np.ndarray, window: _Window, bounds: tuple[int, int], half_height: int, spread: int
 ) -> tuple[float, float] | None:
     """Return the disparity and correlation of a window; None if there is no match within the bounds, or an ambiguous one."""
     top, bottom = window.line - half_height, window.line + half_height + 1
-    begin, end = max(window.first - within[1] - 1, 0), min(window.last - within[0] + 1, right.shape[1])
+    begin, end = max(window.first - bounds[1] - 1, 0), min(window.last - bounds[0] + 1, right.shape[1])
     if end - begin < window.last - window.first + 2:
         return None
     piece = np.ascontiguousarray(left[top:bottom, window.first : window.last])

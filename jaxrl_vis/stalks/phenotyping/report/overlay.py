@@ -10,13 +10,13 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
 COUNTED, REJECTED, MEASURED = (70, 235, 100), (255, 105, 75), (255, 225, 60)
 """RGB colours: outlines of counted and of rejected detections, and marks where widths were measured."""
-_WIDEST = 1688
+_MAX_WIDTH = 1688
 _LEGEND = (("counted", COUNTED), ("not counted", REJECTED), ("width was taken here", MEASURED))
 
 
 def overlay_scale(width: int) -> float:
     """Return the scale factor of the overlay of an image ``width`` pixels wide; at most 1."""
-    return min(_WIDEST / width, 1.0)
+    return min(_MAX_WIDTH / width, 1.0)
 
 
 def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str | None], title: str = "") -> np.ndarray:

@@ -29,7 +29,7 @@ def outline(detection: Detection) -> list[float]:
         return [left, top, right, top, right, bottom, left, bottom]
     first = mask[rows].argmax(axis=1) + detection.corner[1]
     last = mask.shape[1] - mask[rows][:, ::-1].argmax(axis=1) + detection.corner[1]
-    sides = [_simplified(np.stack([side, lines[rows]], axis=1)) for side in (first, last)]
+    sides = [_simplify_outline(np.stack([side, lines[rows]], axis=1)) for side in (first, last)]
     # Use the outer corners of the first and the last pixels instead of their centres.
     for side in sides:
         side[0, 1] -= 0.5
@@ -37,7 +37,7 @@ def outline(detection: Detection) -> list[float]:
     return np.concatenate([sides[0], sides[1][::-1]]).round(1).ravel().tolist()
 
 
-def _simplified(points: np.ndarray) -> np.ndarray:
+def _simplify_outline(points: np.ndarray) -> np.ndarray:
     """Simplify a polyline [K, 2] by the Douglas-Peucker algorithm."""
     return cv2.approxPolyDP(points.astype(np.float32)[:, None], _TOLERANCE, closed=False)[:, 0].astype(float)
 

@@ -148,7 +148,7 @@ class Page:
             for track in rejected
         ]
         reasons = Counter(sighting.reason for frame in plot.frames for sighting in frame if sighting.reason)
-        finds = [{"why": why, "finds": count} for why, count in _grouped(reasons).most_common()]
+        finds = [{"why": why, "finds": count} for why, count in _group_reasons(reasons).most_common()]
         write = self._file.write
         write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
         if plot.why:
@@ -210,7 +210,7 @@ def _headline(row: dict[str, Any]) -> str:
     return ", ".join([*parts, *([] if row["flag"] == "ok" else [str(row["flag"])])])
 
 
-def _grouped(reasons: Counter[str]) -> Counter[str]:
+def _group_reasons(reasons: Counter[str]) -> Counter[str]:
     """Merge the counts of reasons that differ only in a distance."""
     groups: Counter[str] = Counter()
     for reason, count in reasons.items():

@@ -158,7 +158,7 @@ def follow(
     )
     length = abs(float(places[-1] - places[0]) + step) if len(places) else 0.0
     path = Path(places, length, _seen(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
-    closed = [_closed(track, path, step, field, usual, gates) for track in _merged(tracks, gates)]
+    closed = [_close_gaps(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
@@ -212,7 +212,7 @@ class _PairView:
         over = np.array([_over(sighting) for sighting in sightings])
         half = 0.5 * calibration.baseline
         along = np.where(known, along, rays * usual - half)
-        return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), over, half, usual)
+        return cls(rays, along, depth, known, ~elsewhere & _spatial_distance(sightings), over, half, usual)
 
     def along_at(self, depth: float) -> np.ndarray:
         """Return the positions along the row [N], m, assuming a ``depth`` in m; the usual depth if NaN."""
@@ -226,7 +226,7 @@ def _over(sighting: Sighting) -> float:
     return sighting.height_m * math.tan(math.radians(sighting.lean_deg))
 
 
-def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
+def _spatial_distance(sightings: list[Sighting]) -> np.ndarray:
     """Return [N] bool, True for sightings of a pair that are distinct stalks: two stalks cannot intersect in space.
 
     Of two that do, the less certain one is a duplicate and marked False. The minimum distance is 60 % of that at which they
@@ -261,7 +261,7 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
     return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _FORBIDDEN_COST]
 
 
-def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
+def _merge_tracks(tracks: list[_Open], gates: Gates) -> list[_Open]:
     """Merge tracks of one stalk into the longer one, which is modified in place: same position, and hardly ever seen together.
 
     Tracks are also merged if they always lie on the same rays and one of the depths is wrong: of two stalks one behind the
@@ -307,7 +307,7 @@ def _apart(track: _Open, other: _Open) -> tuple[float, float]:
     return abs(track.at(depth) - other.at(depth)), 0.0
 
 
-def _closed(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
+def _close_gaps(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
     position = float(np.median(track.along))
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan

@@ -26,7 +26,7 @@ _MASK_ERROR = 0.7  # pixels: bias of masks on one texture
 _HIDING_ERROR = 0.8  # mm, if an edge may be occluded in all pairs
 _CALIBRATION_ERROR = 0.005  # relative: focal length and baseline of a good calibration
 _FEW = 2.0  # pairs: correction for the underestimated scatter of few pairs
-_FURTHEST = 4.0 * INCH  # m: maximum distance of a measurement from a height
+_MAX_OFFSET = 4.0 * INCH  # m: maximum distance of a measurement from a height
 _NEAR_HEIGHT = 0.5 * INCH  # m: distance within which the taper correction is negligible
 _ASIDE = 20.0  # degrees off the cameras' axis at which the weight is 1/e: from aside, oval stalks show another side
 
@@ -71,10 +71,10 @@ class StalkWidths:
 def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
     """Estimate the widths of the stalks of a plot, in the order of their tracks."""
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
-    first = [_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
+    first = [_widths_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
     tapers = [width.taper for width in first if width.taper is not None]
     taper = float(np.median(tapers)) if len(tapers) >= _MIN_SIGHTINGS else USUAL_TAPER
-    return [_of_stalk(sightings, taper) for sightings in of_stalks]
+    return [_widths_of_stalk(sightings, taper) for sightings in of_stalks]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +97,7 @@ class _Value:
     pixel: float
 
 
-def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
+def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     known = [
         _Value(
             e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.occluded, _pixel(e.diameter_mm, e.width_px)
@@ -117,7 +117,7 @@ def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
         for e in sightings
         if e.upper_mm is not None and e.upper_height_m is not None
     ]
-    lower, upper = _at(LOWER, known, taper), _at(UPPER, above, taper)
+    lower, upper = _width_at(LOWER, known, taper), _width_at(UPPER, above, taper)
     if lower is None:
         return StalkWidths(robust_width(sightings), upper, None, False)
     own = None if upper is None else (lower.mm - upper.mm) / ((UPPER - LOWER) / INCH)
@@ -134,12 +134,12 @@ def _facing(sighting: Sighting) -> float:
     return 1.0 if sighting.ray_deg is None else math.exp(-((sighting.ray_deg / _ASIDE) ** 2))
 
 
-def _at(height: float, values: list[_Value], taper: float) -> Width | None:
+def _width_at(height: float, values: list[_Value], taper: float) -> Width | None:
     """Estimate the width at a height in m; None if nothing was measured near it."""
     near, far = [], 0
     for value in values:
         inches = (value.height - height) / INCH
-        if abs(value.height - height) > _FURTHEST:
+        if abs(value.height - height) > _MAX_OFFSET:
             continue
         error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * inches)
         near.append(dataclasses.replace(value, mm=value.mm + taper * inches, deviation=error))

@@ -12,11 +12,11 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sightin
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
-_MOST = 0.7  # minimum fraction of the detections that are measured in a good pair
+_MIN_MEASURED = 0.7  # minimum fraction of the detections that are measured in a good pair
 _SAME_DEPTH = 0.15  # maximum relative difference of the depths of one row
 _NEAREST = 3.0  # minimum depth in baselines: below, the fields of view hardly overlap
-_LEAST_DISPARITY = 2.0  # pixels
-_SMALL_SHARE, _LARGE_FRACTION = 0.25, 0.6
+_MIN_DISPARITY = 2.0  # pixels
+_SMALL_FRACTION, _LARGE_FRACTION = 0.25, 0.6
 _LINES = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
 
 
@@ -40,11 +40,11 @@ def pair_fault(
     grey_left, grey_right = grey_at(left), grey_at(right)
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
     fault = _upside_down(grey_left, grey_right, calibration) if ground is None else None
-    if fault is None and (ground is None or measured < _MOST * len(detections)):
+    if fault is None and (ground is None or measured < _MIN_MEASURED * len(detections)):
         fault = _distance_fault(detections, grey_left, grey_right, calibration)
     if fault is not None:
         return fault
-    if len(detections) < _MIN_STALKS or measured > _SMALL_SHARE * len(detections):
+    if len(detections) < _MIN_STALKS or measured > _SMALL_FRACTION * len(detections):
         return None
     # The mirror image of a swapped pair is a correct pair.
     mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
@@ -100,7 +100,7 @@ def _any_depth(find: Detection, left: np.ndarray, right: np.ndarray, calibration
     if strip is None:
         return None
     nearest = float(calibration.disparity(np.array(_NEAREST * calibration.baseline)))
-    matched = stalk_disparity(strip, find.corner, left, right, calibration, (calibration.offset + _LEAST_DISPARITY, nearest))
+    matched = stalk_disparity(strip, find.corner, left, right, calibration, (calibration.offset + _MIN_DISPARITY, nearest))
     at = matched.at(strip.reference + find.corner[0])
     return None if at is None else float(calibration.depth(np.array(at[0])))
 

@@ -240,7 +240,7 @@ def measure_pair(
         One sighting per detection.
     """
     if calibration is None:
-        return [_in_pixels(detection) for detection in detections]
+        return [_unscaled_sighting(detection) for detection in detections]
     grey_left, grey_right = grey_at(left), grey_at(right)
     measured: list[tuple[Measurement, Measurement | None]] = []
     for detection in detections:
@@ -267,14 +267,14 @@ def measure_pair(
 
 
 def _without_mismatches(
-    measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, begin: int
+    measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, first_column: int
 ) -> list[tuple[Measurement, Measurement | None]]:
     """Invalidate measurements of stalks outside the right image, which were matched with something else.
 
     Args:
         measured: Lower and upper measurement of each stalk of a pair.
         calibration: Calibration of the cameras.
-        begin: First column of the right image without a black border.
+        first_column: First column of the right image without a black border.
     """
     depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
     if len(depths) < _AT_DISTANCE:
@@ -283,7 +283,7 @@ def _without_mismatches(
     disparity = float(calibration.disparity(np.array(row)))
     valid = []
     for measurement, upper in measured:
-        beyond = measurement.column - 0.5 * measurement.width - disparity < begin
+        beyond = measurement.column - 0.5 * measurement.width - disparity < first_column
         if measurement.diameter_mm is not None and beyond and abs(measurement.depth - row) > _FAR_FROM_ROW:
             measurement = Measurement(
                 line=measurement.line,
@@ -319,7 +319,7 @@ def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
     return occluded
 
 
-def _in_pixels(detection: Detection) -> Sighting:
+def _unscaled_sighting(detection: Detection) -> Sighting:
     strip = detection.strip or strip_width(detection.mask)
     line = 0.5 * (detection.box[1] + detection.box[3])
     column = 0.5 * sum(detection.axis)

@@ -29,7 +29,7 @@ def relight(images: jax.Array, key: jax.Array) -> jax.Array:
     # Smooth random variations of brightness, as of other textures, on a grid of 24 x 24 cells.
     coarse = jax.random.normal(keys["blotch"], (count, 24, 24, 1))
     gain = gain * jnp.exp(per_image("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
-    values = _blurred(values * gain, jnp.where(per_image("sharp", 0.0, 1.0) > 0.5, per_image("blur", 0.3, 1.3), 0.05))
+    values = _blur(values * gain, jnp.where(per_image("sharp", 0.0, 1.0) > 0.5, per_image("blur", 0.3, 1.3), 0.05))
     # Up to three times the shot and read noise of the original images, of which downscaled ones have less.
     level = 3.0 * per_image("level", 0.0, 1.0) ** 2 / _WELL_ROOT
     values = values + level * jnp.sqrt(values + _DARK) * jax.random.normal(keys["noise"], values.shape)
@@ -37,7 +37,7 @@ def relight(images: jax.Array, key: jax.Array) -> jax.Array:
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0) ** curve).astype(jnp.uint8)
 
 
-def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
+def _blur(values: jax.Array, deviation: jax.Array) -> jax.Array:
     """Blur values [N, H, W, C] by a Gaussian with standard deviation ``deviation`` [N, 1, 1, 1], pixels."""
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation) ** 2)  # [N, 1, 1, taps]
     taps = taps / taps.sum(axis=-1, keepdims=True)
@@ -65,10 +65,10 @@ def move(
         Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``.
     """
     keys = jax.random.split(key, images.shape[0])
-    return jax.vmap(_moved)(images, stalks, kinds, sizes, keys)
+    return jax.vmap(_transform_stalks)(images, stalks, kinds, sizes, keys)
 
 
-def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Array, key: jax.Array):
+def _transform_stalks(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Array, key: jax.Array):
     drawn = jax.random.uniform(key, (7,), minval=-1.0, maxval=1.0)
     height, width = shape[0], shape[1]
     still = drawn[0] > 0.5
@@ -120,15 +120,15 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Arr
 def augment_crops(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Augment stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool: width, texture, contrast, mirroring and lighting."""
     light, side, marks, size, contrast, along = jax.random.split(key, 6)
-    crops, masks = _stretched(crops, masks, size)
-    crops = _striped(_set_off(_textured(crops, marks), masks, contrast), masks, along)
+    crops, masks = _stretch(crops, masks, size)
+    crops = _add_stripes(_change_contrast(_add_texture(crops, marks), masks, contrast), masks, along)
     mirror = jax.random.bernoulli(side, 0.5, (crops.shape[0],))
     crops = jnp.where(mirror[:, None, None, None], crops[:, :, ::-1], crops)
     masks = jnp.where(mirror[:, None, None], masks[:, :, ::-1], masks)
     return relight(crops, light), masks
 
 
-def _stretched(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _stretch(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Stretch crops and masks horizontally about their centre by a factor from exp(-0.3) to exp(0.3)."""
     count, _, width = crops.shape[:3]
     wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
@@ -148,7 +148,7 @@ def _stretched(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.
     ) * fraction >= 0.5
 
 
-def _textured(crops: jax.Array, key: jax.Array) -> jax.Array:
+def _add_texture(crops: jax.Array, key: jax.Array) -> jax.Array:
     """Add random speckles, fibres along the stalk and shading to crops, to cover more than the textures of a family."""
     count, height, width = crops.shape[:3]
     spots, fibres, shades, amounts = jax.random.split(key, 4)
@@ -163,7 +163,7 @@ def _textured(crops: jax.Array, key: jax.Array) -> jax.Array:
     return jnp.round(jnp.clip(crops * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
-def _striped(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+def _add_stripes(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     """Add light and dark stripes along the stalk to 70 % of the crops, as of ribs and folded sheaths, varying by internode.
 
     A dark stripe looks like a gap between two stalks, but the stalk continues on its other side.
@@ -184,7 +184,7 @@ def _striped(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     return jnp.round(jnp.clip(crops * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
-def _set_off(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+def _change_contrast(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     """Randomise the contrast of stalks to the background, and their shading towards the edges, in half of the crops.
 
     The shading of a round stalk towards its edges depends on its surface and on the light. A network that overfits to it

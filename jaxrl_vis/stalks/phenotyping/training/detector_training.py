@@ -187,7 +187,12 @@ def _optimiser() -> optax.GradientTransformation:
 
 
 def train(
-    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0, start: Any = None
+    sources: list[Iterator[Example]],
+    settings: Settings,
+    plan: Plan,
+    report: Report,
+    report_interval: float = 30.0,
+    start: Any = None,
 ) -> tuple[Any, int]:
     """Train the networks.
 
@@ -196,7 +201,7 @@ def train(
         settings: Settings of the networks.
         plan: Training schedule.
         report: Progress callback, see `Report`.
-        every: Minimum interval between reports, s.
+        report_interval: Minimum interval between reports, s.
         start: Initial parameters, as returned by this function; None for random initialisation.
 
     Returns:
@@ -225,7 +230,7 @@ def train(
 
     try:
         pool.fill(plan.first)
-        step = repeat(update, pool, plan, started, report, every)
+        step = repeat(update, pool, plan, started, report, report_interval)
     finally:
         pool.close()
     return state[1], step

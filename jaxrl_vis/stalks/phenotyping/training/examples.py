@@ -136,10 +136,12 @@ def cut_out(example: Example, max_size: tuple[int, int], rng: np.random.Generato
     there = shown.all(axis=1) & (example.kinds != NOTHING)
     kinds = np.where(there, example.kinds, NOTHING)
     image = example.image[top : top + lines, left : left + columns]
-    return dataclasses.replace(example, image=np.ascontiguousarray(image), stalks=_clipped(stalks, lines, columns), kinds=kinds)
+    return dataclasses.replace(
+        example, image=np.ascontiguousarray(image), stalks=_clip_stalks(stalks, lines, columns), kinds=kinds
+    )
 
 
-def _clipped(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
+def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
     """Clip the boxes of stalks [T, 6] to an image of ``lines`` x ``columns`` pixels, and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = stalks.T
     slope = (below - above) / np.maximum(bottom - top, 1e-3)
@@ -313,9 +315,9 @@ def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | 
     return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
 
 
-_MOST_ENLARGED = 3.0
+_MAX_ENLARGED = 3.0
 _MAX_CROP_WIDTH = 512  # pixels
-_WIDEST = 2048  # pixels: maximum width of a resized image
+_MAX_WIDTH = 2048  # pixels: maximum width of a resized image
 
 
 def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
@@ -334,7 +336,7 @@ def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
     boxes = [annotation for annotation in data["annotations"] if not annotation.get("iscrowd")]
     if not known:
         tall = float(np.median([annotation["bbox"][3] / widths[annotation["image_id"]] for annotation in boxes]))
-        width = round(min(settings.band_height / tall, _WIDEST, _MOST_ENLARGED * max(widths.values())))
+        width = round(min(settings.band_height / tall, _MAX_WIDTH, _MAX_ENLARGED * max(widths.values())))
         ratio = settings.full_width / settings.width
         settings = dataclasses.replace(
             settings, pixels_per_metre=0.0, width=max(width, 32), full_width=max(round(ratio * width), 32)

@@ -15,7 +15,7 @@ from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
 _CROPS = 8  # stalk crops per batch
-LEAST_SCORE = 0.5
+MIN_SCORE = 0.5
 """Minimum score of a detection to be counted."""
 
 
@@ -44,7 +44,7 @@ class Score:
 
     Attributes:
         images, labels: Numbers of images and of annotated stalks.
-        finds, right: Numbers of detections with a score of at least `LEAST_SCORE`, and of true positives among them.
+        finds, right: Numbers of detections with a score of at least `MIN_SCORE`, and of true positives among them.
         precision, recall, f1: Metrics of these detections; NaN if the denominator is 0.
         ap50: Average precision of all detections at an intersection over union of 0.5; NaN without labels.
         soft: Soft F1, 2 x (sum of the scores of true positives) / (sum of all scores + labels), which is continuous in the
@@ -130,7 +130,7 @@ def score(finds: Sequence[Finds]) -> Score:
     labels = sum(image.labels for image in finds)
     scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])
     right = np.concatenate([image.right[~image.ignored] for image in finds] or [np.zeros(0, bool)])
-    counted = scores >= LEAST_SCORE
+    counted = scores >= MIN_SCORE
     hits, count = int(right[counted].sum()), int(counted.sum())
     nothing = float("nan")
     return Score(

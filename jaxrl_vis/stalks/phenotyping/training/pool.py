@@ -45,10 +45,10 @@ class Pool(Generic[T]):
         except Exception as error:  # raised in the consumer, by `fill`
             self._hand_over(error)
 
-    def _hand_over(self, made: T | Exception | None) -> None:
+    def _hand_over(self, item: T | Exception | None) -> None:
         while not self._stop.is_set():
             try:
-                self._queue.put(made, timeout=0.2)
+                self._queue.put(item, timeout=0.2)
                 return
             except queue.Full:
                 continue

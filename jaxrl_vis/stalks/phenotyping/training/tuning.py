@@ -235,15 +235,15 @@ def _largest(examples: Sequence[Example]) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def heartbeat(words: str, echo: Say) -> Iterator[None]:
+def heartbeat(message: str, echo: Say) -> Iterator[None]:
     """Report progress through ``echo`` at the start and every ten seconds while the context is active."""
     over, began = threading.Event(), time.monotonic()
 
     def beat() -> None:
         while not over.wait(_HEARTBEAT):
-            echo(f"{words}: {time.monotonic() - began:.0f} s")
+            echo(f"{message}: {time.monotonic() - began:.0f} s")
 
-    echo(f"{words} ...")
+    echo(f"{message} ...")
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()
     try:

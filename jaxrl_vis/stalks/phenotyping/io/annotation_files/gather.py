@@ -36,7 +36,7 @@ def gather(folder: Path) -> list[tuple[Any, Annotated]]:
     index = _Index(folder)
     for _, image in images:
         if isinstance(image.name, str):
-            index.settle(image)
+            index.resolve_name(image)
         image.annotations = together(image.annotations)
     return images
 
@@ -186,7 +186,7 @@ class _Index:
             self._by_name.setdefault(path.name.lower(), []).append(path)
             self._by_name.setdefault(path.stem.lower() + "\0", []).append(path)
 
-    def settle(self, image: Annotated) -> None:
+    def resolve_name(self, image: Annotated) -> None:
         """Set ``image.name`` to the path of its file relative to the folder, and its width and height if they are missing.
 
         Modifies ``image`` in place; it is unchanged if no such file exists.

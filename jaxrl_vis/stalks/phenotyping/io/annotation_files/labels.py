@@ -37,7 +37,7 @@ def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str
     else:
         taken = {name for name in names if _names_a_stalk(name)}
     if not taken and names:
-        there = _listed(names)
+        there = _format_labels(names)
         if labels:
             raise RequestError(f"{source}: nothing is called {', '.join(labels)} there, but {there}: name one with --label")
         example = next((name for name, _ in names.most_common() if name), "stem")
@@ -47,7 +47,7 @@ def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str
         )
     left_out = Counter({name: count for name, count in names.items() if name not in taken})
     chosen = Counter({name: count for name, count in names.items() if name in taken})
-    summary = f"stalks: {_listed(chosen)}" + (f"; left out as none: {_listed(left_out)}" if left_out else "")
+    summary = f"stalks: {_format_labels(chosen)}" + (f"; left out as none: {_format_labels(left_out)}" if left_out else "")
     return [annotation for annotation in annotations if _clean_name(annotation.get("name", "")) in taken], summary
 
 
@@ -61,6 +61,6 @@ def _clean_name(name: Any) -> str:
     return " ".join(str(name).split())[:200]
 
 
-def _listed(names: Counter[str]) -> str:
+def _format_labels(names: Counter[str]) -> str:
     parts = [f"{readable(name) or 'without a name'} ({count})" for name, count in names.most_common(_SHOWN)]
     return ", ".join(parts) + (f" and {len(names) - _SHOWN} others" if len(names) > _SHOWN else "")

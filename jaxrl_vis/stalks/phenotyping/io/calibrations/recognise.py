@@ -35,7 +35,7 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPa
         RequestError: There is no calibration, or it cannot be read.
     """
     if path.is_dir():
-        return _in_folder(path, image)
+        return _find_in_folder(path, image)
     cameras = _read(path, image)
     if not isinstance(cameras, list):
         return cameras
@@ -51,7 +51,7 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPa
         raise RequestError(
             f"there is no calibration {path.with_stem(other)}: name a file of a pair, or a folder with left.yaml and right.yaml"
         )
-    return _of_sides(pair, path, image)
+    return _read_sides(pair, path, image)
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -70,11 +70,11 @@ def named_pair(files: list[Path]) -> Path | None:
     return zed_files[0] if zed_files else None
 
 
-def _in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
+def _find_in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
     files = files_in(folder)
     pairs = {pair for pair in map(both_sides, files) if pair is not None}
     if len(pairs) == 1:
-        return _of_sides(pairs.pop(), folder, image)
+        return _read_sides(pairs.pop(), folder, image)
     if len(pairs) > 1:
         names = " and ".join(readable(left.name) for left, _ in sorted(pairs))
         raise RequestError(f"{folder} holds several pairs of calibrations, of {names}: name one of the files")
@@ -99,7 +99,7 @@ def both_sides(path: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _of_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> RectifiedPair | RawPair:
+def _read_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> RectifiedPair | RawPair:
     cameras: list[dict[str, Any]] = []
     for file in pair:
         parsed = _read(file, image)
@@ -143,10 +143,10 @@ def _read(path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict
         raise RequestError(
             f"{path} is not a calibration: it is neither YAML nor XML as OpenCV and ROS write it ({why})"
         ) from error
-    return _of_store(store, path, image)
+    return _read_store(store, path, image)
 
 
-def _of_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
+def _read_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
     if isinstance(store, list):
         raise RequestError(f"{path} is not a calibration: it holds a list, not names with values such as P1 and P2")
     if not isinstance(store, dict):

@@ -71,8 +71,8 @@ def both_in_one(store: dict[str, Any]) -> list[dict[str, Any]] | None:
     return None
 
 
-def _beginning_with(store: dict[str, Any], begin: str) -> dict[str, Any]:
-    return {name.removeprefix(begin): value for name, value in store.items() if name.startswith(begin)}
+def _beginning_with(store: dict[str, Any], prefix: str) -> dict[str, Any]:
+    return {name.removeprefix(prefix): value for name, value in store.items() if name.startswith(prefix)}
 
 
 def from_print(text: str) -> dict[str, Any] | None:

@@ -37,12 +37,12 @@ def nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, 
     if not left or not right:
         return {}
     reach = min(_interval(list(times.values())) for times in (left, right)) / 2
-    there = _nearest_of(left, right)
-    back = _nearest_of(right, left)
+    there = _find_nearest(left, right)
+    back = _find_nearest(right, left)
     return {name: other for name, other in there.items() if back[other] == name and abs(left[name] - right[other]) <= reach}
 
 
-def _nearest_of(names: Mapping[str, float], others: Mapping[str, float]) -> dict[str, str]:
+def _find_nearest(names: Mapping[str, float], others: Mapping[str, float]) -> dict[str, str]:
     ordered = sorted(others.items(), key=lambda item: item[1])
     matched, place = {}, 0
     for name, time in sorted(names.items(), key=lambda item: item[1]):

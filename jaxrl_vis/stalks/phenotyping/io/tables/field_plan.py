@@ -55,10 +55,10 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
     table = [
         [unescape_cell(row[place].strip()) if place < len(row) else "" for place in range(len(columns))] for _, row in rows
     ]
-    by_column = [(place, _matched([row[place] for row in table], plots)) for place in ids]
+    by_column = [(place, _match_names([row[place] for row in table], plots)) for place in ids]
     place, matched = max(by_column, key=lambda match: len(match[1]), default=(None, {}))
     if not matched:
-        matched, place = _by_range(small, table, plots), None
+        matched, place = _match_by_range(small, table, plots), None
     if not matched:
         raise RequestError(
             _no_plot_message(path, [columns[one] for one in ids], [row[ids[0]] for row in table] if ids else [], plots)
@@ -77,14 +77,14 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
     return [columns[one] for one in others], plan
 
 
-def _matched(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[int]]:
+def _match_names(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[int]]:
     """Return the row indices of each plot, by the first method of comparing names that matches and tells the plots apart.
 
     Args:
         names: Identifier in each row.
         plots: Names of the plots.
     """
-    for normalise in (str, _last, _number):
+    for normalise in (str, _last_number, _number):
         rows: dict[str, list[int]] = {}
         for number, name in enumerate(names):
             if name and normalise(name):
@@ -95,17 +95,17 @@ def _matched(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[int]]
     return {}
 
 
-def _last(name: str) -> str:
+def _last_number(name: str) -> str:
     return re.split(r"[/\\]", name)[-1].casefold()
 
 
 def _number(name: str) -> str:
     """Return the last number in a plot's name, without leading zeros; empty if there is none."""
-    numbers = re.findall(r"\d+", _last(name))
+    numbers = re.findall(r"\d+", _last_number(name))
     return str(int(numbers[-1])) if numbers and len(numbers[-1]) < 20 else ""
 
 
-def _by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plots: Sequence[str]) -> dict[str, list[int]]:
+def _match_by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plots: Sequence[str]) -> dict[str, list[int]]:
     """Return the row indices of the plots whose names hold the numbers of their range and of their row or column."""
     places = {name: columns.index(name) for name in ("range", "row", "column", "col", "pass") if name in columns}
     across = [name for name in places if name != "range"]
