@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.plants.texture import hash_words, normal
+from jaxrl_vis_envs.plants.rendering.texture import hash_words, normal
 
 _PSF_RADIUS = 4  # pixels, of the point spread function
 

@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 
 from jaxrl_vis_envs.plants.cameras import Calibration, Pose
-from jaxrl_vis_envs.plants.surfaces import Surfaces
+from jaxrl_vis_envs.plants.rendering.surfaces import Surfaces
 
 NEAR, FAR = 0.15, 6.0
 """Minimum and maximum rendered depth, m."""
