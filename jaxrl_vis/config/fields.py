@@ -97,10 +97,13 @@ class Field:
 
 
 def describe(record: type, group: str = "") -> list[Field]:
-    """List the fields of a dataclass, with groups (fields that are dataclasses themselves) replaced by their fields."""
+    """List the fields of a dataclass, with groups (fields that are dataclasses themselves) replaced by their fields.
+
+    Keyword-only fields, such as those of a mixin, come last.
+    """
     annotated = typing.get_type_hints(record, include_extras=True)
     described = []
-    for field in dataclasses.fields(record):
+    for field in sorted(dataclasses.fields(record), key=lambda field: field.kw_only):
         hint = annotated[field.name]
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             described += describe(hint, field.name)
