@@ -10,9 +10,10 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.storage import metrics, scores
-from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, read_run_id
 from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.types import LoopState
 
 

@@ -40,11 +40,12 @@ from jaxrl_vis.run.reports import Callback, Report
 from jaxrl_vis.run.saving import Saver, import_saving_libraries
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage import metrics
-from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
 from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
 from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.run.trained.results import Results, describe
 from jaxrl_vis.types import LoopState
 

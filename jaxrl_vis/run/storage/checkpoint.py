@@ -17,7 +17,7 @@ checkpoints/replaced/ until the new one is complete.
 """
 
 import contextlib
-import dataclasses
+import functools
 import itertools
 import shutil
 from collections.abc import Callable, Iterator
@@ -27,11 +27,12 @@ from typing import TYPE_CHECKING, Any
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.files import read_json
-from jaxrl_vis.run.storage import hush, sums
-from jaxrl_vis.run.storage.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
-from jaxrl_vis.run.storage.manifest import FILE, SCHEMA, is_manifest
+from jaxrl_vis.run.storage import hush, restoring, sums
+from jaxrl_vis.run.storage.arrays import describe, to_save
+from jaxrl_vis.run.storage.manifest import FILE, SCHEMA
 from jaxrl_vis.run.storage.metrics import RUN_ID
 from jaxrl_vis.run.storage.recent import ANY_RUN, Recent, Unusable
+from jaxrl_vis.run.storage.restoring import Restored, state_without_learner
 from jaxrl_vis.types import LoopState, TrainState
 
 if TYPE_CHECKING:  # orbax takes a fifth of this package's import time, so it is imported where it is used
@@ -44,48 +45,10 @@ _TIMEOUT_S = 10**9
 DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
 
 
-@contextlib.contextmanager
-def _damage_first(where: Path) -> Iterator[None]:
-    """Raise Unusable instead of a RequestError if files of the checkpoint have changed: damage is not another version."""
-    try:
-        yield
-    except RequestError:
-        changes = None
-        with contextlib.suppress(OSError):
-            changes = sums.compare_sums(where)
-        if changes:
-            raise Unusable(changes[0]) from None
-        raise
-
-
-@dataclasses.dataclass(frozen=True)
-class Restored:
-    """Contents of a checkpoint.
-
-    Attributes:
-        tier: `LIGHT`, `FULL`, `RECENT` or `BEST`.
-        iteration: Iterations completed.
-        train: The learner, [S, ...].
-        loop: The complete state; None from the light tier.
-        progress: Progress that was saved with it.
-    """
-
-    tier: str
-    iteration: int
-    train: TrainState
-    loop: LoopState | None
-    progress: dict[str, Any]
-
-
 def _free(path: Path) -> Path:
     """Return an unused path: ``path`` itself, or the first free one of path-2, path-3, ..."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())
-
-
-def state_without_learner(loop: LoopState) -> dict[str, Any]:
-    """Return the part of a loop state that full checkpoints have in addition to the learner."""
-    return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
 
 
 class Checkpoints:
@@ -186,7 +149,7 @@ class Checkpoints:
         self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
 
     def save_best(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
-        """Write the learner, wait for the disk, and only then delete the best one before. See `save_light`."""
+        """Write the learner, wait for the disk, then delete the previous best checkpoint. See `save_light`."""
         self._save(BEST, iteration, {"train": to_save(train, copy=False)}, progress)
         self.wait()
         for earlier in self.iterations(BEST):
@@ -416,38 +379,15 @@ class Checkpoints:
         return None
 
     def _read_manifest(self, tier: str, iteration: int) -> dict[str, Any]:
-        import orbax.checkpoint as ocp
-
-        manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
-        if not is_manifest(manifest):
-            raise Unusable("its manifest is incomplete")
         where = self._folder / tier / str(iteration)
-        with _damage_first(where):
-            if manifest["schema"] != SCHEMA:
-                raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
-        return manifest
+        return restoring.read_manifest(functools.partial(self._read, tier, iteration), where)
 
     def _restored(
         self, tier: str, iteration: int, template: LoopState, with_replay: bool, manifest: dict[str, Any]
     ) -> Restored:
-        import orbax.checkpoint as ocp
-
-        templates = {"train": template.train} | ({"rest": state_without_learner(template)} if with_replay else {})
-        specs = {name: host_specs(tree) for name, tree in templates.items()}
-        where = self._folder / tier / str(iteration)
-        for name, spec in specs.items():
-            with _damage_first(where):
-                check_structure(where, manifest["items"].get(name, {}), spec)
-            specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
-        read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
-        trees = {}
-        for name, tree in templates.items():
-            for leaf_name, array in to_host(read[name], copy=False).items():
-                if not is_intact(array, manifest["items"][name][leaf_name]):
-                    raise Unusable(f"wrong checksum of {leaf_name}")
-            trees[name] = rebuild(tree, read[name])
-        loop = LoopState(train=trees["train"], **trees["rest"]) if with_replay else None
-        return Restored(tier, iteration, trees["train"], loop, manifest["progress"])
+        read, where = functools.partial(self._read, tier, iteration), self._folder / tier / str(iteration)
+        train, loop = restoring.restore_items(read, where, manifest, template, with_replay)
+        return Restored(tier, iteration, train, loop, manifest["progress"])
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
         import orbax.checkpoint as ocp

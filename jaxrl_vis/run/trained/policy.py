@@ -18,7 +18,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
-from jaxrl_vis.run.storage.checkpoint import Restored
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.run.trained import policy_file
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 from jaxrl_vis.run.trained.shipped import find

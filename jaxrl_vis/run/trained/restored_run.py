@@ -13,8 +13,9 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.acting.evaluate import num_recorded
 from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.compiled.memory import check_compiled
-from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.storage.folder import read_config, read_run_id
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.run.trained import policy_file
 from jaxrl_vis.run.trained.shipped import find
 from jaxrl_vis.run.trainer import Trainer, make_trainer

@@ -10,9 +10,10 @@ from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.loop import GUARD
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.arrays import is_intact, to_host
-from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT, state_without_learner
+from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.storage.restoring import state_without_learner
 from jaxrl_vis.run.verifying.inspection import Expected, Findings, listed
 from jaxrl_vis.types import LoopState
 
