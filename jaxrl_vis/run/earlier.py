@@ -40,7 +40,7 @@ def has_ended_early(folder: RunFolder, config: Config, seeds: Collection[int], i
     return config.run.stop_at is not None and iteration in scores.enough_at(config, folder.rows(), seeds)
 
 
-def print_finished(folder: RunFolder, checkpoints: Checkpoints, config: Config, total: int) -> str:
+def finished_message(folder: RunFolder, checkpoints: Checkpoints, config: Config, total: int) -> str:
     """Return the message for a complete run, including how to continue it."""
     last = _last_saved(checkpoints)
     if last < total:
@@ -112,10 +112,10 @@ def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
         return []
     moved = checkpoints.set_foreign_aside()
     report = cut_back(folder, checkpoints, sys.maxsize, keeps_later=False)
-    return [*map(print_foreign_warning, moved), *([report] if report else [])]
+    return [*map(foreign_message, moved), *([report] if report else [])]
 
 
-def print_foreign_warning(path: Path) -> str:
+def foreign_message(path: Path) -> str:
     """Return a message about another run's file and its new location."""
     return f"not of this run, and left out: {path}"
 

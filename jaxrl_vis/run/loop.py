@@ -120,7 +120,7 @@ class RunLoop:
             if is_resumed and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._echo):
                 if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
                     self._echo(said)
-                self._echo(earlier.print_finished(self._folder, self._checkpoints, self._config, self._total))
+                self._echo(earlier.finished_message(self._folder, self._checkpoints, self._config, self._total))
                 return
             interruption = Interruption()
             try:
@@ -267,7 +267,7 @@ class RunLoop:
         for path in damaged:
             self._echo(f"kept for inspection: {path}")
         for path in foreign:
-            self._echo(earlier.print_foreign_warning(path))
+            self._echo(earlier.foreign_message(path))
         self._loggers.open(read_record(self._folder.path), self._programs.seeds, self._folder.rows())
 
     def _take_over(self, restored: Restored) -> None:
@@ -423,8 +423,8 @@ class RunLoop:
                 words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")
         self._echo("  ".join(words))
 
-    def _warn_if_filtered(self, metrics: PerSeed) -> None:
-        too_much = max(metrics.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
+    def _warn_if_filtered(self, values: PerSeed) -> None:
+        too_much = max(values.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
         self._progress.filtered = self._progress.filtered + 1 if too_much else 0
         if self._progress.filtered == _FILTERED_EVALUATIONS:
             self._echo(
