@@ -135,7 +135,7 @@ def with_decay(task: str, variant: str, decay: float) -> Record:
     """Return the run with a decay of the target networks; for the hand, with the authors' view."""
     stem = f"{task}-{variant}-paper" if task != HAND else f"{HAND}-view=fingertips-{variant}-paper"
     if decay != 0.98:
-        return study("target_decay", f"{stem}-decay{decay:g}", fresh=True)
+        return study("target_decay", f"{stem}-decay{decay:g}", is_fresh=True)
     if task == HAND:
         return ol_aux.run(HAND, variant, ol_aux.VIEW)
     return ol_aux.claim(task, variant)

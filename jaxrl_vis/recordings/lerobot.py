@@ -126,7 +126,7 @@ class _Writer:
                 encoded = [
                     {"bytes": data, "path": None}
                     for episode in range(self._recordings.count)
-                    for data in self._encoded(name, episode)
+                    for data in self._encode_video(name, episode)
                 ]
                 columns[name] = pa.array(encoded, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
             elif feature["dtype"] != "video":
@@ -138,7 +138,7 @@ class _Writer:
                 )
         pq.write_table(pa.table(columns), self._path(form.DATA))
 
-    def _encoded(self, name: str, episode: int) -> list[bytes]:
+    def _encode_video(self, name: str, episode: int) -> list[bytes]:
         """Encode the images of an episode before each action; the goal's image is encoded only once."""
         shown = self._images(name, episode)[:-1]
         if name == form.GOAL_DEPTH:

@@ -71,7 +71,7 @@ class _Reader:
         seen, goals = self._observations(is_ours)
         states = goal_states = success = None
         if is_ours and form.TRUE_STATE in self._features:
-            states = self._closed(form.TRUE_STATE, self._numbers(form.TRUE_STATE))
+            states = self._append_last(form.TRUE_STATE, self._numbers(form.TRUE_STATE))
             goal_states = self._numbers(form.TRUE_GOAL)[:, 0]
         if is_ours and form.SUCCESS in rows[0]:
             success = np.array([row[form.SUCCESS] for row in rows], np.bool_)
@@ -96,7 +96,7 @@ class _Reader:
         values = flat.to_numpy(zero_copy_only=False).astype(np.float32)
         return values.reshape(len(self._rows), self._steps, size)
 
-    def _closed(self, name: str, values: np.ndarray) -> np.ndarray:
+    def _append_last(self, name: str, values: np.ndarray) -> np.ndarray:
         """Append the value after the last action to a column [N, T, ...]: [N, T+1, ...]."""
         last = np.array([row[form.LAST + name] for row in self._rows], values.dtype)
         return np.concatenate([values, last[:, None]], axis=1)
@@ -123,7 +123,7 @@ class _Reader:
         if not is_ours:
             return seen, None
         goals_of_all = self._numbers(form.GOAL)[:, 0] if form.GOAL in self._features else None
-        return self._closed(form.STATE, seen), goals_of_all
+        return self._append_last(form.STATE, seen), goals_of_all
 
     def _images(self, name: str, count: int | None = None) -> np.ndarray:
         """Return the first ``count`` images of every episode, or all T: [N, count, H, W, 3] uint8."""

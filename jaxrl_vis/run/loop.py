@@ -204,7 +204,7 @@ class RunLoop:
 
         started = time.monotonic()
         self._echo(f"compiling ({programs.cache_message()}) ...")
-        compiled = programs.compile(meanwhile=import_saving_libraries)
+        compiled = programs.compile(concurrent_work=import_saving_libraries)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s
         return compiled

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.host import distributed
-from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
+from jaxrl_vis.run.compiled.nonfinite import dump, nonfinite_simulation
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
@@ -201,7 +201,7 @@ class Saver:
     def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
         # The guard checks losses and states; a parameter that breaks in the very last update appears in those of the next
         # iteration.
-        if broken := self._programs.broken_leaves(loop):
+        if broken := self._programs.nonfinite_leaves(loop):
             self.stop_nonfinite(loop, iteration, f"the state after iteration {iteration}", {}, broken)
 
     def stop_nonfinite(
@@ -211,7 +211,7 @@ class Saver:
         with contextlib.suppress(StorageError):
             self._checkpoints.wait()
         newest = self._checkpoints.newest()
-        leaves = self._programs.broken_leaves(loop) if broken is None else broken
+        leaves = self._programs.nonfinite_leaves(loop) if broken is None else broken
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
         simulated, dumped = None, "the state is distributed over several processes and is not dumped"
@@ -221,7 +221,7 @@ class Saver:
                 dumped = f"state dumped to {file}"
             except OSError as error:
                 dumped = f"the state cannot be written to {file} ({error.strerror or type(error).__name__})"
-            simulated = made_by_simulation(loop, self._programs.config.run.num_envs)
+            simulated = nonfinite_simulation(loop, self._programs.config.run.num_envs)
             if simulated is None and not leaves and values and all(name.startswith("eval/") for name in values):
                 simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves

@@ -244,7 +244,7 @@ def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
     return {name: vector[index] for index, name in enumerate(loss_order(names))}
 
 
-def settled(updated: WeightingState, previous: WeightingState) -> WeightingState:
+def keep_dtypes(updated: WeightingState, previous: WeightingState) -> WeightingState:
     """Cast a state to the dtypes of the previous one, as required for the carry of a scan."""
     return jax.tree.map(lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype), updated, previous)
 
@@ -339,7 +339,7 @@ def next_state(state: WeightingState, weights: Weights, **more: Any) -> tuple[We
         weights: Weights of this step; or of the next one, if they do not depend on the gradients that they combine.
         more: New values of other fields.
     """
-    after = settled(state.replace(weights=weights, updates=state.updates + 1, **more), state)
+    after = keep_dtypes(state.replace(weights=weights, updates=state.updates + 1, **more), state)
     return after, {f"weight/{name}": weight for name, weight in after.weights.items()}
 
 

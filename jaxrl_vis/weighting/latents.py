@@ -134,7 +134,7 @@ class Differentiated:
     at_latents: AtLatents
     extra: Any
 
-    def combined(self, params: Params, coefficients: Mapping[str, jax.Array]) -> Params:
+    def combine_heads(self, params: Params, coefficients: Mapping[str, jax.Array]) -> Params:
         """Sum the weighted gradients with respect to the parameters, except for the paths through latents: float32."""
         leaves, structure = jax.tree.flatten(params)
 

@@ -91,17 +91,17 @@ def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.A
         rounding = 10.0 * eps * (jnp.dot(jnp.abs(matrix), jnp.abs(x)) + jnp.abs(target))
         return x, jnp.where(free, x < -10.0 * eps * jnp.max(jnp.abs(x)), slack < -rounding)
 
-    def step(now: _Pivots) -> _Pivots:
-        number = jnp.sum(now.wrong, dtype=jnp.int32)
-        progress = number < now.fewest
-        last = jnp.arange(count) == jnp.max(jnp.where(now.wrong, jnp.arange(count), -1))
-        exchanged = jnp.where(progress | (now.patience > 0), now.wrong, last)
-        patience = jnp.where(progress, _PATIENCE, jnp.maximum(now.patience - 1, 0))
-        free = now.free ^ exchanged
-        return _Pivots(free, *solve(free), jnp.minimum(number, now.fewest), patience, now.steps + 1)
+    def step(state: _Pivots) -> _Pivots:
+        number = jnp.sum(state.wrong, dtype=jnp.int32)
+        progress = number < state.fewest
+        last = jnp.arange(count) == jnp.max(jnp.where(state.wrong, jnp.arange(count), -1))
+        exchanged = jnp.where(progress | (state.patience > 0), state.wrong, last)
+        patience = jnp.where(progress, _PATIENCE, jnp.maximum(state.patience - 1, 0))
+        free = state.free ^ exchanged
+        return _Pivots(free, *solve(free), jnp.minimum(number, state.fewest), patience, state.steps + 1)
 
     first = _Pivots(free, *solve(free), jnp.int32(count + 1), jnp.int32(_PATIENCE), jnp.int32(0))
-    last = jax.lax.while_loop(lambda now: jnp.any(now.wrong) & (now.steps < _PIVOTS), step, first)
+    last = jax.lax.while_loop(lambda state: jnp.any(state.wrong) & (state.steps < _PIVOTS), step, first)
     return jnp.maximum(last.solution, 0.0), last.free
 
 
@@ -186,20 +186,20 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
         weights, free = min_norm(shifted, free, passes, min_length=float(eps) ** (1 / 6))
         return weights, jnp.sqrt(jnp.maximum(quadratic(scaled, weights), 0.0)), free
 
-    def step(now: _Bracket) -> _Bracket:
-        t = (now.low * now.at_high - now.high * now.at_low) / (now.at_high - now.at_low)
-        t = jnp.where((t > now.low) & (t < now.high), t, 0.5 * (now.low + now.high))
-        _, length, free = evaluate(t, now.free)
+    def step(state: _Bracket) -> _Bracket:
+        t = (state.low * state.at_high - state.high * state.at_low) / (state.at_high - state.at_low)
+        t = jnp.where((t > state.low) & (t < state.high), t, 0.5 * (state.low + state.high))
+        _, length, free = evaluate(t, state.free)
         above = length > t
         error = length - t
-        at_low = jnp.where(above, error, jnp.where(now.kept_end == -1, 0.5 * now.at_low, now.at_low))
-        at_high = jnp.where(above, jnp.where(now.kept_end == 1, 0.5 * now.at_high, now.at_high), error)
-        low, high = jnp.where(above, t, now.low), jnp.where(above, now.high, t)
-        return _Bracket(low, high, at_low, at_high, jnp.where(above, 1, -1).astype(jnp.int32), free, error, now.steps + 1)
+        at_low = jnp.where(above, error, jnp.where(state.kept_end == -1, 0.5 * state.at_low, state.at_low))
+        at_high = jnp.where(above, jnp.where(state.kept_end == 1, 0.5 * state.at_high, state.at_high), error)
+        low, high = jnp.where(above, t, state.low), jnp.where(above, state.high, t)
+        return _Bracket(low, high, at_low, at_high, jnp.where(above, 1, -1).astype(jnp.int32), free, error, state.steps + 1)
 
-    def is_open(now: _Bracket) -> jax.Array:
-        wide = now.high - now.low > 4.0 * eps * now.high
-        return wide & (jnp.abs(now.error) > 4.0 * eps * now.high) & (now.steps < _ROOT_STEPS)
+    def is_open(state: _Bracket) -> jax.Array:
+        wide = state.high - state.low > 4.0 * eps * state.high
+        return wide & (jnp.abs(state.error) > 4.0 * eps * state.high) & (state.steps < _ROOT_STEPS)
 
     zero, one = jnp.zeros((), scaled.dtype), jnp.ones((), scaled.dtype)
     _, at_one, free = evaluate(one, jnp.zeros(len(gramian), bool))
@@ -244,25 +244,25 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
         utility = jnp.log(x) if power == 1.0 else x ** (1.0 - power) / (1.0 - power)
         return 0.5 * quadratic(unit, x) - jnp.sum(preferences * utility)
 
-    def step(now: _Newton) -> _Newton:
-        pull = preferences * now.x**-power
-        slope = jnp.dot(unit, now.x, precision=jax.lax.Precision.HIGHEST) - pull
-        hessian = unit + jnp.diag(power * pull / now.x)
+    def step(state: _Newton) -> _Newton:
+        pull = preferences * state.x**-power
+        slope = jnp.dot(unit, state.x, precision=jax.lax.Precision.HIGHEST) - pull
+        hessian = unit + jnp.diag(power * pull / state.x)
         change = -jnp.linalg.solve(hessian, slope)
         decrement = -jnp.dot(slope, change)
         # Up to 0.99 of the way to the nearest x_i = 0.
-        farthest = jnp.minimum(1.0, 0.99 / jnp.maximum(jnp.max(-change / now.x), eps))
-        lengths = farthest * 0.5 ** jnp.arange(_HALVINGS, dtype=now.x.dtype)
-        values = jax.vmap(lambda length: objective(now.x + length * change))(lengths)
+        farthest = jnp.minimum(1.0, 0.99 / jnp.maximum(jnp.max(-change / state.x), eps))
+        lengths = farthest * 0.5 ** jnp.arange(_HALVINGS, dtype=state.x.dtype)
+        values = jax.vmap(lambda length: objective(state.x + length * change))(lengths)
         # Close to the minimum, the objective no longer distinguishes steps, and full ones converge quadratically.
         length = jnp.where(decrement < 1e-2, farthest, lengths[jnp.argmin(values)])
-        x = now.x + length * change
+        x = state.x + length * change
         pull = preferences * x**-power
         slope = jnp.dot(unit, x, precision=jax.lax.Precision.HIGHEST) - pull
-        return _Newton(x, jnp.max(jnp.abs(slope) / pull), now.steps + 1)
+        return _Newton(x, jnp.max(jnp.abs(slope) / pull), state.steps + 1)
 
     first = _Newton(preferences ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
-    last = jax.lax.while_loop(lambda now: (now.residual > 20.0 * eps) & (now.steps < _NEWTON_STEPS), step, first)
+    last = jax.lax.while_loop(lambda state: (state.residual > 20.0 * eps) & (state.steps < _NEWTON_STEPS), step, first)
     return last.x * scale / lengths
 
 

@@ -125,7 +125,7 @@ def test_the_oldest_programs_make_room(folder, program, monkeypatch):
         path = folder / f"init-{age}.stablehlo"
         path.write_bytes(b"old")
         os.utime(path, (1000 - age, 1000 - age))
-    monkeypatch.setattr(trace_cache, "MOST_FILES", 5)
+    monkeypatch.setattr(trace_cache, "MAX_FILES", 5)
     Programs(CONFIG, program, keep=True).compile()
     assert names_in(folder) == ["init", "init", "init", "learn", "play"]
     assert {"init-0.stablehlo", "init-1.stablehlo"} <= {path.name for path in folder.iterdir()}

@@ -19,7 +19,7 @@ from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import loop as run_loop
 from jaxrl_vis.run import trainer
 from jaxrl_vis.run.compiled import memory
-from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
+from jaxrl_vis.run.compiled.nonfinite import dump, nonfinite_simulation
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.checkpoint import Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, default_folder, read_config
@@ -90,7 +90,7 @@ def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkey
     memory.check_compiled(compiled, is_allocated=False)
     state = compiled["learn"].memory_analysis().argument_size_in_bytes
     monkeypatch.setattr(memory, "available_bytes", lambda: state + 100)
-    with pytest.raises(RequestError, match="(evaluate|learn|play|broken_leaves) needs .* --eval-episodes") as refused:
+    with pytest.raises(RequestError, match="(evaluate|learn|play|nonfinite_leaves) needs .* --eval-episodes") as refused:
         memory.check_compiled(compiled, is_allocated=False)
     assert "\n" not in str(refused.value)
     monkeypatch.setattr(restored_run, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
@@ -152,7 +152,7 @@ def test_where_a_simulation_went_wrong(name, place, said):
     broken = getattr(episodes, name).at[place].set(np.inf)
     after = episodes.states.at[place[0], place[1], 4:6].set(np.nan) if name == "actions" else episodes.states
     episodes = episodes.replace(**({"states": after} | {name: broken}))
-    evidence = made_by_simulation(loop.replace(replay=loop.replay.replace(episodes=episodes)), 2)
+    evidence = nonfinite_simulation(loop.replace(replay=loop.replay.replace(episodes=episodes)), 2)
     assert evidence == (said and f"{said}, and all actions before it are")
 
 

@@ -169,7 +169,7 @@ def test_rows_that_do_not_fit_are_found(straight, tmp_path, change, problem):
     write_rows(tmp_path, change(rows_in(straight[0])))
     findings, expected = Findings(), expected_in(straight[0])
     rows = read_file(tmp_path / "metrics.jsonl", expected, False, findings)
-    missing = missing_rows(rows, expected, reached=8, total=8, without=(), is_written=False)
+    missing = missing_rows(rows, expected, iteration=8, total=8, without=(), is_written=False)
     assert problem in "; ".join(findings.problems + missing)
 
 
@@ -224,7 +224,7 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
 @pytest.fixture
 def killed(run_trainer, tmp_path, monkeypatch) -> Path:
     """A run that kept a recent state after each iteration, and nothing else, and was killed after the sixth."""
-    monkeypatch.setattr(recent, "_SHARE", math.inf)
+    monkeypatch.setattr(recent, "_FRACTION", math.inf)
     path = tmp_path / "killed"
     reports = run_trainer(small_config(checkpoint_interval=0, full_checkpoint_interval=0), path).run()
     for report in reports:

@@ -273,7 +273,7 @@ def trained():
     said = []
     sources = [iter([drawing(seed) for seed in range(24)])]
     plan = Plan(steps=160, images=24, first=24, batch=4, crops=4, rate=4e-3, average=0.9)
-    params, steps = train(sources, TINY, plan, lambda step, *rest: said.append((step, rest[2])), every=0.0)
+    params, steps = train(sources, TINY, plan, lambda step, *rest: said.append((step, rest[2])), report_interval=0.0)
     return params, steps, said
 
 
@@ -305,7 +305,7 @@ def test_networks_learn_to_find_and_outline(trained, tmp_path):
 def test_a_loss_that_is_not_finite_stops_the_training():
     plan = Plan(steps=40, images=2, first=2, batch=4, crops=4, rate=float("nan"))
     with pytest.raises(NonFiniteError, match="not finite at step"):
-        train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None, every=0.0)
+        train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None, report_interval=0.0)
 
 
 def test_a_training_without_time_for_an_update_is_told():

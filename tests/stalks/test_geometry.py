@@ -11,9 +11,9 @@ from PIL import Image, ImageOps
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 from jaxrl_vis.stalks.phenotyping.detector.finder import (
     Detection,
-    _is_shown,
-    _moved,
-    _without_border,
+    _clear_border_rows,
+    _in_whole_image,
+    _is_inside_frame,
     pad_to_training_height,
     resize,
 )
@@ -239,12 +239,14 @@ def test_finds_on_borders_are_none_and_masks_end_before_them():
     shown = np.ones((100, 80), bool)
     shown[:, :30] = False
     frame = Frame((0, 100), (0, 80), shown)
-    assert not _is_shown(np.array([10, 10, 30, 90, 20, 20]), frame) and _is_shown(np.array([40, 10, 60, 90, 50, 50]), frame)
+    assert not _is_inside_frame(np.array([10, 10, 30, 90, 20, 20]), frame) and _is_inside_frame(
+        np.array([40, 10, 60, 90, 50, 50]), frame
+    )
     mask = np.ones((4, 20), np.float32)
     mask[2:, :5] = 0.0
-    np.testing.assert_array_equal(_without_border(mask, (10, 25), frame).any(axis=1), [False, False, True, True])
+    np.testing.assert_array_equal(_clear_border_rows(mask, (10, 25), frame).any(axis=1), [False, False, True, True])
     find = Detection((1.0, 2.0, 3.0, 4.0), (1.5, 2.5), 1.0, mask, (2, 1), (mask, (0, 1)))
-    moved = _moved(find, Frame((7, 100), (30, 80)))
+    moved = _in_whole_image(find, Frame((7, 100), (30, 80)))
     assert moved.box == (31.0, 9.0, 33.0, 11.0) and moved.axis == (31.5, 32.5) and moved.corner == (9, 31)
     assert moved.upper is not None and moved.upper[1] == (7, 31)
 

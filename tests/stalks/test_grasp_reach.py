@@ -119,7 +119,7 @@ def test_what_can_be_reached_is_what_the_geometry_allows(place: tuple[float, flo
 def test_the_way_is_a_straight_line_out_of_the_shoulder():
     timing, target = control.Timing(), jnp.array([0.2, 0.05, 0.9])
     times = jnp.linspace(timing.turn, timing.reach, 30)
-    way = np.asarray(jax.vmap(lambda time: control.planned(target, jnp.asarray(control.HOME), time, timing))(times))
+    way = np.asarray(jax.vmap(lambda time: control.plan_movement(target, jnp.asarray(control.HOME), time, timing))(times))
     np.testing.assert_allclose(way[-1], target, atol=1e-5)
     away, line = way[:, :2] - stalk_arm.SHOULDER, np.asarray(target)[:2] - stalk_arm.SHOULDER
     assert np.abs(away[:, 0] * line[1] - away[:, 1] * line[0]).max() < 1e-5

@@ -13,7 +13,7 @@ from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.detector.detect import initial
+from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
@@ -45,7 +45,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
     detector, segmenter = jax.random.split(jax.random.key(3))
     params = {
-        "detector": initial(TINY, detector),
+        "detector": init_detector(TINY, detector),
         "segmenter": Segmenter(TINY.segmenter).init(segmenter, np.zeros((1, 32, 32, 3), np.float32)),
     }
     write_weights(path, params, dataclasses.replace(TINY, candidates=7), {"origin": "nothing"})

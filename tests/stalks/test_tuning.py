@@ -12,7 +12,7 @@ import pytest
 from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
-from jaxrl_vis.stalks.phenotyping.detector.detect import initial, padded_shape
+from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector, padded_shape
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def params() -> dict:
     detector, segmenter = jax.random.split(jax.random.key(3))
     blank = np.zeros((1, 32, 32, 3), np.float32)
-    return {"detector": initial(SETTINGS, detector), "segmenter": Segmenter(SETTINGS.segmenter).init(segmenter, blank)}
+    return {"detector": init_detector(SETTINGS, detector), "segmenter": Segmenter(SETTINGS.segmenter).init(segmenter, blank)}
 
 
 @pytest.fixture(scope="module")

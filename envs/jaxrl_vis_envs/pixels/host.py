@@ -76,7 +76,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         images = self._render() | {name: image.copy() for name, image in self._goals.items()}
         layout = self._form.layout
         if layout == "image":
-            return np.array(self._form.joined(images))  # type: ignore[arg-type]
+            return np.array(self._form.concatenate_images(images))  # type: ignore[arg-type]
         if layout == "images":
             return images
         return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
@@ -130,7 +130,8 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             spaces |= {name + formats.GOAL: space for name, space in spaces.items()}
         if self._form.layout == "image":
             low, high = (
-                self._form.joined({name: getattr(box, end) for name, box in spaces.items()}) for end in ("low", "high")
+                self._form.concatenate_images({name: getattr(box, end) for name, box in spaces.items()})
+                for end in ("low", "high")
             )
             return gymnasium.spaces.Box(np.asarray(low), np.asarray(high), dtype=np.dtype(self._form.dtype).type)
         if self._form.layout == "dict":

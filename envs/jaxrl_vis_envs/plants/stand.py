@@ -123,7 +123,7 @@ def stand_of_lines(
     return Stands(stalk.astype(np.int32)[None], *arrays)
 
 
-def concatenated(parts: Sequence[Stands]) -> Stands:
+def concatenate_stands(parts: Sequence[Stands]) -> Stands:
     """Concatenate one or more batches of stands with the same number of stalks each."""
     names = [field.name for field in dataclasses.fields(Stands)]
     return Stands(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

@@ -148,7 +148,7 @@ class HandReach(MjxGoalEnv):
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         if self.config.goal_rule == "meet":
             return self.configuration_at(self._meeting_tips(key))
-        return self._after_random_actions(key)
+        return self._take_random_actions(key)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         data = data.replace(ctrl=self._targets(action))
@@ -187,7 +187,7 @@ class HandReach(MjxGoalEnv):
         low, high = jnp.asarray(self.mj_model.actuator_ctrlrange.T, jnp.float32)
         return 0.5 * (low + high) + 0.5 * (high - low) * action
 
-    def _after_random_actions(self, key: jax.Array) -> mjx.Data:
+    def _take_random_actions(self, key: jax.Array) -> mjx.Data:
         """Return the hand at rest in the configuration reached by random actions from the start."""
         uniform_key, noise_key = jax.random.split(key)
         shape = (self.config.goal_actions, self.action_size)

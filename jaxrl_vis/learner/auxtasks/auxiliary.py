@@ -199,7 +199,7 @@ def make_auxiliary(
         RequestError: Tasks and weighting are incompatible with each other or with the rest of the configuration.
     """
     if config.auxiliary.weighting in WEIGHTINGS:
-        weighting = _bounded(config, make_weighting(config.auxiliary.weighting, **_options(config)))
+        weighting = _bound_strength(config, make_weighting(config.auxiliary.weighting, **_options(config)))
     else:
         maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
         weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
@@ -231,7 +231,7 @@ def make_auxiliary(
     return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, gradient_mode)
 
 
-def _bounded(config: Config, weighting: Weighting) -> Weighting:
+def _bound_strength(config: Config, weighting: Weighting) -> Weighting:
     """Bound and scale the weights as configured. OL-AUX applies the maximum weight in its own rule."""
     maximum, total = config.study.weighting_maximum, config.study.weighting_total
     if config.auxiliary.weighting == "ol_aux":

@@ -4,8 +4,6 @@ The ratio of two fractions, each averaged over many batches, estimates the fract
 filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -45,11 +43,6 @@ def count_rewards(
         "false_negative": jnp.sum(negative * success),
         "filtered_false": jnp.sum((1.0 - keep) * success),
     }
-
-
-def of_rewards(*args: Any, **kwargs: Any) -> Metrics:
-    """Compute the `fractions` of an undivided batch; arguments as for `count_rewards`."""
-    return fractions(count_rewards(*args, **kwargs))
 
 
 def fractions(counts: Metrics, parts: int = 1) -> Metrics:

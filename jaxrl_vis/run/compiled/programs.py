@@ -25,7 +25,7 @@ from jaxrl_vis.learner.acting.rollout import NO_EXPLORATION, Exploration
 from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.train_step import JIT_OPTIONS
 from jaxrl_vis.report import videos
-from jaxrl_vis.run.compiled.nonfinite import broken_leaves
+from jaxrl_vis.run.compiled.nonfinite import nonfinite_leaves
 from jaxrl_vis.run.compiled.pending import Pending, stacked
 from jaxrl_vis.run.compiled.threaded_rollout import ThreadedRollout
 from jaxrl_vis.run.compiled.trace_cache import TraceCache, fingerprint
@@ -122,7 +122,7 @@ class Programs:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the programs that a run needs, slowest to compile first: they compile while others are traced."""
-        return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "broken_leaves", "keys")))
+        return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "nonfinite_leaves", "keys")))
 
     def compile(self, names: Sequence[str] | None = None, concurrent_work: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Compile programs in parallel, including the small operations of saving and evaluating.
@@ -199,7 +199,7 @@ class Programs:
         shapes, number = self.shapes, jax.ShapeDtypeStruct((), jnp.float32)
         first, noise = jax.ShapeDtypeStruct((), jnp.int32), Exploration(number, number)  # type: ignore[arg-type]
         calls: dict[str, tuple[Any, tuple]] = {
-            "broken_leaves": (jax.jit(broken_leaves), (shapes,)),
+            "nonfinite_leaves": (jax.jit(nonfinite_leaves), (shapes,)),
             "keys": (self.program.keys, (shapes.key, shapes.iteration)),
             "play": (self.program.play, (shapes.train, shapes.key, first, noise)),
             "learn": (self.program.learn, (shapes, self.program.parts_spec)),
@@ -272,9 +272,9 @@ class Programs:
         """Prepare metrics of `train_iteration` or `evaluate` for reading by the host, without compiling anything."""
         return Pending(metrics, self._stacks.get(frozenset(metrics), stacked))
 
-    def broken_leaves(self, loop: LoopState) -> list[str]:
+    def nonfinite_leaves(self, loop: LoopState) -> list[str]:
         """List the floating-point leaves of the loop state that hold a NaN or an infinity."""
-        return [name for name, is_broken in jax.device_get(self.compiled("broken_leaves")(loop)).items() if is_broken]
+        return [name for name, is_broken in jax.device_get(self.compiled("nonfinite_leaves")(loop)).items() if is_broken]
 
     def cache_message(self) -> str:
         """Describe, for messages, whether the next start will find the programs compiled now in the cache."""

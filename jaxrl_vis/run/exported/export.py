@@ -81,7 +81,7 @@ def export_run(
     policy = make_policy(trainer, restored, seed)
     layers = None if kind == "stablehlo" else layers_of(policy)
     frames = golden.record(trainer, restored.train, policy)
-    contract = contracts.make_contract(policy, run_dir, kind, _unclipped(policy))
+    contract = contracts.make_contract(policy, run_dir, kind, _input_ranges(policy))
     _write(folder, kind, policy, layers, frames, contract)
     return check_file(folder)
 
@@ -96,7 +96,7 @@ def _check_folder(folder: Path, overwrite: bool) -> None:
         raise RequestError(f"{folder} holds an exported policy: --overwrite replaces it, or name another folder with --out")
 
 
-def _unclipped(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _input_ranges(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the unclipped range (low [S], high [S]) of each input of a state policy; empty for images or if unknown."""
     if len(policy.observation_spec.shape) == 3:
         return {}

@@ -45,7 +45,7 @@ _TIMEOUT_S = 10**9
 DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
 
 
-def _free(path: Path) -> Path:
+def _unused_path(path: Path) -> Path:
     """Return an unused path: ``path`` itself, or the first free one of path-2, path-3, ..."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())
@@ -173,7 +173,7 @@ class Checkpoints:
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         if distributed.are_several():
             self.wait()  # with two tiers written concurrently, processes would confuse one with the other
-        with self._writing(tier):
+        with self._storage_errors(tier):
             manager = self._manager(tier)
             self._wait(tier)
             if distributed.any_process(iteration in self.iterations(tier)):  # orbax would silently keep the old one
@@ -193,11 +193,11 @@ class Checkpoints:
                 sums.write_sums(folder)
             self._unsummed.discard(saved)
             if distributed.is_first():
-                shutil.rmtree(self._replaced(*saved), ignore_errors=True)
+                shutil.rmtree(self._replaced_path(*saved), ignore_errors=True)
                 with contextlib.suppress(OSError):  # others are in there, or it does not exist
                     (self._folder / REPLACED).rmdir()
 
-    def _replaced(self, tier: str, iteration: int) -> Path:
+    def _replaced_path(self, tier: str, iteration: int) -> Path:
         """Return the place of a checkpoint while a new one of the same iteration is written."""
         return self._folder / REPLACED / f"{tier}-{iteration}"
 
@@ -205,7 +205,7 @@ class Checkpoints:
         """Move a checkpoint aside, where `_recover` finds it if the process is killed before the replacement is complete."""
         distributed.meet("replacing")
         if distributed.is_first():
-            aside = self._replaced(tier, iteration)
+            aside = self._replaced_path(tier, iteration)
             aside.parent.mkdir(exist_ok=True)
             shutil.rmtree(aside, ignore_errors=True)
             (self._folder / tier / str(iteration)).rename(aside)
@@ -225,7 +225,7 @@ class Checkpoints:
         distributed.meet("recovered")
 
     @contextlib.contextmanager
-    def _writing(self, tier: str) -> Iterator[None]:
+    def _storage_errors(self, tier: str) -> Iterator[None]:
         """Convert orbax's exceptions on writing into a `StorageError`."""
         try:
             yield
@@ -245,13 +245,13 @@ class Checkpoints:
             StorageError: Something could not be written.
         """
         for tier in list(self._managers):
-            with self._writing(tier):
+            with self._storage_errors(tier):
                 self._wait(tier)
 
     def close(self) -> None:
         """Wait for pending writes, then release orbax's threads."""
         for tier, manager in list(self._managers.items()):
-            with self._writing(tier):
+            with self._storage_errors(tier):
                 self._wait(tier)
                 manager.close()
         self._managers.clear()
@@ -294,7 +294,7 @@ class Checkpoints:
         """
         foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL, BEST)}
         moved = self._move(foreign, FOREIGN)
-        recent = _free(self._folder / FOREIGN / RECENT)
+        recent = _unused_path(self._folder / FOREIGN / RECENT)
         if distributed.is_first() and self.recent.set_foreign_aside(recent):
             moved.append(recent)
         return moved
@@ -303,7 +303,7 @@ class Checkpoints:
         moved = []
         for tier, iteration in [(tier, iteration) for tier, numbers in iterations.items() for iteration in numbers]:
             self._forget(tier)
-            moved.append(_free(self._folder / folder / f"{tier}-{iteration}"))
+            moved.append(_unused_path(self._folder / folder / f"{tier}-{iteration}"))
             if distributed.is_first():
                 moved[-1].parent.mkdir(exist_ok=True)
                 if tier == RECENT:
@@ -350,7 +350,7 @@ class Checkpoints:
         """
         iteration = manifest["iteration"]
         with self._damage_as_request_error(tier, iteration):
-            return self._restored(tier, iteration, template, tier == FULL, manifest)
+            return self._restore_from(tier, iteration, template, tier == FULL, manifest)
 
     @contextlib.contextmanager
     def _damage_as_request_error(self, tier: str, iteration: int) -> Iterator[None]:
@@ -371,7 +371,7 @@ class Checkpoints:
                     loop, progress = self.recent.restore(iteration, template)
                     return Restored(RECENT, iteration, loop.train, loop, progress)
                 manifest = self._read_manifest(tier, iteration)
-                return self._restored(tier, iteration, template, with_replay and tier == FULL, manifest)
+                return self._restore_from(tier, iteration, template, with_replay and tier == FULL, manifest)
             except Unusable as damage:
                 if (tier, iteration) not in self._reported:
                     self._echo(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
@@ -382,7 +382,7 @@ class Checkpoints:
         where = self._folder / tier / str(iteration)
         return restoring.read_manifest(functools.partial(self._read, tier, iteration), where)
 
-    def _restored(
+    def _restore_from(
         self, tier: str, iteration: int, template: LoopState, with_replay: bool, manifest: dict[str, Any]
     ) -> Restored:
         read, where = functools.partial(self._read, tier, iteration), self._folder / tier / str(iteration)

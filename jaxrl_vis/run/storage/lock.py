@@ -202,7 +202,7 @@ def _lock_by_marker(path: Path, lock: Held, echo: Callable[[str], None], stack: 
                 lease.acquire(blocking=False)
             break
         except filelock.Timeout:
-            now, text = _touched(path), _read(path)
+            now, text = _touch_time(path), _read(path)
             if last_touch is None and now is not None:
                 echo(f"{path} belongs to {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life")
                 last_touch, last_touch_at = now, time.monotonic()
@@ -219,7 +219,7 @@ def _lock_by_marker(path: Path, lock: Held, echo: Callable[[str], None], stack: 
         echo(f"took over {path} of {_holder(before)}, which is dead")
 
 
-def _touched(path: Path) -> tuple[float, int] | None:
+def _touch_time(path: Path) -> tuple[float, int] | None:
     try:
         status = path.stat()
     except OSError:

@@ -56,7 +56,7 @@ class Expected:
     run_id: str
 
 
-def listed(values: Iterable[Any]) -> str:
+def format_list(values: Iterable[Any]) -> str:
     """Format the first few values, and the number of further ones."""
     words = [str(value) for value in values]
     return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
@@ -161,13 +161,13 @@ def missing_rows(
     lines = []
     if absent:
         lines.append(
-            f"metrics.jsonl: rows of iteration {listed(absent)} are missing (every {expected.eval_interval}, "
+            f"metrics.jsonl: rows of iteration {format_list(absent)} are missing (every {expected.eval_interval}, "
             "unless a part of the run before a resumption had another eval_interval)"
         )
     for iteration, seeds in sorted(seeds_at.items()):
         if seeds < set(expected.seeds) and not (is_written and iteration == max(seeds_at)):
             lines.append(
-                f"metrics.jsonl: iteration {iteration} has no row of seed {listed(sorted(set(expected.seeds) - seeds))}"
+                f"metrics.jsonl: iteration {iteration} has no row of seed {format_list(sorted(set(expected.seeds) - seeds))}"
             )
     return lines
 
@@ -196,7 +196,7 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     groups = saved.values() if isinstance(saved, Mapping) else ()
     unset = sorted(set(OPTIONS).difference(*(group for group in groups if isinstance(group, Mapping))))
     if unset:
-        findings.notes.append(f"config.json does not have {listed(unset)}: taken to be the default")
+        findings.notes.append(f"config.json does not have {format_list(unset)}: taken to be the default")
 
 
 def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findings: Findings) -> None:
@@ -225,13 +225,13 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
         for name, reason in _ASIDE.items():
             if (folder.checkpoints / name).is_dir():
                 aside = sorted(entry.name for entry in (folder.checkpoints / name).iterdir())
-                findings.notes.append(f"set aside before as {reason}: {listed(aside)}")
+                findings.notes.append(f"set aside before as {reason}: {format_list(aside)}")
     if None in read_processes(folder.processes):
         findings.notes.append(f"{folder.processes.name} has a damaged line: the goodput of the run is unknown")
     if folder.nonfinite.is_dir():
         findings.notes.append(f"the run has met a non-finite number: {folder.nonfinite.name}/ has its state")
     if foreign:
-        findings.notes.append(f"not files of a run: {listed(sorted(foreign))}")
+        findings.notes.append(f"not files of a run: {format_list(sorted(foreign))}")
     if is_finished:
         wanted = [folder.curve, *([folder.video] if shows_images else [])]
         findings.problems += [f"{file.name} is missing, though the run is finished" for file in wanted if not file.exists()]

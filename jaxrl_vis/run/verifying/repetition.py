@@ -14,7 +14,7 @@ from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.storage.restoring import state_without_learner
-from jaxrl_vis.run.verifying.inspection import Expected, Findings, listed
+from jaxrl_vis.run.verifying.inspection import Expected, Findings, format_list
 from jaxrl_vis.types import LoopState
 
 NOT_REPEATED = (RUN_ID, "time/", "resume/")
@@ -127,7 +127,7 @@ class Repeater:
                 (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
             ]
             if best is None:
-                best, numbers = differences, sum(len(_compared(row)) for row in there)
+                best, numbers = differences, sum(len(_compare_arrays(row)) for row in there)
             if not differences:
                 if best:
                     self.without_evaluation.update(range(begin + 1, iteration))
@@ -149,7 +149,9 @@ class Repeater:
 
     def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
         self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
-        shown = listed(f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences)
+        shown = format_list(
+            f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences
+        )
         hint = ""
         if all(key.startswith("eval/") for _, key, _, _ in differences):
             hint = " (or eval_episodes had another value then)"
@@ -179,7 +181,7 @@ class Repeater:
             if manifest is None or saved_progress(manifest).replay_lost_at != mark:
                 continue
             differing = []
-            for described, tree in _saved(tier, manifest, loop):
+            for described, tree in _saved_arrays(tier, manifest, loop):
                 arrays = to_host(tree, copy=False)
                 differing += [
                     leaf
@@ -191,12 +193,12 @@ class Repeater:
             if (checkpoint := f"{tier}/{iteration}") not in self._report.checkpoints:
                 self._report.checkpoints.append(checkpoint)
             if differing:
-                self._differ(f"checkpoint {tier}/{iteration} differs from the repetition: {listed(differing)} differ")
+                self._differ(f"checkpoint {tier}/{iteration} differs from the repetition: {format_list(differing)} differ")
             else:
                 self._echo(f"  checkpoint {tier}/{iteration}: equal")
 
 
-def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
+def _saved_arrays(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
     """Yield pairs of a manifest's items and the arrays that they describe."""
     items = manifest["items"]
     if tier == RECENT:
@@ -230,13 +232,13 @@ def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
     return all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}
 
 
-def _compared(row: Mapping[str, Any]) -> Row:
+def _compare_arrays(row: Mapping[str, Any]) -> Row:
     return {name: value for name, value in row.items() if not name.startswith(NOT_REPEATED)}
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yield the names of values that differ as JSON text, with both values."""
-    compared = _compared(row)
+    compared = _compare_arrays(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
         if json.dumps(value) != json.dumps(again):

@@ -36,7 +36,7 @@ from jaxrl_vis.run.verifying.inspection import (
     Expected,
     check_files,
     check_record,
-    listed,
+    format_list,
     missing_rows,
     read_file,
 )
@@ -197,7 +197,7 @@ class _Verifier:
                     )
                 continue
             if differences:
-                problems.append(f"{name}: {listed(differences)}")
+                problems.append(f"{name}: {format_list(differences)}")
                 continue
             if differences is None:
                 self._report.notes.append(f"{name} has no {SUMS_NAME}: only its arrays are compared with their checksums")
@@ -318,7 +318,7 @@ class _Verifier:
         compared = self._report.checkpoints
         others = [name for tier, number in self._manifests if (name := f"{tier}/{number}") not in compared]
         if others:
-            unverified.append(f"checkpoints {listed(others)}: intact, but not reached by a repetition")
+            unverified.append(f"checkpoints {format_list(others)}: intact, but not reached by a repetition")
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

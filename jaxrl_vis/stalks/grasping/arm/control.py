@@ -88,7 +88,7 @@ def better_side(target: Any, numeric: Any = jnp) -> Any:
     return numeric.where(target[..., 0] > stalk_arm.SHOULDER[0], 1.0, -1.0)
 
 
-def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> jax.Array:
+def plan_movement(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> jax.Array:
     """Return the planned position [3] of the grip at a time, on its path from ``start`` to ``target``, m.
 
     Args:

@@ -198,7 +198,7 @@ def reach(
     parts, aimed_at = [], targets
     for call in range(_calls(timing.reach) + _calls(timing.close)):
         if observer is not None and call:
-            targets = _looked(observer, stands, targets, can, call * LOOK, parts[-1])
+            targets = _observe_targets(observer, stands, targets, can, call * LOOK, parts[-1])
         if call < _calls(timing.reach):
             aimed_at = targets
         reaching, report = advance(scene, reaching, (targets - stands.origin)[fill])
@@ -219,7 +219,7 @@ def reach(
     )
 
 
-def _looked(
+def _observe_targets(
     observer: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
     """Return the targets [B, 3] after another look, unchanged where it gives none or one that is out of reach."""
@@ -283,13 +283,13 @@ def _advance(
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
         time = reaching.data.time
-        wanted = control.planned(target, reaching.start, time + 1.0 / control.RATE, timing)
+        wanted = control.plan_movement(target, reaching.start, time + 1.0 / control.RATE, timing)
         return period(arms, model, scene, reaching, wanted, time > timing.reach - 0.5 / control.RATE, gains), None
 
     def point(reaching: Reaching, _: None) -> tuple[Reaching, dict[str, jax.Array]]:
         reaching = jax.lax.scan(step, reaching, length=_STEPS_A_POINT)[0]
         data = reaching.data
-        path = control.planned(target, reaching.start, data.time, timing)
+        path = control.plan_movement(target, reaching.start, data.time, timing)
         return reaching, {"path": path, "taken": stalk_arm.grip_at(data.qpos[:3]), "poses": data.qpos}
 
     with jax.default_matmul_precision("highest"):

@@ -29,7 +29,15 @@ from jaxrl_vis.stalks.grasping.perception.perceive import Perception
 from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import Motion
 from jaxrl_vis_envs.plants import Plot
-from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatenated, stand_of_lines, stand_origin, stands_at
+from jaxrl_vis_envs.plants.stand import (
+    MAST_DISTANCE,
+    STALKS,
+    Stands,
+    concatenate_stands,
+    stand_of_lines,
+    stand_origin,
+    stands_at,
+)
 
 Loop = Literal["open", "again", "policy"]
 
@@ -118,7 +126,7 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
         again=np.array(again, float).reshape(-1, 2),
         stands=stands_at(plot, at, targets[scored], POLICY_STALKS if for_policy else STALKS),
         standing=standing,
-        detected=concatenated(detected) if for_policy and detected else None,
+        detected=concatenate_stands(detected) if for_policy and detected else None,
     )
 
 
@@ -219,12 +227,12 @@ def execute_plans(
             np.concatenate([getattr(plan, name) for plan in block])
             for name in ("targets", "stalks", "errors", "sides", "refused", "again")
         )
-        stands = concatenated([plan.stands for plan in block])
+        stands = concatenate_stands([plan.stands for plan in block])
         keys = wind_keys(numbers, places, seed)
         if loop == "policy":
             detected = [plan.detected for plan in block if plan.detected is not None]
             assert policy is not None and len(detected) == len(block)
-            result = reach_by_policy(stands, concatenated(detected), targets, policy, keys, wind_mm)
+            result = reach_by_policy(stands, concatenate_stands(detected), targets, policy, keys, wind_mm)
         else:
             look = follow(stands, stalks, again) if loop == "again" else None
             result = reach(stands, targets, keys, wind_mm, sides=sides, observer=look)

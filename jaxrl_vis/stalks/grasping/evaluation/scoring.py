@@ -113,11 +113,11 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
     """
     painted: dict[int, np.ndarray] = {}
 
-    def remembered(image: np.ndarray, number: int) -> np.ndarray:
+    def record_mask(image: np.ndarray, number: int) -> np.ndarray:
         painted[number] = scene.masks[number] if mask is None else mask(image, number)
         return painted[number]
 
-    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, variant)
+    perception = perceive(scene.views, record_mask, scene.drive.stated, scene.mount, variant)
     targets = in_world(perception, scene)
     true, detected, errors = match_stalks(targets, scene.plot)
     poses = scene.drive.poses

@@ -16,10 +16,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organised
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organise
 from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint, grasp_points
 from jaxrl_vis.stalks.grasping.perception.slices import slice_points
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import joined, stalk_segments
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import join_segments, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Stitch, Thinned, stitch
 from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration
@@ -121,7 +121,7 @@ def perceive(
             # Matching runs in threads while the network computes masks, perhaps on an accelerator.
             with clock("mask"):
                 painted = [mask(view.left, view.number) for view in views]
-            clouds = list(side_by_side(lambda disparity, red: organised(disparity, red, calibration, mount), matched, painted))
+            clouds = list(side_by_side(lambda disparity, red: organise(disparity, red, calibration, mount), matched, painted))
         with clock("stitch"):
             method = THESIS if variant.stitch else DEFAULT
             thinned = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
@@ -145,7 +145,7 @@ def perceive(
                     lambda cloud, frame: stalk_segments(cloud, calibration, mount, frame), clouds, range(len(clouds))
                 )
                 parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, segments)]
-                points = grasp_points(joined(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount))
+                points = grasp_points(join_segments(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount))
     if not points:
         notes.append("no stalk was found")
     return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))

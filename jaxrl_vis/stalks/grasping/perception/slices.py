@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from scipy import ndimage
 
-from jaxrl_vis.stalks.grasping.perception.cloud import thinned
+from jaxrl_vis.stalks.grasping.perception.cloud import subsample
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED, GraspPoint
 
 THICKNESS = 0.2
@@ -44,7 +44,7 @@ class Slice:
 def slice_at(points: np.ndarray, low: float) -> Slice:
     """Return the slice of points [N, 3] (m) from the height ``low`` to `THICKNESS` above it."""
     inside = points[(points[:, 2] >= low) & (points[:, 2] < low + THICKNESS)]
-    inside = thinned(inside, _VOXEL)
+    inside = subsample(inside, _VOXEL)
     if not len(inside):
         return Slice(low, np.zeros(2), np.zeros((1, 1)), np.zeros((1, 1), int), np.zeros((0, 3)))
     corner = np.floor(inside[:, :2].min(axis=0) / CELL - 2) * CELL

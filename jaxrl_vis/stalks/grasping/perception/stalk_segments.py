@@ -77,7 +77,7 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
     return StalkSegments(mount.pose.to_world(points), thickness, np.full(len(line), frame), piece)
 
 
-def joined(parts: list[StalkSegments]) -> StalkSegments:
+def join_segments(parts: list[StalkSegments]) -> StalkSegments:
     """Concatenate the chords of several pairs, all in one robot frame; pieces are renumbered to stay distinct."""
     if not parts:
         return _nothing()

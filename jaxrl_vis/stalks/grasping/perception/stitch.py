@@ -13,7 +13,7 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, thinned
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, subsample
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,8 +89,8 @@ DEFAULT = Method(
 )
 
 _ODOMETRY_FRACTION = 0.05
-_WOBBLE = 0.03  # m
-_TURN = math.radians(3.0)
+_MAX_WOBBLE = 0.03  # m
+_MAX_TURN = math.radians(3.0)
 _MIN_OVERLAP = 0.2
 _STILL = 0.01  # tolerance of convergence relative to the gate, for translation in m and rotation in rad
 
@@ -126,7 +126,7 @@ class Thinned:
             points: [N, 3], m.
             method: Method of stitching, which determines the grid.
         """
-        self.points = thinned(points, method.voxel)
+        self.points = subsample(points, method.voxel)
 
     @classmethod
     def of(cls, cloud: Cloud, method: Method = DEFAULT) -> "Thinned":
@@ -166,12 +166,12 @@ def _rejection_reason(motion: Motion, prior: Motion, distance: float, overlap: f
     # Compare displacements at a point of the row, so that rotations count as well.
     place = np.array([0.0, 0.6, 0.8])
     moved = float(np.linalg.norm(motion(place) - prior(place)))
-    allowed = _ODOMETRY_FRACTION * abs(distance) + _WOBBLE
+    allowed = _ODOMETRY_FRACTION * abs(distance) + _MAX_WOBBLE
     if overlap < _MIN_OVERLAP:
         return f"only {100 * overlap:.0f} % of the points overlap"
     if moved > allowed:
         return f"it moved {1e3 * moved:.0f} mm from the odometry, which allows {1e3 * allowed:.0f} mm"
-    if motion.angle > _TURN:
+    if motion.angle > _MAX_TURN:
         return f"it turned by {math.degrees(motion.angle):.1f} degrees"
     return ""
 

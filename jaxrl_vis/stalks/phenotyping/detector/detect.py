@@ -139,7 +139,7 @@ def best_proposals(
     """
     count = min(settings.candidates, logits.shape[0])
     scores, places = jax.lax.top_k(logits, count)
-    stalks = within(decode(codes[places], anchors[places]), shape)
+    stalks = clip_to_image(decode(codes[places], anchors[places]), shape)
     size = stalks[:, 2:4] - stalks[:, :2]
     selected = suppress(band_overlap(stalks, stalks), scores, settings.proposal_threshold)
     selected &= (size[:, 0] > 2.0) & (size[:, 1] > 8.0)
@@ -148,7 +148,7 @@ def best_proposals(
     return stalks[places], best, jnp.isfinite(best)
 
 
-def within(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
+def clip_to_image(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """Clip the boxes of stalks [N, 6] to an image of ``shape`` (height, width), and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = jnp.moveaxis(stalks, -1, 0)
     slope = (below - above) / jnp.maximum(bottom - top, 1e-3)
@@ -166,7 +166,7 @@ def heads(
     return logits, codes
 
 
-def judge(
+def classify_proposals(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
     """Score and refine proposals [P, 6] of one image with features [H, W, C], and remove duplicates."""
@@ -195,11 +195,11 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
     proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
-    detected = judge(network, params, features[0], proposals, valid, settings)
-    return dataclasses.replace(detected, pooled=_pooled(features[0], image))
+    detected = classify_proposals(network, params, features[0], proposals, valid, settings)
+    return dataclasses.replace(detected, pooled=_pool_features(features[0], image))
 
 
-def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:
+def _pool_features(features: jax.Array, image: jax.Array) -> jax.Array:
     """Compute mean and standard deviation [2 C] float32 of features [h, w, C] where the image [H, W, 3] is not black."""
     values = features.astype(jnp.float32)
     lit = image.any(axis=-1).reshape(values.shape[0], STRIDE[0], values.shape[1], STRIDE[1]).any(axis=(1, 3))
@@ -208,7 +208,7 @@ def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:
     return jnp.concatenate([mean, jnp.sqrt((weights * (values - mean) ** 2).sum(axis=(0, 1)))])
 
 
-def initial(settings: Settings, key: jax.Array) -> Any:
+def init_detector(settings: Settings, key: jax.Array) -> Any:
     """Initialise the parameters of a detector at random."""
     images = jax.ShapeDtypeStruct((1, 2 * PADDING, 2 * PADDING, 3), jnp.float32)
     regions = jax.ShapeDtypeStruct((1, *GRID, settings.channels[2]), jnp.float32)

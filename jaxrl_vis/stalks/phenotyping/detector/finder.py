@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste, smoothed
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste, preprocess_crops
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
@@ -145,7 +145,7 @@ def segment(params: Any, crops: jax.Array, settings: Settings, dtype: Any, full_
     """
     count, *shape = crops.shape[:3]
     enlarged = jax.image.resize(crops.astype(jnp.float32), (count, *full_shape, 3), "linear")
-    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(enlarged))
+    logits = Segmenter(settings.segmenter, dtype).apply(params, preprocess_crops(enlarged))
     assert isinstance(logits, jax.Array)
     return jax.image.resize(jax.nn.sigmoid(logits), (count, *shape), "linear")
 

@@ -10,7 +10,7 @@ from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, region_features
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import smoothed
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import preprocess_crops
 
 # Kinds of true stalks: NOTHING is padding, UNCLEAR is too occluded to count as positive or negative.
 NOTHING, UNCLEAR, STALK = 0, 1, 2
@@ -113,7 +113,7 @@ def segmenter_loss(params: Any, crops: jax.Array, masks: jax.Array, settings: Se
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
     """
-    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(crops))
+    logits = Segmenter(settings.segmenter, dtype).apply(params, preprocess_crops(crops))
     assert isinstance(logits, jax.Array)
     return mask_loss(logits, masks)
 

@@ -67,7 +67,7 @@ def _cut(image: jax.Array, top: jax.Array, left: jax.Array, width: int) -> jax.A
     return jnp.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), taken, jnp.zeros((), image.dtype))
 
 
-def smoothed(crops: jax.Array) -> jax.Array:
+def preprocess_crops(crops: jax.Array) -> jax.Array:
     """Preprocess stalk crops [N, h, w, 3] for segmentation: float32 in [-1, 1], smoothed along the stalk.
 
     Values are averaged over 15 rows, as edges run along a stalk and texture mostly does not, and bright tones are compressed.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.weights_file import check_range, read_parameters, write_parameters
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 
 SHIPPED = Path(__file__).with_name("stalks.safetensors")
@@ -82,7 +82,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         if about.pop("schema") != SCHEMA or not values.keys() <= _HINTS.keys():
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
         settings = _checked(path, values)
-        return settings, declared(settings)
+        return settings, declare_shapes(settings)
 
     return read_parameters(path, _COMMAND, declare)
 
@@ -103,11 +103,11 @@ def _checked(path: Path, values: dict[str, Any]) -> Settings:
 
 
 @functools.lru_cache(maxsize=4)
-def declared(settings: Settings) -> dict[str, Any]:
+def declare_shapes(settings: Settings) -> dict[str, Any]:
     """Return the shapes and dtypes of the networks' parameters as nested dictionaries, without computing any of them."""
     crops = jax.ShapeDtypeStruct((1, settings.crop_height, settings.crop_width, 3), jnp.float32)
 
     def draw(key: jax.Array) -> dict[str, Any]:
-        return {"detector": initial(settings, key), "segmenter": Segmenter(settings.segmenter).lazy_init(key, crops)}
+        return {"detector": init_detector(settings, key), "segmenter": Segmenter(settings.segmenter).lazy_init(key, crops)}
 
     return jax.eval_shape(draw, jax.random.key(0))

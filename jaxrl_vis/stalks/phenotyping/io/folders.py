@@ -294,19 +294,19 @@ def _pair_by_name(folder: Path) -> _Sides:
     stems = {stem.lower() for stem in images.values()}
     sides: _Sides = {}
     for image, stem in images.items():
-        word = _side_in(stem, stems)
+        word = _match_side(stem, stems)
         if word is not None:
             name = (stem[: word.start()] + stem[word.end() :]).strip("_-. ") or "pair"
             _add_pair(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
         else:
-            for side, other in _counted(stem, stems):
+            for side, other in _pair_by_counter(stem, stems):
                 # The characters common to both names, without the number or letter of the side.
                 same = "".join(one for one, two in zip(stem, other) if one == two)
                 _add_pair(sides, same.strip("_-. ") or "pair", side, image)
     return sides
 
 
-def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
+def _pair_by_counter(stem: str, stems: set[str]) -> list[tuple[str, str]]:
     """Return the side given by a last letter or camera number of an image's name, with the partner's name; empty if ambiguous.
 
     im0 and im1 are a pair, but im0 to im7 are the images of one camera.
@@ -322,7 +322,7 @@ def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
     return matches if len(back) == 1 else []
 
 
-def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
+def _match_side(stem: str, stems: set[str]) -> re.Match[str] | None:
     """Find the word or letter of an image's name that tells its side; None if there is none.
 
     Names of rows and repetitions may hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words take precedence over

@@ -114,7 +114,7 @@ def match_rows(
     first = sorted(set(np.linspace(0, len(wanted) - 1, min(_FIRST, len(wanted))).round().astype(int)))
     limits = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
     matches = {place: _match(left, right, wanted[place], limits, half_height, spread) for place in first}
-    expected = _agreed([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
+    expected = _robust_line([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
     for place, window in enumerate(wanted):
         if place in matches:
             continue
@@ -157,7 +157,7 @@ def _match(
     return None if best is None else (window.first - (begin + best[0]), best[1])
 
 
-def _agreed(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
+def _robust_line(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
     """Fit a robust line to (row, disparity) pairs and return its offset and slope.
 
     Returns None unless at least three, and all but one, are inliers.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial, padded_shape
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, init_detector, padded_shape
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.losses import detector_loss, segmenter_loss
 from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, move, relight
@@ -176,7 +176,7 @@ def initial_networks(settings: Settings, detector_key: jax.Array, segmenter_key:
     """Initialise the parameters of both networks at random."""
     blank = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     return {
-        "detector": initial(settings, detector_key),
+        "detector": init_detector(settings, detector_key),
         "segmenter": Segmenter(settings.segmenter).lazy_init(segmenter_key, blank),
     }
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.annotation_files import coco, label_studio, labelme, voc, yolo
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, together
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, merge_groups
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis_envs.documents import parse_json, parse_xml, read_bytes, read_json, read_text
@@ -27,7 +27,7 @@ def gather(folder: Path) -> list[tuple[Any, Annotated]]:
 
     Returns:
         Id and contents of each image. The names of images that exist are paths relative to the folder, missing sizes are read
-        from the image files, and polygons of one group are merged (see `together`).
+        from the image files, and polygons of one group are merged (see `merge_groups`).
 
     Raises:
         RequestError: There are no annotations, a file cannot be read, or an image is ambiguous or annotated twice.
@@ -37,7 +37,7 @@ def gather(folder: Path) -> list[tuple[Any, Annotated]]:
     for _, image in images:
         if isinstance(image.name, str):
             index.resolve_name(image)
-        image.annotations = together(image.annotations)
+        image.annotations = merge_groups(image.annotations)
     return images
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import (
     Annotated,
     Annotation,
-    boxed,
-    outlined,
+    from_box,
+    from_outline,
     turned_box,
     without_width,
 )
@@ -52,11 +52,11 @@ def _voc_image(path: Path, root: Element) -> Annotated:
             x, y, wide, high, angle = (float(_text(element, f"robndbox/{part}")) for part in ("cx", "cy", "w", "h", "angle"))
             if not np.isfinite([x, y, wide, high, angle]).all():
                 raise ValueError("robndbox")
-            annotations.append(outlined(name, turned_box((x, y), (wide, high), angle), source))
+            annotations.append(from_outline(name, turned_box((x, y), (wide, high), angle), source))
         else:
             # Pixel indices start at 1, and the last ones are inclusive.
             left, top, right, bottom = (float(_text(element, f"bndbox/{edge}")) for edge in _EDGES)
-            annotations.append(boxed(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
+            annotations.append(from_box(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
     width, height = (_integer(root.findtext(f"size/{side}")) for side in ("width", "height"))
     return Annotated(_text(root, "filename"), width, height, path, annotations)
 
@@ -90,11 +90,11 @@ def _cvat_shape(shape: Element, size: tuple[int, int], name: str, source: str, g
         angle = np.radians(float(shape.get("rotation") or 0.0))
         if angle:
             centre = ((left + right) / 2, (top + bottom) / 2)
-            return outlined(name, turned_box(centre, (right - left, bottom - top), float(angle)), source, group)
-        return boxed(name, [left, top, right - left, bottom - top], source, group)
+            return from_outline(name, turned_box(centre, (right - left, bottom - top), float(angle)), source, group)
+        return from_box(name, [left, top, right - left, bottom - top], source, group)
     if shape.tag == "polygon":
         points = [list(map(float, point.split(","))) for point in (shape.get("points") or "").split(";") if point]
-        return outlined(name, np.reshape(np.array(points, float), (-1, 2)), source, group)
+        return from_outline(name, np.reshape(np.array(points, float), (-1, 2)), source, group)
     if shape.tag == "mask":
         left, top, wide, high = (int(value) for value in numbers("left", "top", "width", "height"))
         return {

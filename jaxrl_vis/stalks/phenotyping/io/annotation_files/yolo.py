@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotation, boxed, outlined
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotation, from_box, from_outline
 from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis_envs.documents import read_text
 
@@ -72,7 +72,7 @@ def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) ->
             raise ValueError(f"line {index + 1} holds what is no share of an image")
         if len(coordinates) == 4:
             x, y, wide, high = (coordinate * size[axis % 2] for axis, coordinate in enumerate(coordinates))
-            annotations.append(boxed(name, [x - wide / 2, y - high / 2, wide, high], source))
+            annotations.append(from_box(name, [x - wide / 2, y - high / 2, wide, high], source))
         else:
-            annotations.append(outlined(name, np.reshape(coordinates, (-1, 2)) * size, source))
+            annotations.append(from_outline(name, np.reshape(coordinates, (-1, 2)) * size, source))
     return annotations
