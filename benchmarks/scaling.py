@@ -264,7 +264,9 @@ def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
     return line, Measurement("scaling/all_reduce", round(1 / seconds, 1), "all-reduces/s", described)
 
 
-def in_processes(figures: list[Figure], positions: list[int], times: list[list[float]]) -> list[tuple[str, Measurement]]:
+def measure_in_processes(
+    figures: list[Figure], positions: list[int], times: list[list[float]]
+) -> list[tuple[str, Measurement]]:
     """Time the same training by two processes with half of the devices each; return lines of the table, and the records.
 
     Args:
@@ -391,7 +393,7 @@ def main() -> None:
             figure for figure in figures if figure.timed.config.run.devices == numbers[-1] and figure.kind in ("seeds", "weak")
         ][:2]
         positions = [len(alone) + figures.index(figure) for figure in again]
-        for line, measurement in in_processes(again, positions, [times[id(figure)] for figure in again]):
+        for line, measurement in measure_in_processes(again, positions, [times[id(figure)] for figure in again]):
             keep(line, measurement)
     took = time.perf_counter() - began
     print(

@@ -44,7 +44,7 @@ class Clock:
         self._wall, self._processor = time.time(), time.process_time()
 
 
-def time_import(clock: Clock, options: argparse.Namespace) -> Any:
+def import_programs(clock: Clock, options: argparse.Namespace) -> Any:
     """Import everything and return the programs of a run, untraced."""
     import jax
 
@@ -76,7 +76,7 @@ def start(clock: Clock, options: argparse.Namespace) -> None:
     """Start like a run: compile, then do the first iteration."""
     import jax
 
-    programs = time_import(clock, options)
+    programs = import_programs(clock, options)
     programs.compile()
     clock.lap("compile")
     loop, metrics = programs.train_iteration(programs.init(programs.run_keys))

@@ -261,7 +261,7 @@ def _bit_in_metrics(folder: Path, rng: random.Random) -> int | None:
     return status or None
 
 
-def _remove_file(is_kept: bool) -> Strike:
+def _move_folder(is_kept: bool) -> Strike:
     """Return a strike that moves the folder, and back after the process has ended; or that deletes it."""
 
     def strike(folder: Path, rng: random.Random) -> int | None:
@@ -336,11 +336,11 @@ FAULTS: dict[str, Fault] = {
         _bit_in_metrics, "all other rows stay; a row that is none any more is put aside, and said", (143,), spoils=True
     ),
     "folder moved": Fault(
-        _remove_file(is_kept=True),
+        _move_folder(is_kept=True),
         "status 1 and one line; nothing is left behind, and the folder goes on at its new place",
         (1,),
     ),
-    "folder gone": Fault(_remove_file(is_kept=False), "status 1 and one line; no half of a run takes its place", (1,)),
+    "folder gone": Fault(_move_folder(is_kept=False), "status 1 and one line; no half of a run takes its place", (1,)),
     "lock of a dead process elsewhere": Fault(_lock_of_the_dead, "is taken over", (143,)),
     "clock jumps by up to a month": Fault(_jumping_clock, f"no duration follows it; {EXACT}", (143,)),
 }

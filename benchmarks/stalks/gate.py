@@ -79,7 +79,9 @@ def plain_measures(image: np.ndarray) -> tuple[float, float]:
     return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
 
 
-def see(finder: Finder, image: np.ndarray, pixels_per_metre: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def detect_stalks(
+    finder: Finder, image: np.ndarray, pixels_per_metre: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Detect stalks in an image: return detections [N, 6] in its own coordinates, their scores, and the pooled features."""
     frame = find_frame(image)
     stalks, scores, pooled = finder.look(fill_borders(image, frame), pixels_per_metre)
@@ -92,12 +94,12 @@ def f1_of(hits: int, finds: int, stalks: int) -> float:
     return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
 
 
-def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
+def detections_in(path: Path, finder: Finder, name: str) -> list[Seen]:
     """Evaluate the images of a file of `draw`, or read the cached results of the detector of this name."""
     cached = path.with_suffix(f".{name.split()[-1]}.npz")
     if not cached.exists():
         arrays = {}
-        for index, seen in enumerate(_seen_now(path, finder)):
+        for index, seen in enumerate(_detect_images(path, finder)):
             values = {"pooled": seen.pooled, "scores": seen.scores, "f1": seen.f1, "plain": seen.plain}
             arrays |= {f"{key}_{index}": value for key, value in values.items()}
         np.savez(cached, **arrays)
@@ -110,21 +112,21 @@ def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
     ]
 
 
-def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
+def _detect_images(path: Path, finder: Finder) -> Iterator[Seen]:
     with np.load(path) as data:
         for index in range(FRAMES):
             image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
-            stalks, scores, pooled = see(finder, image, float(data["density"]))
+            stalks, scores, pooled = detect_stalks(finder, image, float(data["density"]))
             right, ignored = match_finds(stalks, scores, truth, kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
             yield Seen("", pooled, scores, f1, plain_measures(image))
 
 
-def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
+def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
     """Evaluate photographs, whose cameras are unknown."""
     for image, count, find_boxes in photographs:
-        stalks, scores, pooled = see(finder, image, None)
+        stalks, scores, pooled = detect_stalks(finder, image, None)
         boxes = stalks[scores >= MIN_SCORE][:, :4]
         yield Seen("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
 
@@ -194,7 +196,7 @@ def main() -> None:
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
         if path.exists():
-            seen[part] += seen_in(path, finder, detector_name(options.weights))
+            seen[part] += detections_in(path, finder, detector_name(options.weights))
     fitted, tried = seen["fit"], seen["test"]
     wrong = np.array([image.f1 < RIGHT for image in fitted])
     pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES
@@ -203,7 +205,7 @@ def main() -> None:
     write_gate(options.weights, gate, about)
     if options.photographs:
         module, _, name = options.photographs.partition(":")
-        tried += seen_in_photographs(getattr(importlib.import_module(module), name)(), finder)
+        tried += detections_in_photographs(getattr(importlib.import_module(module), name)(), finder)
     doubts = control(fitted, tried)
     print(f"{detector_name(options.weights)}: {len(fitted)} images to fit on, {len(tried)} to try; right is F1 >= {RIGHT:g}")
     report("all", tried, gate, doubts)

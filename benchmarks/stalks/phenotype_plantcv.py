@@ -105,7 +105,7 @@ def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
 
 
 def compare(file: Path) -> None:
-    """Print the errors of both, mm."""
+    """Print the width errors of both methods, mm."""
     try:
         from plantcv import plantcv as pcv  # pyright: ignore[reportMissingImports]
     except ImportError:

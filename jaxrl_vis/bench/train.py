@@ -73,7 +73,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
     return loop, timing, {"compile": compile_s, "host": max(0.0, timing.median_s - alone.median_s)}
 
 
-def _warm_up(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
+def _wait_for_result(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
     """Wrap a call to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
     if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
         return call
@@ -93,13 +93,13 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     """
     program, iteration = programs.program, loop.iteration
     keys, key = seed_keys(program, 3), jax.random.key(4)
-    evaluation = measure_time(_warm_up(program, lambda: programs.evaluate(loop.train, key)), repeats)
+    evaluation = measure_time(_wait_for_result(program, lambda: programs.evaluate(loop.train, key)), repeats)
     num_envs = programs.config.run.num_envs
 
     def play() -> tuple[Episodes, Metrics]:
         return jax.tree.map(lambda *leaves: join_parts(leaves, num_envs, axis=1), *programs.play(loop.train, keys))
 
-    rollout = measure_time(_warm_up(program, play), repeats)
+    rollout = measure_time(_wait_for_result(program, play), repeats)
     episodes, _ = play()
     insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)
     train, replay = loop.train, loop.replay

@@ -25,7 +25,7 @@ from typing import Any, Protocol, TypeVar
 
 from jaxrl_vis.errors import RequestError, WorkerError
 from jaxrl_vis.host.files import is_count, read_json, write_atomically
-from jaxrl_vis.run.signals import ignore_terminal_signals, shielded_children
+from jaxrl_vis.run.signals import obey_parent_only, shielded_children
 from jaxrl_vis_envs.cores import num_cores
 
 Record = dict[str, Any]
@@ -161,7 +161,7 @@ def _end_with_parent() -> None:
 
 def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
     """Initialise a worker process."""
-    ignore_terminal_signals()  # a signal to the process group would otherwise interrupt parent and worker at once
+    obey_parent_only()  # a signal to the process group would otherwise interrupt parent and worker at once
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
         index = counter.value

@@ -238,7 +238,7 @@ class Ending(_Handlers):
                     should_stop(received[0])
 
 
-def ignore_terminal_signals() -> None:
+def obey_parent_only() -> None:
     """Let a child process, in which `SIGNALS` are blocked (`shielded_children`), end only by a SIGTERM of its parent.
 
     If the system does not report the sender of a signal (macOS), any SIGTERM ends it.

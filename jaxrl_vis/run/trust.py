@@ -115,7 +115,7 @@ def _names(run_dir: Path, config: Config) -> tuple[str, str]:
     about = [str(run_dir.resolve()), read_run_id(run_dir), *(word for pair in files.items() for word in map(str, pair))]
     paths = {file for file in files.values() if file is not None and not _is_inside(run_dir, file)}
     if any(_is_inside(run_dir, file) for file in files.values()):
-        paths |= set(_imported_modules(run_dir))
+        paths |= set(_importable_files(run_dir))
     contents = [[str(path), hashlib.sha256(path.read_bytes()).hexdigest()] for path in sorted(paths) if path.is_file()]
     return _digest(about), _digest([*about, contents])
 
@@ -128,7 +128,7 @@ def _is_inside(run_dir: Path, file: Path | None) -> bool:
     return file is not None and file.is_relative_to(run_dir.resolve())
 
 
-def _imported_modules(run_dir: Path) -> list[Path]:
+def _importable_files(run_dir: Path) -> list[Path]:
     """List all files below a run folder that Python could import."""
     suffixes = tuple(importlib.machinery.all_suffixes())
     return sorted(path for path in run_dir.resolve().rglob("*") if path.name.endswith(suffixes) and path.is_file())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.stalks.phenotyping.detector.gate import fit_gate, gate_path, read_gate, write_gate
-from jaxrl_vis.stalks.phenotyping.pipeline import Request, _strange
+from jaxrl_vis.stalks.phenotyping.pipeline import Request, _unfamiliar_note
 
 SURE, UNSURE = np.array([0.97, 0.95, 0.02]), np.array([0.6, 0.45, 0.3])
 
@@ -60,8 +60,8 @@ def test_a_gate_is_for_its_weights_alone(gate, images, tmp_path):
 
 def test_a_plot_is_flagged_where_most_of_its_pairs_are(tmp_path):
     request = Request(tmp_path, "strip", "networks", {}, max_doubt=0.5)
-    told = _strange(request, [{"doubt": 0.9}, {"doubt": 0.7}, {"doubt": 0.1}])
+    told = _unfamiliar_note(request, [{"doubt": 0.9}, {"doubt": 0.7}, {"doubt": 0.1}])
     assert told.startswith("2 of 3 pairs are unlike") and "0.70, the limit 0.50" in told
-    assert not _strange(request, [{"doubt": 0.9}, {"doubt": 0.1}])
-    assert not _strange(request, [{"doubt": None}, {}])
-    assert not _strange(Request(tmp_path, "strip", "truth", {}), [{"doubt": 0.9}])
+    assert not _unfamiliar_note(request, [{"doubt": 0.9}, {"doubt": 0.1}])
+    assert not _unfamiliar_note(request, [{"doubt": None}, {}])
+    assert not _unfamiliar_note(Request(tmp_path, "strip", "truth", {}), [{"doubt": 0.9}])

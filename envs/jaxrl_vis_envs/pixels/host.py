@@ -56,7 +56,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._drawn = mujoco.MjData(views.mj_model)
         self._goals: dict[str, np.ndarray] = {}
         self._draw = jax.jit(lambda arrays: self._form.images(views(_Drawn(arrays))))
-        self.observation_space = self._space()
+        self.observation_space = self._build_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and render the goal image, if there is one."""
@@ -114,7 +114,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         finally:
             inner.data, model.site_pos[:] = own, sites
 
-    def _space(self) -> gymnasium.Space:
+    def _build_space(self) -> gymnasium.Space:
         """Return the observation space: a Box for the layout ``image``, else a Dict."""
         images = jax.eval_shape(self._draw, self._poses())
         spaces: dict[str, gymnasium.Space] = {}

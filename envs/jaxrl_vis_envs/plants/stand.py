@@ -47,7 +47,7 @@ class Stands:
     origin: np.ndarray
 
     @property
-    def present(self) -> np.ndarray:
+    def is_present(self) -> np.ndarray:
         """[B, N] bool, True for existing stalks."""
         return self.stalk >= 0
 

@@ -70,12 +70,12 @@ def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray |
     major = major - (axis @ major)[:, None] * axis
     major /= np.linalg.norm(major, axis=1, keepdims=True)
 
-    def rescale_box(vectors: np.ndarray, factor: float) -> np.ndarray:
+    def scale_along_major(vectors: np.ndarray, factor: float) -> np.ndarray:
         return vectors + (factor - 1.0) * (vectors * major).sum(axis=1, keepdims=True) * major
 
     # In space compressed until the stalk is round, its edges are where rays are tangent to a circle.
     radius = (np.interp(arcs, stalk.arc, stalk.radius) / np.sqrt(stalk.ovality))[:, None]
-    centre = rescale_box(pose.to_camera(middle), 1.0 / stalk.ovality)
+    centre = scale_along_major(pose.to_camera(middle), 1.0 / stalk.ovality)
     from_axis = centre - (centre * axis).sum(axis=1, keepdims=True) * axis
     distance = np.linalg.norm(from_axis, axis=1, keepdims=True)
     from_axis /= distance
@@ -84,7 +84,7 @@ def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray |
     sides = []
     for sign in (-1.0, 1.0):
         tangent_point = centre + radius * (sign * np.sqrt(1.0 - sine**2) * sideways - sine * from_axis)
-        point = rescale_box(tangent_point, stalk.ovality)
+        point = scale_along_major(tangent_point, stalk.ovality)
         sides.append(point[:, :2] / point[:, 2:] * camera.focal + np.array(camera.centre))
     left, right = sides
     swap = left[:, :1] > right[:, :1]

@@ -97,7 +97,7 @@ def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[
     return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.encoded)}
 
 
-def _together(auxiliary: Auxiliary, encoded: Latents | dict[str, jax.Array]) -> Latents:
+def _collect_latents(auxiliary: Auxiliary, encoded: Latents | dict[str, jax.Array]) -> Latents:
     """Collect the latents for the losses, whether encoded together or by `_encoders`."""
     if isinstance(encoded, Latents):
         return encoded
@@ -161,13 +161,13 @@ class Objectives:
 
         def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
-            latents = _together(self.auxiliary, encoded)
+            latents = _collect_latents(self.auxiliary, encoded)
             target = self._target(copies, inputs, latents, batch, noise)
             values = networks.values(critic, latents.pair, batch.action)
             value = _minimum(values)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
             others = self._auxiliary(critic, latents, inputs, image, batch)
-            errors = [losses.critic_loss(of_head, target, keep, self._kept(keep)) for of_head in values]
+            errors = [losses.critic_loss(of_head, target, keep, self._kept_mean(keep)) for of_head in values]
             return {MAIN: functools.reduce(jnp.add, errors), **others}, (latents, value, keep)
 
         # If losses are differentiated one by one, auxiliary losses need not pass through everything that the main one reads.
@@ -178,7 +178,7 @@ class Objectives:
             options["reduce"] = self.shards.mean
         return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), mode, **options)
 
-    def _kept(self, keep: jax.Array) -> jax.Array | None:
+    def _kept_mean(self, keep: jax.Array) -> jax.Array | None:
         """Return the mean number of unfiltered transitions per shard, the divisor for all shards; None for each its own."""
         if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
             return None

@@ -87,7 +87,7 @@ class Sampler:
         goal_slot = self.goal_slots(goal_key, indices.time)
         choice = Choice(indices, goal_slot)
         if self.config.goals.trivial_goals < 1.0:
-            is_replaced = self._replace_trivial_goals(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
+            is_replaced = self._trivial_goal_mask(state, jax.random.fold_in(key, _TRIVIAL), indices, goal_slot)
             # Transitions are sampled at random, so the next transition's episode is a random one.
             choice = choice._replace(goal_episode=jnp.where(is_replaced, jnp.roll(indices.episode, 1), indices.episode))
         if self.config.network.random_shift:
@@ -117,7 +117,7 @@ class Sampler:
         discount = self.resolved.discount if self.config.goals.future_goals == "geometric" else None
         return choose_goal_slots(key, time, self.replay.horizon, *probabilities, discount)
 
-    def _replace_trivial_goals(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
+    def _trivial_goal_mask(self, state: ReplayState, key: jax.Array, indices: Indices, goal_slot: jax.Array) -> jax.Array:
         """Return the mask [B] of relabelled goals to be replaced by another episode's: most of those already reached.
 
         They are not replaced by original goals. If these look different from observations in episodes (VisualFingerTurn's

@@ -152,7 +152,7 @@ def check_file(path: Path | str) -> Check:
     """
     contract = contracts.read_contract(Path(path))
     frames = golden.read(contract.golden, contract.forms)
-    run = _export_weights(contract) if contract.format == "safetensors" else _export_program(contract)
+    run = _load_weights(contract) if contract.format == "safetensors" else _load_program(contract)
     try:
         action = run(frames.observation, frames.goal)
     except Exception as error:  # the file may contain an arbitrary graph
@@ -163,7 +163,7 @@ def check_file(path: Path | str) -> Check:
     return Check(contract.file, float(np.max(np.abs(action.astype(np.float64) - frames.action))), len(frames.action))
 
 
-def _export_program(contract: Contract) -> Any:
+def _load_program(contract: Contract) -> Any:
     """Load a policy in ONNX or StableHLO, and compare its inputs and outputs with the contract."""
     model = (onnx_file.Model if contract.format == "onnx" else stablehlo.Program)(contract.file)
     tensors = {**model.inputs, **model.outputs}
@@ -179,7 +179,7 @@ def _export_program(contract: Contract) -> Any:
     return model
 
 
-def _export_weights(contract: Contract) -> Any:
+def _load_weights(contract: Contract) -> Any:
     """Load weights, and return their forward pass in NumPy."""
 
     def declare(about: dict[str, Any]) -> tuple[float, Any]:

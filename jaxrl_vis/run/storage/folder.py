@@ -135,7 +135,7 @@ class RunFolder:
         """Check that the folder is still in place since it was locked, before the run starts.
 
         Args:
-            lock: What holds the folder.
+            lock: The lock of the folder, held by this process.
 
         Raises:
             FolderGoneError: It was moved, deleted or taken over.
@@ -149,7 +149,7 @@ class RunFolder:
 
         Args:
             run_id: Id of the run.
-            lock: What holds the folder.
+            lock: The lock of the folder, held by this process.
 
         Raises:
             FolderGoneError: It was moved, deleted or taken over.

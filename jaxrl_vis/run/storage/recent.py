@@ -92,7 +92,7 @@ class Recent:
         return is_foreign
 
     def save(
-        self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
+        self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], start_time: float | None = None
     ) -> None:
         """Write a state and its missing rollouts; if there is no space, report it and disable further saving.
 
@@ -101,9 +101,9 @@ class Recent:
             loop: The state, on one device.
             num_envs: E, episodes that one iteration adds to the replay.
             progress: A JSON value.
-            started: Start of the work for it, checks included (`time.monotonic`); None: now.
+            start_time: Start of the work for it, checks included (`time.monotonic`); None: now.
         """
-        self._saved_at = time.monotonic() if started is None else started
+        self._saved_at = time.monotonic() if start_time is None else start_time
         try:
             self._write(iteration, loop, num_envs, progress)
         except OSError as error:

@@ -127,7 +127,7 @@ class Repeater:
                 (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
             ]
             if best is None:
-                best, numbers = differences, sum(len(_compare_arrays(row)) for row in there)
+                best, numbers = differences, sum(len(_comparable_values(row)) for row in there)
             if not differences:
                 if best:
                     self.without_evaluation.update(range(begin + 1, iteration))
@@ -232,13 +232,13 @@ def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
     return all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}
 
 
-def _compare_arrays(row: Mapping[str, Any]) -> Row:
+def _comparable_values(row: Mapping[str, Any]) -> Row:
     return {name: value for name, value in row.items() if not name.startswith(NOT_REPEATED)}
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yield the names of values that differ as JSON text, with both values."""
-    compared = _compare_arrays(row)
+    compared = _comparable_values(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
         if json.dumps(value) != json.dumps(again):

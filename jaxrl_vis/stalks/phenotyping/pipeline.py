@@ -282,7 +282,7 @@ def _finish(
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
     known = distances is not None and all(pair.name in distances for pair, _ in usable)
-    flag, tracks, start = _missing_outputs(len(usable), calibration), [], 0.0
+    flag, tracks, start = _tracking_fault(len(usable), calibration), [], 0.0
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     drive = None
     why = _lens_fault(request, frames, [record for _, record in usable], plot.name)
@@ -300,7 +300,7 @@ def _finish(
         labels = sighting_labels(frames, tracks)
         start = float(path.places[0])
         stalks, row = plot_rows(frames, tracks, path, skipped, origin)
-    strange = _strange(request, [record for _, record in usable])
+    strange = _unfamiliar_note(request, [record for _, record in usable])
     if strange:
         row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
@@ -309,7 +309,7 @@ def _finish(
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
 
 
-def _strange(request: Request, records: list[dict[str, Any]]) -> str:
+def _unfamiliar_note(request: Request, records: list[dict[str, Any]]) -> str:
     """Return a warning if more than half of the pairs of a plot are unfamiliar to the networks; else an empty string."""
     doubts = [record["doubt"] for record in records if record.get("doubt") is not None]
     if request.max_doubt is None or not doubts:
@@ -361,7 +361,7 @@ def _draw_overlay(plot: str, job: tuple[Path, PairFiles, list[Sighting], list[st
     write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
 
 
-def _missing_outputs(pairs: int, calibration: Calibration | None) -> str:
+def _tracking_fault(pairs: int, calibration: Calibration | None) -> str:
     """Return a flag on why the stalks of a plot cannot be tracked."""
     if pairs == 0:
         return "no usable pairs"

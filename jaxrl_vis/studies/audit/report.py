@@ -30,7 +30,7 @@ COLUMNS = {
 _BATCH = 512
 
 
-def _record_of(name: str, reward: Reward) -> Reward:
+def _with_errors_named(name: str, reward: Reward) -> Reward:
     """Wrap a reward so that its errors name it."""
 
     def call(images: jax.Array, goals: jax.Array) -> jax.Array:
@@ -51,7 +51,7 @@ def _rewards(name: str, reward: Reward, images: np.ndarray, goals: np.ndarray) -
     Raises:
         RequestError: The rewards are not one number between 0 and 1 for each pair.
     """
-    compiled, rows = jaxrl_vis_envs.jit(_record_of(name, reward)), []
+    compiled, rows = jaxrl_vis_envs.jit(_with_errors_named(name, reward)), []
     for first in range(0, len(images), _BATCH):
         part = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
         rows.append(np.asarray(compiled(images[part], goals[part]))[: len(images) - first])

@@ -163,7 +163,7 @@ def _open(optuna: Any, request: Request) -> Any:
         RequestError: The journal cannot be read or written, or belongs to another search.
     """
     file = request.runs / JOURNAL
-    asked = _record_of(request)
+    asked = _request_record(request)
     try:
         request.runs.mkdir(parents=True, exist_ok=True)
         storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(file)))
@@ -189,7 +189,7 @@ def _open(optuna: Any, request: Request) -> Any:
     return study
 
 
-def _record_of(request: Request) -> dict[str, Any]:
+def _request_record(request: Request) -> dict[str, Any]:
     """Describe the settings common to all trials of a search, as a JSON value."""
     varied = {part.name for part in request.ranges}
     values = {name: value for name, value in request.config.flat().items() if name not in varied}

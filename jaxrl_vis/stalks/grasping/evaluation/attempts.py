@@ -95,19 +95,19 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     low, high = driven_stretch(plot)
     masts, points = mast_positions(perception), perception.points
     chosen = choose_nearest(points, masts, POLICY_HEIGHTS) if for_policy else choose(points, masts)
-    targets = np.array([_stop_plans(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
+    targets = np.array([_to_plot_frame(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
     places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
     places = places.reshape(len(targets), len(plot.measured), 2)
     stalks = match(targets[:, :2], places, RADIUS)
     origins = np.array([stand_origin(pose.position[0]) for pose in poses])
-    standing = _standing(plot, origins, number)
+    standing = _true_stalks(plot, origins, number)
     known = {stalk.stalk for stalk in standing}
     scored = [
         place
         for place, (target, stalk) in enumerate(zip(targets, stalks))
         if (stalk in known if stalk >= 0 else low <= target[0] <= high)
     ]
-    off = np.array([_off(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
+    off = np.array([_offset_from_stalk(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
     segments = {
         stop: stalk_segments(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))
     }
@@ -115,7 +115,7 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
         off[index] + _offset_at_stop(chosen[place], points[place], perception, segments) for index, place in enumerate(scored)
     ]
     at = origins[[chosen[place].stop for place in scored], 0]
-    detected = [_detected_around(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
+    detected = [_detections_around(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
     return Plan(
         run=number,
         targets=targets[scored],
@@ -135,7 +135,7 @@ def mast_positions(perception: Perception) -> np.ndarray:
     return np.array([motion(np.array([0.0, MAST_DISTANCE, 0.0])) for motion in perception.to_last]) * [1.0, 1.0, 0.0]
 
 
-def _stop_plans(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
+def _to_plot_frame(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
     """Map the chosen point, or ``points`` [..., 3], to the plot's frame by the stitches and the true pose at the stop.
 
     Points are in the robot frame of the last pair, m. The result [..., 3] contains the errors of the stitches.
@@ -144,15 +144,15 @@ def _stop_plans(choice: Choice, scene: Scene, perception: Perception, points: np
     return scene.drive.poses[choice.stop].to_world(scene.mount.pose.to_camera(from_there))
 
 
-def _detected_around(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
+def _detections_around(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
     """Return the detected stalks around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
     height = float(choice.point[2])
     ends = np.array([point.at_height(np.array([height, height + _AROUND])) for point in perception.points])
-    ends = _stop_plans(choice, scene, perception, ends)
+    ends = _to_plot_frame(choice, scene, perception, ends)
     return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], stalk_radii(perception.points, height), x, target, POLICY_STALKS)
 
 
-def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
+def _offset_from_stalk(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
     """Return the horizontal offset [2] of a target from its stalk, m; NaN without one."""
     return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
 
@@ -188,7 +188,7 @@ def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
     return np.asarray(approach.reachable(masts[:, None], points[None]).any(axis=0))
 
 
-def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
+def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
     """Return the true stalks of the stretch, with their reachability and room at the preferred height."""
     low, high = driven_stretch(plot)
     middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)

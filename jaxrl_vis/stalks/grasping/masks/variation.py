@@ -30,7 +30,7 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
     count = len(images)
     strength = jax.random.uniform(keys["strength"], (count,), minval=0.3)
     strength = jnp.where(jax.random.bernoulli(keys["kept"], _AS_IT_IS, (count,)), 0.0, strength)
-    values, masks = _random_shift(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
+    values, masks = _transform(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
     strengths = strength[:, None, None, None]
     values = values * _textures(values.shape, strengths, keys["texture"])
     values = _shift_colours(values, strengths, keys["colour"])
@@ -42,7 +42,7 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0)).astype(jnp.uint8), masks
 
 
-def _random_shift(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Scale, stretch, shear and mirror crops and masks about their centres, with edge pixels repeated beyond the edges."""
     count, height, width = masks.shape
     drawn = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)

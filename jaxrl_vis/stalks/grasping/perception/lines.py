@@ -101,11 +101,11 @@ def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple
         point = _grasp(segments, members, min(2, len(visibility.clouds)), heights)
         if point is None:
             continue
-        count = _is_consistent(point, visibility)
+        count = _count_support(point, visibility)
         if count:
             lines.append(_Line(point, members, count))
     lines.sort(key=lambda line: -line.shown)
-    return sorted((line.point for line in _distinct(lines, segments)), key=lambda point: float(point.point[0]))
+    return sorted((line.point for line in _remove_duplicates(lines, segments)), key=lambda point: float(point.point[0]))
 
 
 def _seeds(segments: StalkSegments) -> list[np.ndarray]:
@@ -223,7 +223,7 @@ def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
     return float((parts[0][1] - parts[1][1]) / (parts[0][0] - parts[1][0]))
 
 
-def _is_consistent(point: GraspPoint, visibility: Visibility) -> int:
+def _count_support(point: GraspPoint, visibility: Visibility) -> int:
     """Count the places along a stalk's line at which pairs show it.
 
     Return 0 unless at least two pairs (or the only one) show it, and few enough see through it.
@@ -236,16 +236,16 @@ def _is_consistent(point: GraspPoint, visibility: Visibility) -> int:
     return count if agreed else 0
 
 
-def _distinct(lines: list[_Line], segments: StalkSegments) -> list[_Line]:
+def _remove_duplicates(lines: list[_Line], segments: StalkSegments) -> list[_Line]:
     """Return the lines without those that are the same stalk as an earlier one."""
     distinct: list[_Line] = []
     for line in lines:
-        if not any(_same(line.point, other.point) and not _side_by_side(segments, line, other) for other in distinct):
+        if not any(_is_same_stalk(line.point, other.point) and not _side_by_side(segments, line, other) for other in distinct):
             distinct.append(line)
     return distinct
 
 
-def _same(point: GraspPoint, other: GraspPoint) -> bool:
+def _is_same_stalk(point: GraspPoint, other: GraspPoint) -> bool:
     """Return True if a line is probably the same stalk as ``other``, which pairs show better."""
     up = point.point[2] - other.point[2]
     distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))

@@ -179,15 +179,15 @@ class _Clock:
 
     @contextlib.contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        self._turn()
+        self._record_lap()
         self._names.append(name)
         try:
             yield
         finally:
-            self._turn()
+            self._record_lap()
             self._names.pop()
 
-    def _turn(self) -> None:
+    def _record_lap(self) -> None:
         now = time.perf_counter()
         if self._names:
             self._seconds[self._names[-1]] += now - self._last

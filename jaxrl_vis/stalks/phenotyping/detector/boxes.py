@@ -44,7 +44,7 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
     # Fixed-point iteration over all boxes at once: a box is kept unless a kept box of higher score suppresses it. Each round
     # settles at least the next box in order and never changes a settled one, so it converges to the sequential result, usually
     # in a few rounds instead of N steps.
-    def unsettled(state: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def is_unsettled(state: tuple[jax.Array, jax.Array]) -> jax.Array:
         selected, before = state
         return (selected != before).any()
 
@@ -52,7 +52,7 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
         selected, _ = state
         return there & ~(better & selected[:, None]).any(axis=0), selected
 
-    selected, _ = jax.lax.while_loop(unsettled, again, again((there, ~there)))
+    selected, _ = jax.lax.while_loop(is_unsettled, again, again((there, ~there)))
     return jnp.zeros(scores.shape, bool).at[order].set(selected)
 
 

@@ -36,11 +36,11 @@ def refine_edges(strip: Strip, image: np.ndarray, corner: tuple[int, int], line:
     edges = []
     for offset, slope in (strip.left, strip.right):
         column = offset + slope * (lines - corner[0] - strip.reference) + corner[1]
-        edges.append((offset + _shift(image, lines, column), slope))
+        edges.append((offset + _edge_shift(image, lines, column), slope))
     return dataclasses.replace(strip, left=edges[0], right=edges[1])
 
 
-def _shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
+def _edge_shift(image: np.ndarray, lines: np.ndarray, columns: np.ndarray) -> float:
     """Return the shift to the right, pixels, of an edge at image rows and columns [N]; 0 without a clear gradient maximum."""
     offsets = _SAMPLE_STEP * np.arange(-_BESIDE, _BESIDE + 1)
     places = columns[:, None] + offsets

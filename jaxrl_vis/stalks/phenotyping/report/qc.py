@@ -150,11 +150,11 @@ class Page:
         reasons = Counter(sighting.reason for frame in plot.frames for sighting in frame if sighting.reason)
         finds = [{"why": why, "finds": count} for why, count in _group_reasons(reasons).most_common()]
         write = self._file.write
-        write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
+        write(f'<details id="{_escape(name)}"><summary>{_escape(name)}: {_escape(_headline(plot.row))}</summary>')
         if plot.why:
-            write(f'<p class="doubt">No count: {_safe(plot.why)}.</p>')
+            write(f'<p class="doubt">No count: {_escape(plot.why)}.</p>')
         if plot.strange:
-            write(f'<p class="doubt">{_safe(plot.strange[:1].upper() + plot.strange[1:])}.</p>')
+            write(f'<p class="doubt">{_escape(plot.strange[:1].upper() + plot.strange[1:])}.</p>')
         if plot.stalks:
             write(_chart(plot, rejected))
             write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + table({"picture": "", **_STALK_COLUMNS}, tables))
@@ -177,13 +177,13 @@ class Page:
         Raises:
             OSError: The file cannot be written.
         """
-        rows = [{**row, "plot": _Html(f'<a href="#{_safe(row["plot"])}">{_safe(row["plot"])}</a>')} for row in self._rows]
+        rows = [{**row, "plot": _Html(f'<a href="#{_escape(row["plot"])}">{_escape(row["plot"])}</a>')} for row in self._rows]
         with replacing(path) as encoded:
             file = codecs.getwriter("utf-8")(encoded)
             file.write('<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Stalks</title>')
             file.write(f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>')
             file.write("<h1>Stalks: what was counted and measured</h1>")
-            file.write("".join(f"<p>{_safe(line)}</p>" for line in self._about))
+            file.write("".join(f"<p>{_escape(line)}</p>" for line in self._about))
             file.write("<h2>Plots</h2><p>Click on a column to sort by it, and on a plot to see its stalks.</p>")
             file.write(table(_PLOT_COLUMNS, rows))
             if skipped:
@@ -199,7 +199,7 @@ class _Html(str):
     """HTML that must not be escaped again."""
 
 
-def _safe(value: Any) -> str:
+def _escape(value: Any) -> str:
     return html.escape(str(value))
 
 
@@ -226,7 +226,7 @@ def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
         rows: Values by column name; flags other than ``ok`` are highlighted.
     """
     head = "".join(
-        f'<th aria-sort="none"><button>{_safe(title)}</button></th>' if title else "<th></th>" for title in columns.values()
+        f'<th aria-sort="none"><button>{_escape(title)}</button></th>' if title else "<th></th>" for title in columns.values()
     )
     lines = []
     for row in rows:
@@ -236,7 +236,7 @@ def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
             if column in _DIGITS and value != "":
                 value = f"{float(value):.{_DIGITS[column]}f}"
             kind = ' class="doubt"' if column == "flag" and value != "ok" else ""
-            cells.append(f"<td{kind}>{value if isinstance(value, _Html) else _safe(value)}</td>")
+            cells.append(f"<td{kind}>{value if isinstance(value, _Html) else _escape(value)}</td>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
     return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
 
@@ -257,7 +257,7 @@ class _Pictures:
         # The best sighting of each track, grouped by pair, so that each overlay is read once.
         wanted: dict[int, list[tuple[int, int]]] = {}
         for place, track in enumerate(plot.tracks):
-            frame, sighting = max(track.sightings, key=lambda indices: self._clear(*indices))
+            frame, sighting = max(track.sightings, key=lambda indices: self._clear_section(*indices))
             wanted.setdefault(frame, []).append((place, sighting))
         self._crops: dict[int, _Html] = {}
         for frame, tracks in wanted.items():
@@ -266,7 +266,7 @@ class _Pictures:
                 name = f"pair {plot.pairs[frame]}"
                 self._crops[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
 
-    def _clear(self, frame: int, sighting: int) -> tuple[bool, float]:
+    def _clear_section(self, frame: int, sighting: int) -> tuple[bool, float]:
         chosen = self._plot.frames[frame][sighting]
         return chosen.diameter_mm is not None, chosen.confidence
 
@@ -296,7 +296,7 @@ class _Pictures:
             shrink = min(_THUMB / overlay.shape[1], 1.0)
             small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
             name = f"pair {pairs[place]}"
-            yield f"<figure>{picture(small, name, 'pair')}<figcaption>{_safe(name)}</figcaption></figure>"
+            yield f"<figure>{picture(small, name, 'pair')}<figcaption>{_escape(name)}</figcaption></figure>"
 
 
 def picture(image: np.ndarray, name: str, kind: str) -> _Html:
@@ -309,9 +309,8 @@ def picture(image: np.ndarray, name: str, kind: str) -> _Html:
     """
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 75])
     source = base64.b64encode(data.tobytes()).decode()
-    return _Html(
-        f'<img class="{kind}" loading="lazy" alt="{_safe(name)}" title="{_safe(name)}" src="data:image/jpeg;base64,{source}">'
-    )
+    title = _escape(name)
+    return _Html(f'<img class="{kind}" loading="lazy" alt="{title}" title="{title}" src="data:image/jpeg;base64,{source}">')
 
 
 def _chart(plot: PlotResult, rejected: list[Track]) -> str:
@@ -345,14 +344,14 @@ def _chart(plot: PlotResult, rejected: list[Track]) -> str:
         marks.append(f'<text x="{x(tick):.1f}" y="{tall - 12}" text-anchor="middle">{tick:.2f}</text>')
     for track in rejected:
         place = f'x="{x(track.position_m - plot.start):.1f}" y="{tall - 32}"'
-        marks.append(f'<text class="no" {place} text-anchor="middle">×<title>{_safe(track.reason)}</title></text>')
+        marks.append(f'<text class="no" {place} text-anchor="middle">×<title>{_escape(track.reason)}</title></text>')
     for place, width, error, row in points:
         kind = "good" if row["flag"] == "ok" else "doubt"
         ends = f'y1="{y(width - error):.1f}" y2="{y(width + error):.1f}"'
         title = f"stalk {row['stalk']}: {row['width_mm']} ± {row['width_se_mm']} mm, {row['flag']}"
         marks.append(f'<line class="{kind}" x1="{x(place):.1f}" x2="{x(place):.1f}" {ends}/>')
         marks.append(
-            f'<circle class="{kind}" cx="{x(place):.1f}" cy="{y(width):.1f}" r="4"><title>{_safe(title)}</title></circle>'
+            f'<circle class="{kind}" cx="{x(place):.1f}" cy="{y(width):.1f}" r="4"><title>{_escape(title)}</title></circle>'
         )
     caption = "Width in mm along the row in m. Orange: look at its flag. ×: rejected."
     return (

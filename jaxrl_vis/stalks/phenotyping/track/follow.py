@@ -158,7 +158,7 @@ def follow(
     )
     length = abs(float(places[-1] - places[0]) + step) if len(places) else 0.0
     path = Path(places, length, _seen(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
-    closed = [_close_gaps(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
+    closed = [_finish_track(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
@@ -209,24 +209,24 @@ class _PairView:
         known = np.isfinite(along) & np.isfinite(depth)
         # A depth without a position: not a stalk of the row.
         elsewhere = np.array([sighting.depth_m is not None and sighting.along_m is None for sighting in sightings], bool)
-        over = np.array([_over(sighting) for sighting in sightings])
+        over = np.array([_lean_offset(sighting) for sighting in sightings])
         half = 0.5 * calibration.baseline
         along = np.where(known, along, rays * usual - half)
-        return cls(rays, along, depth, known, ~elsewhere & _spatial_distance(sightings), over, half, usual)
+        return cls(rays, along, depth, known, ~elsewhere & _are_distinct(sightings), over, half, usual)
 
     def along_at(self, depth: float) -> np.ndarray:
         """Return the positions along the row [N], m, assuming a ``depth`` in m; the usual depth if NaN."""
         return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
 
 
-def _over(sighting: Sighting) -> float:
+def _lean_offset(sighting: Sighting) -> float:
     """Return the distance along the row from a stalk's foot to the place of its measurement, m; 0 if unknown."""
     if sighting.height_m is None or sighting.lean_deg is None or abs(sighting.lean_deg) > _MAX_LEAN:
         return 0.0
     return sighting.height_m * math.tan(math.radians(sighting.lean_deg))
 
 
-def _spatial_distance(sightings: list[Sighting]) -> np.ndarray:
+def _are_distinct(sightings: list[Sighting]) -> np.ndarray:
     """Return [N] bool, True for sightings of a pair that are distinct stalks: two stalks cannot intersect in space.
 
     Of two that do, the less certain one is a duplicate and marked False. The minimum distance is 60 % of that at which they
@@ -270,7 +270,7 @@ def _merge_tracks(tracks: list[_Open], gates: Gates) -> list[_Open]:
     merged: list[_Open] = []
     for track in sorted(tracks, key=lambda track: -len(track.sightings)):
         for other in merged:
-            aside, away = _apart(track, other)
+            aside, away = _track_distance(track, other)
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A wrongly assigned sighting may make both appear in one pair.
             near = aside < gates.merge and away < gates.depth
@@ -296,7 +296,7 @@ def _one_behind(track: _Open, other: _Open) -> float:
     return float(np.median(np.abs(positions)))
 
 
-def _apart(track: _Open, other: _Open) -> tuple[float, float]:
+def _track_distance(track: _Open, other: _Open) -> tuple[float, float]:
     """Return the distances of two tracks along the row and in depth, m."""
     depths = track.depths(), other.depths()
     if all(map(len, depths)) or not any(map(len, depths)):
@@ -307,7 +307,7 @@ def _apart(track: _Open, other: _Open) -> tuple[float, float]:
     return abs(track.at(depth) - other.at(depth)), 0.0
 
 
-def _close_gaps(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
+def _finish_track(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
     position = float(np.median(track.along))
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan

@@ -30,7 +30,7 @@ from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
 
 MIN_VISIBLE = 0.3
 """Minimum visible fraction of a stalk's part in the band to count it as a `STALK`."""
-_MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
+_MaskFunction = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 """Function that returns the masks [N, h, w] bool of the crops of stalks with indices [N], given their positions (boxes and
 axes) [N or more, 6] and the (height, width) of crops."""
 MAX_STALKS = 56
@@ -87,8 +87,8 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         true = sequence.drive.true
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
-        masks_of = functools.partial(_instance_masks, instance, indices)
-        example = _example(image, pixels_per_metre, stalks, kinds, masks_of, settings, rng, _HIGHER)
+        mask_function = functools.partial(_instance_masks, instance, indices)
+        example = _example(image, pixels_per_metre, stalks, kinds, mask_function, settings, rng, _HIGHER)
         if by_day:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.
             shape = crop_shape((settings.crop_height, settings.crop_width), family.rig.width / settings.full_width)
@@ -153,7 +153,7 @@ def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
 def _instance_masks(
     instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of an instance segmentation; see `_MasksOf`."""
+    """Cut the masks of stalk crops out of an instance segmentation; see `_MaskFunction`."""
     cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is outside the image
     return cut_out == indices[parts][:, None, None] + 1
 
@@ -194,7 +194,7 @@ def _example(
     pixels_per_metre: float | None,
     stalks: np.ndarray,
     kinds: np.ndarray,
-    masks_of: _MasksOf,
+    mask_function: _MaskFunction,
     settings: Settings,
     rng: Any,
     higher: float = 0.0,
@@ -220,7 +220,7 @@ def _example(
         filled = -(-len(clear) // 16) * 16  # few shapes, few compilations
         places = np.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
         crops = np.asarray(cut(on_device, places, shape))[: len(clear)]
-        masks = masks_of(clear, places, shape)
+        masks = mask_function(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
     count = min(len(stalks), MAX_STALKS)
     padded, padded_kinds = np.zeros((MAX_STALKS, 6), np.float32), np.full(MAX_STALKS, NOTHING, np.int32)
@@ -289,7 +289,7 @@ def _own_masks(
     places: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of annotations; see `_MasksOf`.
+    """Cut the masks of stalk crops out of annotations; see `_MaskFunction`.
 
     One at a time: masks may overlap, and all of an image together could exceed the memory.
     """

@@ -44,7 +44,7 @@ def gather(folder: Path) -> list[tuple[Any, Annotated]]:
 def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     path = folder / "annotations.json"
     if path.exists():
-        return _one(path, lambda: _coco(path, read_json(path)), "COCO")
+        return _convert_errors(path, lambda: _read_coco(path, read_json(path)), "COCO")
     annotated: list[tuple[Any, Annotated]] = []
     others: list[Path] = []
     names: list[str] | None = None
@@ -52,12 +52,17 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     images = {image.stem: image for image in _files(folder, _IMAGES) if image.is_file()}
     for file in _files(folder, {".json", ".xml", ".txt"}):
         if file.suffix.lower() == ".json":
-            read = _json(file, numbers)
+            read = _read_json(file, numbers)
         elif file.suffix.lower() == ".xml":
-            read = _xml(file, numbers)
+            read = _read_xml(file, numbers)
         elif file.stem in images and file.name not in yolo.NAMES:
             names = _class_names(folder) if names is None else names
-            read = list(zip(numbers, _one(file, lambda file=file, names=names: _yolo(file, images[file.stem], names), "YOLO")))
+            read = list(
+                zip(
+                    numbers,
+                    _convert_errors(file, lambda file=file, names=names: _read_yolo(file, images[file.stem], names), "YOLO"),
+                )
+            )
         else:
             continue
         annotated += read or []
@@ -75,7 +80,7 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     return annotated
 
 
-def _one(file: Path, read: Any, kind: str) -> Any:
+def _convert_errors(file: Path, read: Any, kind: str) -> Any:
     """Call ``read``, converting errors of the readers to a `RequestError`.
 
     Args:
@@ -94,44 +99,44 @@ def _one(file: Path, read: Any, kind: str) -> Any:
         raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
     except _WRONG as error:
         what = "not COCO: it needs images and annotations" if kind == "COCO" else f"no annotation of {kind}"
-        raise RequestError(f"{file} is {what}{_reason(error)}") from error
+        raise RequestError(f"{file} is {what}{_error_reason(error)}") from error
 
 
-def _reason(error: Exception) -> str:
+def _error_reason(error: Exception) -> str:
     """Return the message of a `ValueError` in parentheses, shortened; empty for other errors."""
     words = " ".join(str(error).split()) if isinstance(error, ValueError) else ""
     return f" ({words[:200]})" if words else ""
 
 
-def _coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
+def _read_coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
     if not coco.is_coco(data):
         raise KeyError("images")
     return coco.read_coco(path, data)
 
 
-def _json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+def _read_json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
     """Read the images of a COCO, LabelMe or Label Studio JSON file; return None if it has another format."""
-    data = _one(file, lambda: parse_json(read_text(file)), "LabelMe")
+    data = _convert_errors(file, lambda: parse_json(read_text(file)), "LabelMe")
     if coco.is_coco(data):
-        read = _one(file, lambda: _coco(file, data), "COCO")
+        read = _convert_errors(file, lambda: _read_coco(file, data), "COCO")
         # Ids may repeat across files.
         return [((str(file), number) if isinstance(number, (int, str)) else number, image) for number, image in read]
     if label_studio.is_label_studio(data):
-        return list(zip(numbers, _one(file, lambda: label_studio.read_label_studio(file, data), "Label Studio")))
+        return list(zip(numbers, _convert_errors(file, lambda: label_studio.read_label_studio(file, data), "Label Studio")))
     if labelme.is_labelme(data):
-        return list(zip(numbers, _one(file, lambda: labelme.read_labelme(file, data), "LabelMe")))
+        return list(zip(numbers, _convert_errors(file, lambda: labelme.read_labelme(file, data), "LabelMe")))
     return None
 
 
-def _xml(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+def _read_xml(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
     """Read the images of a Pascal VOC or CVAT XML file; return None if it has another format."""
-    root = _one(file, lambda: parse_xml(read_bytes(file)), "Pascal VOC")
+    root = _convert_errors(file, lambda: parse_xml(read_bytes(file)), "Pascal VOC")
     if root.tag not in ("annotation", "annotations"):
         return None
-    return list(zip(numbers, _one(file, lambda: voc.read_xml(file, root), "Pascal VOC")))
+    return list(zip(numbers, _convert_errors(file, lambda: voc.read_xml(file, root), "Pascal VOC")))
 
 
-def _yolo(file: Path, image: Path, names: list[str]) -> list[Annotated]:
+def _read_yolo(file: Path, image: Path, names: list[str]) -> list[Annotated]:
     text = read_text(file, _MAX_BYTES)
     if not yolo.is_yolo(text):
         raise ValueError("its lines are not a class and numbers")
@@ -144,7 +149,7 @@ def _class_names(folder: Path) -> list[str]:
     for name in yolo.NAMES:
         for path in (folder / name, folder.parent / name, *sorted(folder.glob(f"*/{name}"))):
             if path.is_file():
-                return _one(path, lambda path=path: yolo.read_names(path), "YOLO's classes")
+                return _convert_errors(path, lambda path=path: yolo.read_names(path), "YOLO's classes")
     return []
 
 

@@ -84,7 +84,7 @@ def _match_names(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[i
         names: Identifier in each row.
         plots: Names of the plots.
     """
-    for normalise in (str, _last_number, _number):
+    for normalise in (str, _last_component, _number):
         rows: dict[str, list[int]] = {}
         for number, name in enumerate(names):
             if name and normalise(name):
@@ -95,13 +95,13 @@ def _match_names(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[i
     return {}
 
 
-def _last_number(name: str) -> str:
+def _last_component(name: str) -> str:
     return re.split(r"[/\\]", name)[-1].casefold()
 
 
 def _number(name: str) -> str:
     """Return the last number in a plot's name, without leading zeros; empty if there is none."""
-    numbers = re.findall(r"\d+", _last_number(name))
+    numbers = re.findall(r"\d+", _last_component(name))
     return str(int(numbers[-1])) if numbers and len(numbers[-1]) < 20 else ""
 
 

@@ -204,7 +204,7 @@ def _parse_printed(path: Path, text: str) -> _Table | None:
         stamps = [int(stamp[1]) + int(stamp[2]) * 1e-9 for stamp, _ in rows if stamp is not None]
         times = np.array(stamps) - stamps[0] if len(stamps) == len(rows) else None
         metres = places if pattern is _PRINTED_PLACE else _project_to_plane(places)
-        return _Table(path, None, times, stamps[0] if times is not None else 0.0, _along(metres))
+        return _Table(path, None, times, stamps[0] if times is not None else 0.0, _project_on_path(metres))
     return None
 
 
@@ -226,7 +226,7 @@ def _parse_table(path: Path, text: str) -> _Table:
         raise RequestError(f"{path} needs a column distance_m, or time_s and --speed{hint}")
 
     def column(index: int) -> np.ndarray:
-        return np.array([_number(row[index] if index < len(row) else "", path, line, comma) for line, row in rows], float)
+        return np.array([_parse_number(row[index] if index < len(row) else "", path, line, comma) for line, row in rows], float)
 
     names = None if left is None else [unescape_cell(row[left].strip()) if left < len(row) else "" for _, row in rows]
     distances: np.ndarray | None = None
@@ -234,10 +234,10 @@ def _parse_table(path: Path, text: str) -> _Table:
         distances = column(metres[0][0]) * metres[0][1]
     elif places is not None:
         values = np.stack([column(columns.index(name)) for name in places if name in columns], axis=1)
-        distances = _along(_project_to_plane(values) if places in _GLOBE else values) if len(values) else np.zeros(0)
+        distances = _project_on_path(_project_to_plane(values) if places in _GLOBE else values) if len(values) else np.zeros(0)
     times, start = None, 0.0
     if time is not None and (distances is None or names is None):
-        times, start = _seconds(column(time), columns[time], path)
+        times, start = _parse_seconds(column(time), columns[time], path)
     return _Table(path, names, times, start, distances)
 
 
@@ -246,7 +246,7 @@ def _time_column(columns: list[str]) -> int | None:
     return named[0] if named else None
 
 
-def _seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, float]:
+def _parse_seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, float]:
     """Convert times to s; return them relative to the first one, and the first one.
 
     Args:
@@ -278,7 +278,7 @@ def _project_to_plane(degrees: np.ndarray) -> np.ndarray:
     return _EARTH * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
 
 
-def _along(places: np.ndarray) -> np.ndarray:
+def _project_on_path(places: np.ndarray) -> np.ndarray:
     """Return distances [N] along the straight line fitted to positions [N, 2 or 3], from the first one; NaN if any is invalid.
 
     Lateral deviations from the line do not count. The direction of travel is positive.
@@ -292,7 +292,7 @@ def _along(places: np.ndarray) -> np.ndarray:
     return along - along[0]
 
 
-def _number(cell: str, path: Path, line: int, comma: bool) -> float:
+def _parse_number(cell: str, path: Path, line: int, comma: bool) -> float:
     text = unescape_cell(cell.strip())
     try:
         value = float(text.replace(",", ".") if comma else text)
