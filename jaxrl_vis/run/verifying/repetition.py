@@ -103,14 +103,14 @@ class Repeater:
             read = self._programs.pending(values).read_per_seed(len(self._expected.seeds))
             broken = [key for key, counts in read.items() if key.startswith(GUARD) and any(counts)]
             if broken:
-                self._differ(f"iteration {iteration}: the repetition from {name} meets non-finite numbers")
+                self._note_difference(f"iteration {iteration}: the repetition from {name} meets non-finite numbers")
                 return
             history[iteration] = {key: per_seed for key, per_seed in read.items() if not key.startswith(GUARD)}
             if iteration in compared_iterations:
                 self._compare(name, iteration, loop, history)
             self._compare_checkpoints(iteration, progress.replay_lost_at, loop)
 
-    def _differ(self, line: str) -> None:
+    def _note_difference(self, line: str) -> None:
         self._report.differences.append(line)
         self._report.problems.append(line)
         self._echo(f"  {line}")
@@ -155,7 +155,7 @@ class Repeater:
         hint = ""
         if all(key.startswith("eval/") for _, key, _, _ in differences):
             hint = " (or eval_episodes had another value then)"
-        self._differ(f"iteration {iteration}, from {name}: {shown}{hint}")
+        self._note_difference(f"iteration {iteration}, from {name}: {shown}{hint}")
 
     def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
         """List candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
@@ -193,7 +193,9 @@ class Repeater:
             if (checkpoint := f"{tier}/{iteration}") not in self._report.checkpoints:
                 self._report.checkpoints.append(checkpoint)
             if differing:
-                self._differ(f"checkpoint {tier}/{iteration} differs from the repetition: {format_list(differing)} differ")
+                self._note_difference(
+                    f"checkpoint {tier}/{iteration} differs from the repetition: {format_list(differing)} differ"
+                )
             else:
                 self._echo(f"  checkpoint {tier}/{iteration}: equal")
 

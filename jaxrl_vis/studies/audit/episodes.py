@@ -102,11 +102,11 @@ def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
         return pairs
     draw = np.random.default_rng(seed)
 
-    def noisy(images: Any) -> Any:
+    def add_noise(images: Any) -> Any:
         changed = images + deviation * draw.standard_normal(images.shape, np.float32)
         return np.clip(np.round(changed), 0, 255).astype(np.uint8)
 
-    return pairs._replace(images=noisy(pairs.images), goals=noisy(pairs.goals))
+    return pairs._replace(images=add_noise(pairs.images), goals=add_noise(pairs.goals))
 
 
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:

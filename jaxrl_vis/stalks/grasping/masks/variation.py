@@ -45,9 +45,13 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
 def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Scale, stretch, shear and mirror crops and masks about their centres, with edge pixels repeated beyond the edges."""
     count, height, width = masks.shape
-    drawn = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
-    size, wide, shear = jnp.exp(0.3 * strength * drawn[0]), jnp.exp(0.25 * strength * drawn[1]), 0.2 * strength * drawn[2]
-    mirror = jnp.where(drawn[3] > 0.0, 1.0, -1.0)
+    sample_uniform = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
+    size, wide, shear = (
+        jnp.exp(0.3 * strength * sample_uniform[0]),
+        jnp.exp(0.25 * strength * sample_uniform[1]),
+        0.2 * strength * sample_uniform[2],
+    )
+    mirror = jnp.where(sample_uniform[3] > 0.0, 1.0, -1.0)
     line, column = jnp.meshgrid(jnp.arange(height) - 0.5 * (height - 1), jnp.arange(width) - 0.5 * (width - 1), indexing="ij")
 
     def one(image: jax.Array, mask: jax.Array, size: jax.Array, wide: jax.Array, shear: jax.Array, mirror: jax.Array):
@@ -105,14 +109,14 @@ def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
     count = len(values)
     gain, gamma, contrast, black, amount, ramp = jax.random.split(key, 6)
 
-    def drawn(key: jax.Array, low: float, high: float) -> jax.Array:
+    def sample_uniform(key: jax.Array, low: float, high: float) -> jax.Array:
         return strength * jax.random.uniform(key, (count, 1, 1, 1), minval=low, maxval=high)
 
-    values = jnp.maximum(values, 1e-4) ** jnp.exp(drawn(gamma, -0.5, 0.5))
+    values = jnp.maximum(values, 1e-4) ** jnp.exp(sample_uniform(gamma, -0.5, 0.5))
     middle = values.mean(axis=(1, 2, 3), keepdims=True)
-    values = middle + (values - middle) * jnp.exp(drawn(contrast, -0.5, 0.4))
-    ramp = drawn(amount, 0.0, 0.6) * _field(ramp, values.shape, 2, 2)
-    return values * jnp.exp(drawn(gain, -1.1, 0.8) + ramp) + drawn(black, 0.0, 0.08)
+    values = middle + (values - middle) * jnp.exp(sample_uniform(contrast, -0.5, 0.4))
+    ramp = sample_uniform(amount, 0.0, 0.6) * _field(ramp, values.shape, 2, 2)
+    return values * jnp.exp(sample_uniform(gain, -1.1, 0.8) + ramp) + sample_uniform(black, 0.0, 0.08)
 
 
 def _blur(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:

@@ -76,7 +76,7 @@ def write_plots(
     for seed in seeds:
         description = folder / plot_name(seed) / "plot.json"
         if description.exists():
-            if _holds(description.parent, truth, family.rig.frames):
+            if _is_complete(description.parent, truth, family.rig.frames):
                 present += 1
                 done(seed, family.rig.frames)
                 continue
@@ -87,7 +87,7 @@ def write_plots(
     return present
 
 
-def _holds(folder: Path, truth: Truth, frames: int) -> bool:
+def _is_complete(folder: Path, truth: Truth, frames: int) -> bool:
     """Return whether a complete plot holds at least the requested ground truth."""
     maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
     wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]

@@ -237,7 +237,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         RequestError: Annotations are missing or invalid, or an image is missing or differs in size from its annotations.
     """
     data = read_annotations(folder, labels)
-    density_of = _densities(folder, data["images"])
+    resolution_of = _resolutions(folder, data["images"])
     of_image: dict[int, list[dict[str, Any]]] = {}
     for annotation in data["annotations"]:
         of_image.setdefault(annotation["image_id"], []).append(annotation)
@@ -262,7 +262,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         stalks = np.concatenate([stalks, strips])
         rng = np.random.default_rng([number, 18])
         yield _example(
-            image, density_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
+            image, resolution_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
         )
 
 
@@ -300,7 +300,7 @@ def _own_masks(
     return np.concatenate(crops)
 
 
-def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
+def _resolutions(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
     """Return the pixels per metre at the row of each image by its id; all None if the folder has no calibration.
 
     Raises:
@@ -330,7 +330,7 @@ def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
         RequestError: The annotations or the calibration of the folder cannot be read.
     """
     data = read_annotations(folder, labels)
-    densities = _densities(folder, data["images"])
+    densities = _resolutions(folder, data["images"])
     known = all(densities.values())
     widths = {image["id"]: image["width"] for image in data["images"]}
     boxes = [annotation for annotation in data["annotations"] if not annotation.get("iscrowd")]
