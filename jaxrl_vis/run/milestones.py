@@ -63,7 +63,7 @@ class Milestones:
             self._saver.best(loop, iteration, progress, about)
             self._best = score
 
-    def ends(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
+    def should_end(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
         """Return why the run ends after this evaluation; None if it continues."""
         asked = False
         for callback in callbacks:  # each of them, also after one that asks to stop

@@ -55,10 +55,10 @@ def step(params: Params, gradient: Params, state: Any, learning_rate: float, cor
     moments = state[0]
     first, second = (_update_average(*terms, gradient) for terms in zip(_DECAYS, (1, 2), (moments.mu, moments.nu), strict=True))
 
-    def moved(leaf: jax.Array, mean: jax.Array, square: jax.Array) -> jax.Array:
+    def update_leaf(leaf: jax.Array, mean: jax.Array, square: jax.Array) -> jax.Array:
         return leaf - learning_rate * (mean / correction[0] / (jnp.sqrt(square / correction[1]) + _SMALL))
 
-    return jax.tree.map(moved, params, first, second), (moments._replace(mu=first, nu=second), *state[1:])
+    return jax.tree.map(update_leaf, params, first, second), (moments._replace(mu=first, nu=second), *state[1:])
 
 
 def _update_average(decay: float, order: int, moment: Params, gradient: Params) -> Params:

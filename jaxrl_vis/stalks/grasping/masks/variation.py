@@ -45,13 +45,9 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
 def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Scale, stretch, shear and mirror crops and masks about their centres, with edge pixels repeated beyond the edges."""
     count, height, width = masks.shape
-    sample_uniform = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
-    size, wide, shear = (
-        jnp.exp(0.3 * strength * sample_uniform[0]),
-        jnp.exp(0.25 * strength * sample_uniform[1]),
-        0.2 * strength * sample_uniform[2],
-    )
-    mirror = jnp.where(sample_uniform[3] > 0.0, 1.0, -1.0)
+    draws = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
+    size, wide, shear = jnp.exp(0.3 * strength * draws[0]), jnp.exp(0.25 * strength * draws[1]), 0.2 * strength * draws[2]
+    mirror = jnp.where(draws[3] > 0.0, 1.0, -1.0)
     line, column = jnp.meshgrid(jnp.arange(height) - 0.5 * (height - 1), jnp.arange(width) - 0.5 * (width - 1), indexing="ij")
 
     def one(image: jax.Array, mask: jax.Array, size: jax.Array, wide: jax.Array, shear: jax.Array, mirror: jax.Array):

@@ -26,7 +26,7 @@ from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis_envs.plants import Family
 
 SCHEMA = 3
-KEPT_SCORE = 0.05
+MIN_RECORDED_SCORE = 0.05
 """Minimum score of recorded detections: lower ones affect only the far end of the precision-recall curve."""
 
 
@@ -64,7 +64,7 @@ def evaluate_plot(task: Task, seed: int) -> Record:
     if task.weights is not None:
         from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 
-        find = load_finder(task.weights, KEPT_SCORE)
+        find = load_finder(task.weights, MIN_RECORDED_SCORE)
     score = score_plot(task.family, seed, find, task.method, task.min_score, task.thesis)
     where = {"device": device_name(), "workers": task.workers, "revision": revision()}
     return {**where, **_record(score, task.family.rig.frames)}
