@@ -339,7 +339,7 @@ class RunLoop:
 
     def _end_early(self, report: Report) -> None:
         """Make this iteration the last one if an evaluation or a callback requests it."""
-        if (reason := self._milestones.should_end(report, self._callbacks)) and self._done < self._total:
+        if (reason := self._milestones.end_reason(report, self._callbacks)) and self._done < self._total:
             self._echo(f"stopped at iteration {self._done} of {self._total}: {reason}")
             self._total = self._done
 

@@ -63,8 +63,8 @@ class Milestones:
             self._saver.best(loop, iteration, progress, about)
             self._best = score
 
-    def should_end(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
-        """Return why the run ends after this evaluation; None if it continues."""
+    def end_reason(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
+        """Return the reason to end the run after this evaluation; None to continue."""
         asked = False
         for callback in callbacks:  # each of them, also after one that asks to stop
             asked |= callback(report) is True

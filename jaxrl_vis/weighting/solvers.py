@@ -235,17 +235,17 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
     unit = unit + len(unit) * eps * jnp.eye(len(unit), dtype=unit.dtype)  # keeps the solution finite
     greatest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(gramian)), 0.0))
     lengths = relative * jnp.where(greatest > 0.0, greatest, 1.0)
-    # With a = x scale / lengths, the equation is unit x = preferences x^(-power), where the maximum of preferences is 1.
+    # With a = x scale / lengths, the equation is unit x = ratios x^(-power), where the maximum of ratios is 1.
     wanted = preferences * lengths ** (power - 1.0)
     scale = jnp.max(wanted) ** (1.0 / (1.0 + power))
-    preferences = wanted / jnp.max(wanted)
+    ratios = wanted / jnp.max(wanted)
 
     def objective(x: jax.Array) -> jax.Array:
         utility = jnp.log(x) if power == 1.0 else x ** (1.0 - power) / (1.0 - power)
-        return 0.5 * quadratic(unit, x) - jnp.sum(preferences * utility)
+        return 0.5 * quadratic(unit, x) - jnp.sum(ratios * utility)
 
     def step(state: _Newton) -> _Newton:
-        pull = preferences * state.x**-power
+        pull = ratios * state.x**-power
         slope = jnp.dot(unit, state.x, precision=jax.lax.Precision.HIGHEST) - pull
         hessian = unit + jnp.diag(power * pull / state.x)
         change = -jnp.linalg.solve(hessian, slope)
@@ -257,11 +257,11 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
         # Close to the minimum, the objective no longer distinguishes steps, and full ones converge quadratically.
         length = jnp.where(decrement < 1e-2, farthest, lengths[jnp.argmin(values)])
         x = state.x + length * change
-        pull = preferences * x**-power
+        pull = ratios * x**-power
         slope = jnp.dot(unit, x, precision=jax.lax.Precision.HIGHEST) - pull
         return _Newton(x, jnp.max(jnp.abs(slope) / pull), state.steps + 1)
 
-    first = _Newton(preferences ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
+    first = _Newton(ratios ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
     last = jax.lax.while_loop(lambda state: (state.residual > 20.0 * eps) & (state.steps < _NEWTON_STEPS), step, first)
     return last.x * scale / lengths
 

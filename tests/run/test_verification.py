@@ -169,7 +169,7 @@ def test_rows_that_do_not_fit_are_found(straight, tmp_path, change, problem):
     write_rows(tmp_path, change(rows_in(straight[0])))
     findings, expected = Findings(), expected_in(straight[0])
     rows = read_file(tmp_path / "metrics.jsonl", expected, False, findings)
-    missing = missing_rows(rows, expected, iteration=8, total=8, without=(), is_written=False)
+    missing = missing_rows(rows, expected, last_written=8, total=8, without=(), is_written=False)
     assert problem in "; ".join(findings.problems + missing)
 
 

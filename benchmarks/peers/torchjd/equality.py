@@ -101,7 +101,7 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
             jacobians, ranks = arrays[f"{count}/jacobians"], arrays[f"{count}/ranks"]
             chosen = ranks > (count - 1 if method in _FULL_RANK else 1 if method in _NO_LINE else 0)
             jacobians, one, other = (
-                values[chosen] for values in (jacobians, ours[f"{count}/{method}"], theirs[f"{count}/{method}"])
+                part[chosen] for part in (jacobians, ours[f"{count}/{method}"], theirs[f"{count}/{method}"])
             )
             if method in SOLVED:
                 for side, weights in (("ours", one), ("theirs", other)):

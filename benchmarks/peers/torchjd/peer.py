@@ -125,7 +125,7 @@ def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
         print(prefix, name, flush=True)
     results |= {f"{prefix}/{name}": value for name, value in drawn(arrays, prefix).items()}
     by_path = [dict(paths(losses)) for losses in torch.from_numpy(arrays[f"{prefix}/losses"])]
-    return results | {f"{prefix}/{name}": np.stack([path[name] for path in by_path]) for name in by_path[0]}
+    return results | {f"{prefix}/{name}": np.stack([outcome[name] for outcome in by_path]) for name in by_path[0]}
 
 
 def main() -> None:

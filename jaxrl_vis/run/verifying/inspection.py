@@ -136,7 +136,7 @@ def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: Expecte
 def missing_rows(
     rows: Sequence[Mapping[str, Any]],
     expected: Expected,
-    iteration: int,
+    last_written: int,
     total: int,
     without: Collection[int],
     is_written: bool,
@@ -146,7 +146,7 @@ def missing_rows(
     Args:
         rows: The rows of the file.
         expected: Conditions on the rows.
-        iteration: Last iteration whose rows were written, according to checkpoints, or 0.
+        last_written: Last iteration whose rows were written, according to checkpoints, or 0.
         total: Iterations of the run; the last one is always evaluated.
         without: Scheduled iterations without an evaluation.
         is_written: Another process may be writing rows of the last iteration.
@@ -154,9 +154,9 @@ def missing_rows(
     seeds_at: dict[int, set[int]] = {}
     for row in rows:
         seeds_at.setdefault(row["iteration"], set()).add(row["seed"])
-    last = max([iteration, *seeds_at])
+    last = max([last_written, *seeds_at])
     scheduled = set(range(expected.eval_interval, last + 1, expected.eval_interval)) - set(without)
-    scheduled |= {total} if iteration == total else set()
+    scheduled |= {total} if last_written == total else set()
     absent = sorted(scheduled - set(seeds_at))
     lines = []
     if absent:
