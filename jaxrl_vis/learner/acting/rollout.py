@@ -150,7 +150,7 @@ def play(
     def stored(leaf: jax.Array) -> jax.Array:
         return by_seed(leaf)[:, :num_kept]
 
-    def seen(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
+    def perturb(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
         # Noise is sampled once per frame and stored with it, so that a frame equals itself when it becomes a goal.
         if not deviation:
             return observations
@@ -164,8 +164,8 @@ def play(
     reset_keys, policy_keys = split_keys(keys, num_envs, draws)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
-    first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)
-    goal = seen(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
+    first_observation = perturb(state.obs["observation"], policy_keys, _FIRST_NOISE)
+    goal = perturb(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
     first_state, first_record = state.achieved_state, recorded(state)
     policies = jax.vmap(algorithm.policy_params)(train.agent, train.statistics)
     aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
@@ -177,7 +177,7 @@ def play(
         state, observation = carry
         action = jax.vmap(act)(policies, aims, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
         state = jax.vmap(env.advance)(state, action)
-        observation = seen(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
+        observation = perturb(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
         step_results = tuple(stored(leaf) for leaf in (observation, state.achieved_state, action))
         return (state, observation), (step_results, recorded(state))
 

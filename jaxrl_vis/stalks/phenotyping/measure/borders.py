@@ -73,10 +73,10 @@ def _border_wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
     """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image."""
     outside = np.zeros(dark.shape, bool)
     for turns in range(4):
-        seen, filled = np.rot90(dark, turns), np.rot90(image, turns)
-        reach = _side(seen, filled)
+        turned, filled = np.rot90(dark, turns), np.rot90(image, turns)
+        reach = _side(turned, filled)
         if reach is not None:
-            wedge = np.arange(seen.shape[1]) < reach[:, None]
+            wedge = np.arange(turned.shape[1]) < reach[:, None]
             outside |= np.rot90(wedge, -turns)
     return outside
 
