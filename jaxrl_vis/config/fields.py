@@ -103,7 +103,7 @@ def describe(record: type, group: str = "") -> list[Field]:
     """
     annotated = typing.get_type_hints(record, include_extras=True)
     described = []
-    for field in sorted(dataclasses.fields(record), key=lambda field: field.kw_only):
+    for field in sorted(dataclasses.fields(record), key=lambda field: bool(field.kw_only)):
         hint = annotated[field.name]
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             described += describe(hint, field.name)

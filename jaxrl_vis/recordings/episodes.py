@@ -114,9 +114,8 @@ class Recordings:
         """
         images_or_states = np.asarray(episodes.observations)
         if images_or_states.dtype == np.uint8:
-            images_or_states = np.moveaxis(
-                images_or_states[:, :, : images_or_states.shape[2] // int(about.get("frame_stack", 1))], 2, -1
-            )
+            channels = images_or_states.shape[2] // int(about.get("frame_stack", 1))
+            images_or_states = np.moveaxis(images_or_states[:, :, :channels], 2, -1)
         states = np.asarray(episodes.states)
         return cls(
             observations=np.ascontiguousarray(images_or_states[:, :-1]),

@@ -260,7 +260,7 @@ def _gradient_by_latents(
     added = through.backward(differentiated.at_latents, rest)
     if of_main is not None:  # add the main loss's gradient, which is known already
         added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
-    in_heads = differentiated.combined(params, weighting.coefficients(weighting.head_weights(weights), losses))
+    in_heads = differentiated.combine_heads(params, weighting.coefficients(weighting.head_weights(weights), losses))
     combined = jax.tree.map(jnp.add, in_heads, _embed(shared, params, added))
     return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
 

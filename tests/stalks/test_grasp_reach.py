@@ -189,7 +189,7 @@ def test_a_stand_of_nothing_is_refused_in_one_line():
     with pytest.raises(ValueError, match="finite"):
         stands_at(row(), np.zeros(1), np.full((1, 3), np.nan))
     empty = stands_at(Plot(TRAINING, 0, (), ()), np.zeros(1), np.zeros((1, 3)))
-    assert not empty.present.any()
+    assert not empty.is_present.any()
 
 
 def test_a_stalk_gives_way_like_a_beam():

@@ -298,7 +298,7 @@ assert_close(gradient(params, state, spread), gradient(params, state, batch))
 upgrad = make_weighting("upgrad")
 options = {"shared": encoder_of, "encode": encode}
 of_part = weighted_grad(
-    losses_of_latents, upgrad, way="latents", reduce=lambda tree: jax.lax.pmean(tree, "data"), **options
+    losses_of_latents, upgrad, mode="latents", reduce=lambda tree: jax.lax.pmean(tree, "data"), **options
 )
 specs = (PartitionSpec(), PartitionSpec(), PartitionSpec("data"))
 of_parts = jax.jit(jax.shard_map(of_part, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False))

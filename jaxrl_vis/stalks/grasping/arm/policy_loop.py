@@ -81,7 +81,7 @@ def reach_by_policy(
     result = jax.tree.map(lambda part: np.asarray(part)[:count], episode(*shapes[:1], goals, key[fill], winds))
     steps = round(Timing().reach / policy.env.control_period)
     error = np.linalg.norm(result["taken"][:, steps - 1] - (targets - stands.origin), axis=-1)
-    mine = can[:, None] & stands.present
+    mine = can[:, None] & stands.is_present
     return ReachResult(
         held=result["held"] & mine,
         path=result["path"] + stands.origin[:, None],

@@ -206,7 +206,7 @@ def reach(
     paths = {name: np.concatenate([part[name] for part in parts], axis=1) for name in ("path", "taken", "poses")}
     closing = parts[_calls(timing.reach) - 1]
     error = np.linalg.norm(closing["taken"][:, -1] - (aimed_at - stands.origin), axis=-1)
-    mine = can[:, None] & stands.present
+    mine = can[:, None] & stands.is_present
     return ReachResult(
         held=parts[-1]["held"] & mine,
         path=paths["path"] + stands.origin[:, None],
@@ -223,7 +223,7 @@ def _observe_targets(
     observer: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
     """Return the targets [B, 3] after another look, unchanged where it gives none or one that is out of reach."""
-    places = np.where(stands.present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
+    places = np.where(stands.is_present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
     updated = np.asarray(observer(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
     if updated.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
