@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.cli.parsing import AlsoPositional
@@ -81,7 +81,6 @@ def run(options: Run) -> int:
     enable_compilation_cache()
     from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
-    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS, UNFAMILIAR
 
     gate = None
     if options.masks == "truth":
@@ -119,25 +118,25 @@ def run(options: Run) -> int:
     for name, why in uncounted.items():
         if calibrations[name] is not None:
             print(f"{name}: {why}, so no count", file=sys.stderr)
-    for row in rows:
-        if NO_WIDTHS in row["flag"]:
-            print(
-                f"{row['plot']}: no width: none of its {row['stalks']} stalks could be measured, see qc.html", file=sys.stderr
-            )
-        if NO_GROUND in row["flag"]:
-            print(
-                f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
-            )
-        if UNFAMILIAR in row["flag"]:
-            print(
-                f"{row['plot']}: its images are unlike those that the networks read rightly: look at its overlays before you "
-                "trust a number",
-                file=sys.stderr,
-            )
-        if FEW_FRAMES in row["flag"]:
-            print(f"{row['plot']}: most widths were measured in fewer than three pairs: take more of them", file=sys.stderr)
+    _warn_of_flags(rows)
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
     counts = f"plots: {len(plots)}, pairs skipped: {len(skipped)}"
     print(f"{options.out}: stalks.csv, plots.csv, {written}, qc.html and overlays ({counts})")
     return SKIPPED if skipped else 0
+
+
+def _warn_of_flags(rows: list[dict[str, Any]]) -> None:
+    """Print a line for each flag of each row of plots.csv, with a hint."""
+    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS, UNFAMILIAR
+
+    hints = {
+        NO_WIDTHS: "no width: none of its {stalks} stalks could be measured, see qc.html",
+        NO_GROUND: "the ground is not seen, so nobody knows at what height the widths were taken",
+        UNFAMILIAR: "its images are unlike those that the networks read rightly: look at its overlays before you trust a number",
+        FEW_FRAMES: "most widths were measured in fewer than three pairs: take more of them",
+    }
+    for row in rows:
+        for flag, hint in hints.items():
+            if flag in row["flag"]:
+                print(f"{row['plot']}: {hint.format(stalks=row['stalks'])}", file=sys.stderr)
