@@ -133,7 +133,8 @@ def _warn_of_flags(rows: list[dict[str, Any]]) -> None:
     hints = {
         NO_WIDTHS: "no width: none of its {stalks} stalks could be measured, see qc.html",
         NO_GROUND: "the ground is not seen, so nobody knows at what height the widths were taken",
-        UNFAMILIAR: "its images are unlike those that the networks read rightly: look at its overlays before you trust a number",
+        UNFAMILIAR: "its images are unlike those that the networks read rightly: look at its overlays before you trust "
+        "a number",
         FEW_FRAMES: "most widths were measured in fewer than three pairs: take more of them",
     }
     for row in rows:
