@@ -88,8 +88,8 @@ def build_view(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float
     triangle_boxes, visible_triangles = triangle_boxes[in_sight], candidates[in_sight]
     triangles = _triangle_table(surfaces, visible_triangles, corners[in_sight], pose)
 
-    cone_list, cone_ranges = _lists(cone_boxes, columns, lines)
-    triangle_list, triangle_ranges = _lists(triangle_boxes, columns, lines)
+    cone_list, cone_ranges = _list_by_tile(cone_boxes, columns, lines)
+    triangle_list, triangle_ranges = _list_by_tile(triangle_boxes, columns, lines)
     line, column = np.divmod(np.arange(columns * lines), columns)
     return View(
         cones=_pad_rows(cones, _CONES),
@@ -150,7 +150,7 @@ def _in_sight(boxes: np.ndarray, columns: int, lines: int) -> np.ndarray:
     return (boxes[:, 0] < columns) & (boxes[:, 1] < lines) & (boxes[:, 2] >= 0) & (boxes[:, 3] >= 0)
 
 
-def _lists(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.ndarray]:
+def _list_by_tile(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the table rows visible in each tile, tile by tile, and the range [N, 2] of each tile's part."""
     first = np.maximum(boxes[:, :2], 0)
     last = np.minimum(boxes[:, 2:], [columns - 1, lines - 1])

@@ -16,7 +16,7 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     TILE,
     Weights,
     apply,
-    apply_plainly,
+    apply_plain,
     as_quarters,
     before,
     cast_kernels,
@@ -103,4 +103,4 @@ def _gpu_jvp(
 def _plain_jvp(
     patches: jax.Array, weights: Weights, tangent_weights: Weights, first: int, count: int
 ) -> tuple[jax.Array, jax.Array]:
-    return jax.jvp(lambda weights: apply_plainly(patches, weights, first, count), (weights,), (tangent_weights,))
+    return jax.jvp(lambda weights: apply_plain(patches, weights, first, count), (weights,), (tangent_weights,))

@@ -217,7 +217,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
     """
     place = {"first": first, "count": count}
     on_gpu = functools.partial(_apply_on_gpu, **place, interpret=interpret)
-    return dispatch(on_gpu, functools.partial(apply_plainly, **place), patches, weights, interpret=interpret)
+    return dispatch(on_gpu, functools.partial(apply_plain, **place), patches, weights, interpret=interpret)
 
 
 def as_quarters(patches: jax.Array, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
@@ -243,7 +243,7 @@ def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, 
     )(data, *cast)
 
 
-def apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
+def apply_plain(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
     """Compute `apply` in plain JAX."""
     chosen = patches[first : first + count].reshape(-1, patches.shape[1] // 4)
     return _layers(chosen, cast_kernels(weights, patches.dtype))[-1]
@@ -291,7 +291,7 @@ def _gpu_backward(
 def _plain_backward(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int
 ) -> Weights:
-    return jax.vjp(lambda weights: apply_plainly(patches, weights, first, count), weights)[1](gradient)[0]
+    return jax.vjp(lambda weights: apply_plain(patches, weights, first, count), weights)[1](gradient)[0]
 
 
 apply.defvjp(_apply_forward, _apply_backward)

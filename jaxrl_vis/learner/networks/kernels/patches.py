@@ -110,7 +110,7 @@ def prepare_on_gpu(
     )(images.reshape(batch, pixels), mean.reshape(pixels), scale.reshape(pixels), *moves)
 
 
-def prepare_plainly(
+def prepare_plain(
     images: jax.Array, mean: jax.Array, scale: jax.Array, shift: jax.Array | None, levels: int, limit: float, dtype: Any
 ) -> jax.Array:
     """Compute `kernels.encoder.prepare` in plain JAX."""
