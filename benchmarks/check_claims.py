@@ -26,7 +26,7 @@ def ledger_differences() -> Iterator[str]:
     """Yield a line for each table of the ledger that differs from the records."""
     for page, name in OF_LEARNING.items():
         text = (CHECKOUT / page).read_text(encoding="utf-8")
-        if ledger.filled(text, {name: ledger.PAGES[page][name]}) != text:
+        if ledger.fill_page(text, {name: ledger.PAGES[page][name]}) != text:
             yield f"{page}: the table {name!r} differs from the records: make tables"
 
 

@@ -82,15 +82,15 @@ def lists_of_names(path: Path, names: set[str]) -> list[int]:
 
 def own_imports(path: Path) -> int:
     """Count this project's modules that a file imports."""
-    found = set()
+    modules = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names if alias.name.startswith("jaxrl_vis")}
+            modules |= {alias.name for alias in node.names if alias.name.startswith("jaxrl_vis")}
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxrl_vis"):
             for alias in node.names:
                 full = f"{node.module}.{alias.name}"
-                found.add(full if _is_module(full) else node.module)
-    return len(found)
+                modules.add(full if _is_module(full) else node.module)
+    return len(modules)
 
 
 def _is_module(name: str) -> bool:

@@ -1,6 +1,6 @@
 """Smoke test of the installation: a new user's commands on an unprepared machine.
 
-    python benchmarks/install_smoke_test.py [--python python3.12 python3.13] [--ways wheel clone notebooks] [--whole]
+    python benchmarks/install_smoke_test.py [--python python3.12 python3.13] [--methods wheel clone notebooks] [--full]
 
 wheel      build a wheel, install it with pip, run every command, train a custom task, and try invalid commands
 clone      clone the repository, `make train`, then the commands of docs/start.md; no untracked files may remain
@@ -8,7 +8,7 @@ notebooks  Jupyter without this project, and the notebooks in a separate folder:
            with one that cannot be cloned, and run with that of a clone
 
 Each has an empty home folder, virtual environment and caches of its own; packages come from the registry that pip is configured
-for. Settings are tiny (the robots learn nothing), except for notebooks with ``--whole``. Each command is printed with its exit
+for. Settings are tiny (the robots learn nothing), except for notebooks with ``--full``. Each command is printed with its exit
 status and its time. Exits with 1 if an exit status is unexpected, an invalid command is answered with more than one line, or an
 expected output is missing. Takes about ten minutes per Python version on two idle cores.
 """
@@ -216,7 +216,7 @@ def clone(shell: Shell, python: Path) -> None:
         shell.failures.append(f"left in the checkout: {' '.join(untracked.split())}")
 
 
-def notebooks(shell: Shell, python: Path, whole: bool) -> None:
+def notebooks(shell: Shell, python: Path, full: bool) -> None:
     """Test the notebooks, in a separate folder, in a Jupyter without this project."""
     shell.type(f"{python.name} -m venv .venv")
     shell.activate(shell.folder / ".venv")
@@ -224,7 +224,7 @@ def notebooks(shell: Shell, python: Path, whole: bool) -> None:
     shell.type(f"git clone --quiet {CHECKOUT} ../address")
     for name in NOTEBOOKS:
         shutil.copy(CHECKOUT / f"notebooks/{name}.ipynb", shell.folder)
-    variables = {} if whole else {"JAXRL_VIS_NOTEBOOK_FAST": "1"}
+    variables = {} if full else {"JAXRL_VIS_NOTEBOOK_FAST": "1"}
     execute = "jupyter nbconvert --execute --to html --ExecutePreprocessor.timeout=7200"
     shell.type(f"{execute} {NOTEBOOKS[0]}.ipynb", status=1, shows="set REPOSITORY in this cell")
     missing = str(shell.folder.parent / "missing")
@@ -242,8 +242,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Print the transcript; return 1 if anything was unexpected, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--python", nargs="+", default=["python3.12", "python3.13"], help="names or paths of interpreters")
-    parser.add_argument("--ways", nargs="+", choices=("wheel", "clone", "notebooks"), default=["wheel", "clone", "notebooks"])
-    parser.add_argument("--whole", action="store_true", help="notebooks train to the end")
+    parser.add_argument(
+        "--methods", nargs="+", choices=("wheel", "clone", "notebooks"), default=["wheel", "clone", "notebooks"]
+    )
+    parser.add_argument("--full", action="store_true", help="notebooks train to the end")
     parser.add_argument(
         "--folder", type=Path, help="where to work, and keep what comes of it; default: a folder that is removed"
     )
@@ -255,7 +257,7 @@ def main(arguments: list[str] | None = None) -> int:
     top = Path(tempfile.mkdtemp(prefix="stranger-")) if options.folder is None else options.folder.resolve()
     failures = []
     for path in interpreters.values():
-        for method in options.ways:
+        for method in options.methods:
             python = Path(str(path)).resolve()
             print(f"\n== {method}, {python.name} ==", flush=True)
             shell = new_shell(top / f"{method}-{python.name}", python)
@@ -264,7 +266,7 @@ def main(arguments: list[str] | None = None) -> int:
             elif method == "clone":
                 clone(shell, python)
             else:
-                notebooks(shell, python, options.whole)
+                notebooks(shell, python, options.full)
             failures += [f"{method}, {python.name}: {failure}" for failure in shell.failures]
     print(f"\n{len(failures)} commands were not as expected" if failures else "\nall as expected")
     for failure in failures:

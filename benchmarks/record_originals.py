@@ -22,8 +22,8 @@ import numpy as np
 STEPS = 50
 LIFTED = 0.5  # height of the grip at which the fingers pass over the object, m
 BEHIND = 0.065  # distance of the grip from the middle of the object before it pushes, m
-LEAST_PUSH = 0.08  # m
-MOST_OBLIQUE = 0.1  # standard deviation of the direction of a push from a face's normal, rad
+MIN_PUSH = 0.08  # m
+MAX_OBLIQUITY = 0.1  # standard deviation of the direction of a push from a face's normal, rad
 
 
 def sample_actions(rng: np.random.Generator, sequences: int, size: int, lower: float) -> np.ndarray:
@@ -123,27 +123,30 @@ def finger_turn() -> Callable[[np.ndarray], dict[str, np.ndarray]]:
 class Pusher:
     """Scripted pusher: above the object, down behind it, and along the table to a target position."""
 
-    def __init__(self, rng: np.random.Generator, middle: np.ndarray, thing: np.ndarray, control: bool) -> None:
-        """Sample a target for ``thing`` [2] (m), within 15 cm of ``middle`` [2] on each axis; ``control``: pass over it."""
+    def __init__(self, rng: np.random.Generator, middle: np.ndarray, object_position: np.ndarray, control: bool) -> None:
+        """Sample a target for ``object_position`` [2] (m), within 15 cm of ``middle`` [2] on each axis.
+
+        If ``control`` is true, the pusher passes over the object.
+        """
         self.rng, self.control, self.is_down = rng, control, False
         self.height, self.speed = rng.uniform((0.418, 0.3), (0.44, 1.0))
-        self.place = thing
-        while not np.linalg.norm(self.place - thing) > LEAST_PUSH or np.abs(self.place - middle).max() > 0.15:
+        self.place = object_position
+        while not np.linalg.norm(self.place - object_position) > MIN_PUSH or np.abs(self.place - middle).max() > 0.15:
             # Against one of the four faces, because a push against a corner can turn the box either way.
-            angle = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, MOST_OBLIQUE)
-            self.place = thing + rng.uniform(LEAST_PUSH, 0.3) * np.array([np.cos(angle), np.sin(angle)])
+            angle = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, MAX_OBLIQUITY)
+            self.place = object_position + rng.uniform(MIN_PUSH, 0.3) * np.array([np.cos(angle), np.sin(angle)])
 
-    def act(self, grip: np.ndarray, thing: np.ndarray) -> np.ndarray:
+    def act(self, grip: np.ndarray, object_position: np.ndarray) -> np.ndarray:
         """Return the action [4] for the positions of the grip [3] and the object [3], m."""
-        way = self.place - thing[:2]
+        way = self.place - object_position[:2]
         left = np.linalg.norm(way)
         way = way / max(left, 1e-6)
-        behind = thing[:2] - BEHIND * way
+        behind = object_position[:2] - BEHIND * way
         aside = np.linalg.norm(behind - grip[:2])
         self.is_down |= not self.control and grip[2] < self.height + 0.01 and aside < 0.03
         action = np.zeros(4)
         if self.is_down:
-            across = (thing[:2] - grip[:2]) - ((thing[:2] - grip[:2]) @ way) * way
+            across = (object_position[:2] - grip[:2]) - ((object_position[:2] - grip[:2]) @ way) * way
             action[:2] = 10.0 * across + (min(self.speed, 8.0 * left) if left > 0.01 else 0.0) * way
             action[2] = 20.0 * (self.height - grip[2])
         else:
@@ -169,10 +172,10 @@ def record_pushes(rng: np.random.Generator, sequences: int, control: bool) -> di
     env = gymnasium.make("FetchPush-v4").unwrapped
     model, data = env.model, env.data
     fingers = {model.geom(f"robot0:{side}_gripper_finger_link").id for side in "lr"}
-    thing = model.geom("object0").id
+    object_position = model.geom("object0").id
 
     def read() -> dict[str, np.ndarray]:
-        touches = any(thing in contact.geom and fingers & set(contact.geom) for contact in data.contact[: data.ncon])
+        touches = any(object_position in contact.geom and fingers & set(contact.geom) for contact in data.contact[: data.ncon])
         return {"observations": env._get_obs()["observation"], "touches": np.array(touches)}
 
     episodes = []

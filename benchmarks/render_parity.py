@@ -81,14 +81,14 @@ def compare(name: str, poses: int, size: int) -> dict[str, Any]:
         **row,
         "geoms": len(scene.object_ids),
         "measures": {name: None if np.isnan(value) else round(value, 5) for name, value in tally.measures().items()},
-        "worst_iou": named(mj_model, tally.worst),
-        "worst_match": named(mj_model, tally.worst_match),
+        "worst_iou": describe_worst(mj_model, tally.worst),
+        "worst_match": describe_worst(mj_model, tally.worst_match),
         "failures": tally.failures(entry.limits),
         "seconds": {"ours": round(ours_s, 1), "all": round(time.perf_counter() - start, 1)},
     }
 
 
-def named(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, Any]:
+def describe_worst(mj_model: mujoco.MjModel, worst: tuple[float, int, int]) -> dict[str, Any]:
     """Name the model and pose with the worst value of a measure."""
     _, number, pose = worst
     return {"object": number, "name": mj_model.geom(number).name if 0 <= number < mj_model.ngeom else "", "pose": pose}

@@ -222,27 +222,29 @@ def make_figures(base: Config, env: Any, numbers: list[int], batches: tuple[int,
     return figures
 
 
-def compare(kind: str, config: Config, one: list[float], seconds: list[float], ideal: int) -> tuple[str, Measurement]:
+def compare(
+    kind: str, config: Config, single: list[float], seconds: list[float], ideal_speed_up: int
+) -> tuple[str, Measurement]:
     """Compare a configuration with its reference; return a line of the table, and the record.
 
     Args:
         kind: seeds, weak, strong or processes.
         config: The configuration.
-        one: Times of an iteration of the reference, s.
+        single: Times of an iteration of the reference, s.
         seconds: Times of an iteration of the configuration, s.
-        ideal: Speed-up at an efficiency of one.
+        ideal_speed_up: Speed-up at an efficiency of one.
     """
-    before, after = statistics.median(one), statistics.median(seconds)
-    speedup = before / after * (1 if kind == "strong" else ideal)
-    spread = max((max(cycles) - min(cycles)) / statistics.median(cycles) for cycles in (one, seconds))
+    before, after = statistics.median(single), statistics.median(seconds)
+    speedup = before / after * (1 if kind == "strong" else ideal_speed_up)
+    spread = max((max(cycles) - min(cycles)) / statistics.median(cycles) for cycles in (single, seconds))
     line = (
         f"{kind:10}{config.run.devices:8}{config.run.seeds:7}{config.run.batch_size:8}{config.run.num_envs:6}"
         f"{1e3 * before:11,.1f} ms"
-        f"{1e3 * after:11,.1f} ms{speedup:10.3f}{speedup / ideal:12.1%}{spread:9.1%}"
+        f"{1e3 * after:11,.1f} ms{speedup:10.3f}{speedup / ideal_speed_up:12.1%}{spread:9.1%}"
     )
     names = ("env", "preset", "image_size", "pixels", "num_envs", "batch_size", "seeds", "devices", "updates_per_iteration")
     compared = "one_process_ms" if kind == "processes" else "one_device_ms"
-    details = {compared: 1e3 * before, "ms": 1e3 * after, "efficiency": speedup / ideal, "spread": spread}
+    details = {compared: 1e3 * before, "ms": 1e3 * after, "efficiency": speedup / ideal_speed_up, "spread": spread}
     details = {name: round(value, 4) for name, value in details.items()} | {"repeats": len(seconds)}
     described = {name: config.value(name) for name in names}
     return line, Measurement(f"scaling/{kind}", round(speedup, 4), "x one device", described, details)
@@ -262,7 +264,9 @@ def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
     return line, Measurement("scaling/all_reduce", round(1 / seconds, 1), "all-reduces/s", described)
 
 
-def in_processes(figures: list[Figure], positions: list[int], times: list[list[float]]) -> list[tuple[str, Measurement]]:
+def measure_in_processes(
+    figures: list[Figure], positions: list[int], times: list[list[float]]
+) -> list[tuple[str, Measurement]]:
     """Time the same training by two processes with half of the devices each; return lines of the table, and the records.
 
     Args:
@@ -389,7 +393,7 @@ def main() -> None:
             figure for figure in figures if figure.timed.config.run.devices == numbers[-1] and figure.kind in ("seeds", "weak")
         ][:2]
         positions = [len(alone) + figures.index(figure) for figure in again]
-        for line, measurement in in_processes(again, positions, [times[id(figure)] for figure in again]):
+        for line, measurement in measure_in_processes(again, positions, [times[id(figure)] for figure in again]):
             keep(line, measurement)
     took = time.perf_counter() - began
     print(

@@ -25,12 +25,12 @@ from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 
 FRESH_KEY = 59_000_000
 """Seed of the fresh episodes: larger than all seeds of runs, and different from that of evaluations."""
-MOST_BYTES = 2 * 1024**2
+MAX_BYTES = 2 * 1024**2
 
 
 def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, episodes: int) -> Score:
     """Evaluate one seed of a run, or a policy alone, on fresh episodes."""
-    trainer = open_run(run_dir, keep_programs=True, eval_episodes=episodes)
+    trainer = open_run(run_dir, cache_programs=True, eval_episodes=episodes)
     metrics = trainer.evaluate(load(trainer, run_dir, checkpoint).train, jax.random.key(FRESH_KEY))
     row = {name: float(values[trainer.seeds.index(seed)]) for name, values in metrics.items()}
     return score({**row, "env_steps": iteration * trainer.program.steps_per_iteration}, episodes)
@@ -43,7 +43,7 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
         RequestError: The run cannot be used, or its policy is too large.
     """
     policy = load_policy(run_dir, seed=seed, checkpoint=checkpoint)
-    whole = fresh_score(run_dir, checkpoint, policy.seed, policy.iteration, episodes)
+    score_float32 = fresh_score(run_dir, checkpoint, policy.seed, policy.iteration, episodes)
     shipped.FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=shipped.FOLDER, prefix=".ship-") as temporary:
         folder = Path(temporary) / name
@@ -52,24 +52,30 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
         record = public_record(run_dir)
         write_atomically(folder / RunFolder(folder).config.name, json.dumps(record, indent=2) + "\n")
         size = (folder / policy_file.FILE_NAME).stat().st_size
-        if size > MOST_BYTES:
+        if size > MAX_BYTES:
             raise RequestError(
-                f"the policy of {run_dir} takes {size / 2**20:.1f} MiB: ship one of {MOST_BYTES / 2**20:.0f} MiB or less"
+                f"the policy of {run_dir} takes {size / 2**20:.1f} MiB: ship one of {MAX_BYTES / 2**20:.0f} MiB or less"
             )
-        halved = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
+        score_float16 = fresh_score(folder, None, policy.seed, policy.iteration, episodes)
         remark = (
             f"The episodes are fresh ones, drawn from key {FRESH_KEY} after the training. The weights are shipped in float16 "
-            f"({size / 1e6:.2f} MB), and the figures are theirs; in float32 success is {whole.share:.3f}."
+            f"({size / 1e6:.2f} MB), and the figures are theirs; in float32 success is {score_float32.success:.3f}."
         )
         text = card(
-            policy.config, record, policy.seed, {policy.seed: halved}, policy.env.distance_unit, name_here=name, remark=remark
+            policy.config,
+            record,
+            policy.seed,
+            {policy.seed: score_float16},
+            policy.env.distance_unit,
+            name_here=name,
+            remark=remark,
         )
         write_atomically(folder / "README.md", text)
         place = shipped.FOLDER / name
         place.mkdir(exist_ok=True)
         for file in folder.iterdir():
             file.replace(place / file.name)
-    return halved
+    return score_float16
 
 
 def main() -> None:
@@ -88,7 +94,7 @@ def main() -> None:
         result = ship(options.run, options.name, checkpoint, options.seed, options.episodes)
     except RequestError as error:
         sys.exit(str(error))
-    print(f"{shipped.FOLDER / options.name}: success {result.share:.3f} ({result.low:.3f} to {result.high:.3f})")
+    print(f"{shipped.FOLDER / options.name}: success {result.success:.3f} ({result.low:.3f} to {result.high:.3f})")
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ class Clock:
         self._wall, self._processor = time.time(), time.process_time()
 
 
-def imported(clock: Clock, options: argparse.Namespace) -> Any:
+def import_programs(clock: Clock, options: argparse.Namespace) -> Any:
     """Import everything and return the programs of a run, untraced."""
     import jax
 
@@ -76,7 +76,7 @@ def start(clock: Clock, options: argparse.Namespace) -> None:
     """Start like a run: compile, then do the first iteration."""
     import jax
 
-    programs = imported(clock, options)
+    programs = import_programs(clock, options)
     programs.compile()
     clock.lap("compile")
     loop, metrics = programs.train_iteration(programs.init(programs.run_keys))
@@ -87,7 +87,7 @@ def start(clock: Clock, options: argparse.Namespace) -> None:
 MODES = ("cold", "warm")
 
 
-def measured(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
+def time_modes(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
     """Measure in a new process; return its laps."""
     command = [sys.executable, __file__, options.env, "--seeds", str(options.seeds), "--mode", mode]
     command += ["--preset", options.preset] if options.preset else []
@@ -126,7 +126,7 @@ def main() -> None:
     laps = {}
     with tempfile.TemporaryDirectory() as cache:
         for mode in MODES:
-            laps[mode] = measured(mode, cache, options)
+            laps[mode] = time_modes(mode, cache, options)
             show(mode, laps[mode])
     if options.json:
         options.json.write_text(json.dumps(laps, indent=1) + "\n", encoding="utf-8")

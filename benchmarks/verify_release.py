@@ -83,11 +83,11 @@ def members(archive: Path) -> dict[str, tuple[Any, ...]]:
                 for item in files.infolist()
             }
     with tarfile.open(archive) as files:
-        found = {}
+        contents = {}
         for item in files.getmembers():
             reader = files.extractfile(item)
-            found[item.name] = (item.size, item.mtime, item.mode, _digest(reader.read() if reader else b""))
-        return found
+            contents[item.name] = (item.size, item.mtime, item.mode, _digest(reader.read() if reader else b""))
+        return contents
 
 
 def _digest(data: bytes) -> str:
@@ -162,9 +162,12 @@ def main() -> int:
             export(CHECKOUT, folder / name)
             builds.append(build(folder / name, folder / f"{name}-dist", seconds))
         for first, second in zip(*builds, strict=True):
-            found = list(differences(first, second))
-            failures += found
-            print("\n".join(found) if found else f"equal byte for byte: {first.name} {_digest(first.read_bytes())}", flush=True)
+            differing = list(differences(first, second))
+            failures += differing
+            print(
+                "\n".join(differing) if differing else f"equal byte for byte: {first.name} {_digest(first.read_bytes())}",
+                flush=True,
+            )
         options.out.mkdir(parents=True, exist_ok=True)
         released = [Path(shutil.copy(path, options.out)) for path in builds[0]]
         if not options.skip_install:

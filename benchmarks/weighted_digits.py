@@ -71,13 +71,13 @@ def problems() -> dict[str, Problem]:
     }
     classes = {"digit": 10, "even": 2, "high": 2, "holes": 3, "ink": 4}
 
-    def asked(chosen: np.ndarray, digit: str = "digit") -> Split:
-        named = {digit if name == "digit" else name: values[chosen] for name, values in answers.items()}
-        return {"x": images[chosen].reshape(-1, 64), **named}
+    def asked(indices: np.ndarray, digit: str = "digit") -> Split:
+        named = {digit if name == "digit" else name: values[indices] for name, values in answers.items()}
+        return {"x": images[indices].reshape(-1, 64), **named}
 
-    def pair(chosen: np.ndarray, seed: int) -> Split:
-        upper, lower = chosen, np.random.default_rng(seed).permutation(chosen)
-        canvas = np.zeros((len(chosen), 10, 10), np.float32)
+    def pair(indices: np.ndarray, seed: int) -> Split:
+        upper, lower = indices, np.random.default_rng(seed).permutation(indices)
+        canvas = np.zeros((len(indices), 10, 10), np.float32)
         canvas[:, :8, :8] = images[upper]
         canvas[:, 2:, 2:] = np.maximum(canvas[:, 2:, 2:], images[lower])
         return {"x": canvas.reshape(-1, 100), "upper": digits[upper], "lower": digits[lower]}
@@ -86,13 +86,13 @@ def problems() -> dict[str, Problem]:
     return {
         "pairs": Problem(
             {"upper": 10, "lower": 10},
-            {name: pair(np.tile(chosen, 4), seed) for seed, (name, chosen) in enumerate(rows.items())},
+            {name: pair(np.tile(indices, 4), seed) for seed, (name, indices) in enumerate(rows.items())},
             ("upper", "lower"),
         ),
-        "questions": Problem(classes, {name: asked(chosen) for name, chosen in rows.items()}, tuple(classes)),
+        "questions": Problem(classes, {name: asked(indices) for name, indices in rows.items()}, tuple(classes)),
         "helped": Problem(
             {jw.MAIN if name == "digit" else name: count for name, count in classes.items()},
-            {name: asked(chosen, jw.MAIN) for name, chosen in few.items()},
+            {name: asked(indices, jw.MAIN) for name, indices in few.items()},
             (jw.MAIN,),
         ),
     }

@@ -32,13 +32,13 @@ def driver() -> int | None:
 
 def versions(names: tuple[str, ...]) -> dict[str, str]:
     """Versions of those of the distributions ``names`` that are installed."""
-    found = {}
+    installed = {}
     for name in names:
         try:
-            found[name] = importlib.metadata.version(name)
+            installed[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 def cuda_extra(driver_version: int | None, installed: Mapping[str, str], supported_jax: Requirement) -> str | None:

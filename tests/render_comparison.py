@@ -17,7 +17,7 @@ import numpy as np
 
 VISIBLE_PIXELS = 30  # a geom with fewer in an image (edges counted) has no IoU there
 MATCHED_PIXELS = 10  # an object with fewer, in the image where it has more of them, may be hidden in the other
-DEPTH_METRES, DEPTH_SHARE = 1e-3, 1e-3  # whichever is more
+DEPTH_METRES, DEPTH_FRACTION = 1e-3, 1e-3  # whichever is more
 COINCIDENT_METRES, COINCIDENT_GREY_LEVELS = 1e-4, 4  # of two surfaces of which either may be drawn
 
 PLANE, SKY, BARE, TEXTURED = "plane", "sky", "bare", "textured"
@@ -141,7 +141,7 @@ class Tally:
         self.kept += int(kept.sum())
         self.agreeing += int((kept & (ours.segmentation == theirs.segmentation)).sum())
         self.solid += int(solid.sum())
-        allowed = np.maximum(DEPTH_METRES, DEPTH_SHARE * theirs.depth)
+        allowed = np.maximum(DEPTH_METRES, DEPTH_FRACTION * theirs.depth)
         self.close += int((solid & (np.abs(ours.depth - theirs.depth) <= allowed)).sum())
         labels, visible = np.unique(theirs.segmentation, return_counts=True)
         for label in labels[(labels >= 0) & (visible >= VISIBLE_PIXELS)]:

@@ -116,7 +116,7 @@ def difference(one, other):
 
 def restored_differences(loop, folder):
     """What a checkpoint of two devices holds, restored on other numbers of them: bytes that differ."""
-    checkpoints = Checkpoints(Path(folder), say=lambda line: None)
+    checkpoints = Checkpoints(Path(folder), echo=lambda line: None)
     checkpoints.save_full(3, loop, {})
     found = {}
     for devices, parts in ((1, None), (2, 1), (2, 2), (4, 2), (4, 4)):
@@ -134,7 +134,7 @@ def restored_differences(loop, folder):
 
 def resumed(loop, folder, program):
     """An iteration on one device, after what two devices have saved."""
-    checkpoints = Checkpoints(Path(folder), say=lambda line: None)
+    checkpoints = Checkpoints(Path(folder), echo=lambda line: None)
     checkpoints.save_full(3, loop, {})
     restored = checkpoints.restore_for_resume(jax.eval_shape(program.init, jnp.stack([jax.random.key(0)] * CONFIG.run.seeds)))
     checkpoints.close()

@@ -86,11 +86,11 @@ def assert_close(one: Any, other: Any, tolerance: float = 2e-5) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance), one, other)
 
 
-WAYS: tuple[Any, ...] = ("per_loss", "latents")
+MODES: tuple[Any, ...] = ("per_loss", "latents")
 
 
-def ways_of(weighting: Weighting) -> tuple[Any, ...]:
-    return WAYS[:1] if weighting.needs == "gradients" else WAYS
+def modes_of(weighting: Weighting) -> tuple[Any, ...]:
+    return MODES[:1] if weighting.needs == "gradients" else MODES
 
 
 def gradient_by(way: Any, weighting: Weighting, **options: Any) -> Any:

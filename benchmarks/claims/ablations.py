@@ -111,7 +111,7 @@ TWENTY = {
 
 def _fetch_twenty() -> str:
     rows = _rows([(label, f"fetch_25_20seeds_{name}") for label, name in TWENTY.items()])
-    columns = [*_at(10, 12.5, 15, 17.5), c.least(15 * _K), c.least(20 * _K), c.mean_success(20 * _K), c.names()]
+    columns = [*_at(10, 12.5, 15, 17.5), c.min_success(15 * _K), c.min_success(20 * _K), c.mean_success(20 * _K), c.names()]
     return table(["VisualFetchReach, seeds 0 to 19"], rows, columns)
 
 

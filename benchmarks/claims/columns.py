@@ -128,7 +128,7 @@ def of_seeds(steps: int, digits: int = 2) -> Column:
     return Column(show_steps(steps), cell)
 
 
-def least(steps: int) -> Column:
+def min_success(steps: int) -> Column:
     """Return the column of the minimum success over seeds at one evaluation."""
 
     def cell(record: Record) -> str:

@@ -29,7 +29,7 @@ _PARTS = {
 @functools.cache
 def run(task: str, variant: str) -> Record:
     """Return a run of these studies, with fresh seeds if there are any."""
-    return study("indicator", f"{task}-{variant}-fast", fresh=True)
+    return study("indicator", f"{task}-{variant}-fast", is_fresh=True)
 
 
 def _rows(task: str, labels: Mapping[str, str]) -> list[Row]:

@@ -34,7 +34,7 @@ def run(task: str, variant: str, view: str = "") -> Record:
 @functools.cache
 def claim(task: str, variant: str, budget: int | None = None) -> Record:
     """Return the run for claims, with fresh seeds if there are any."""
-    return study("ol_aux", f"{task}-{variant}-paper", fresh=True, budget=budget or BUDGETS[task])
+    return study("ol_aux", f"{task}-{variant}-paper", is_fresh=True, budget=budget or BUDGETS[task])
 
 
 def _figure_5_4(

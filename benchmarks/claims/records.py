@@ -82,7 +82,7 @@ class Record:
         return np.array([np.mean([row[metric] for row in rows if row["seed"] == seed]) for seed in self.seeds])
 
 
-def _joined(name: str, parts: Iterable[Record]) -> Record:
+def _merge_records(name: str, parts: Iterable[Record]) -> Record:
     parts = list(parts)
     return Record(name, tuple(row for part in parts for row in part.rows), frozenset().union(*(part.made for part in parts)))
 
@@ -111,34 +111,36 @@ def learning(*names: str) -> Record:
         about = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
         made = frozenset({_made(about["revision"], about["device"])})
         parts.append(Record(f"learning/{name}", _evaluations(folder / f"{name}.metrics.jsonl"), made))
-    return _joined(", ".join(part.name for part in parts), parts)
+    return _merge_records(", ".join(part.name for part in parts), parts)
 
 
 @functools.cache
-def study(family: str, stem: str, fresh: bool = False, budget: int = 0) -> Record:
+def study(family: str, stem: str, is_fresh: bool = False, budget: int = 0) -> Record:
     """Return the runs of a study that differ only in seeds.
 
     Args:
         family: Folder below benchmarks/results/studies.
         stem: Prefix of the folders' names, before the seeds: ``VisualFetchReach-none-paper``.
-        fresh: True for runs with seeds from 100 on instead of seeds 0 to 4, if there are any.
+        is_fresh: True for runs with seeds from 100 on instead of seeds 0 to 4, if there are any.
         budget: Environment steps that fresh runs must have reached.
 
     Raises:
         LookupError: No such run is stored.
     """
     folders = _folders(family, stem)
-    if fresh:
+    if is_fresh:
         # The study of target networks includes the release's decay with fresh seeds, which is the same configuration.
         candidates = {**_folders("target_decay", f"{stem}-decay0.98"), **folders}
         long_enough = {first: folder for first, folder in candidates.items() if _read_run(folder).end >= budget}
         fresh_folders = {first: folder for first, folder in long_enough.items() if first >= FIRST_FRESH_SEED}
         if fresh_folders:
-            return _joined(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(fresh_folders.items())))
+            return _merge_records(
+                f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(fresh_folders.items()))
+            )
     folders = {first: folder for first, folder in folders.items() if first < FIRST_FRESH_SEED}
     if not folders:
         raise LookupError(f"no run {stem} with seeds is kept in {RESULTS / 'studies' / family}")
-    return _joined(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(folders.items())))
+    return _merge_records(f"studies/{family}/{stem}", (_read_run(folder) for _, folder in sorted(folders.items())))
 
 
 def fresh_variants(task: str) -> list[str]:

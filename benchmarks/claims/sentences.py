@@ -122,9 +122,11 @@ def _weightings() -> Iterator[Sentence]:
     yield Sentence(
         LAB, f"{none[FINGER].median(2_480_000):.3f} against {authors.median(2_480_000):.3f} at 2.48 M", none[FINGER].name
     )
-    share = np.median(none[FINGER].means(metric="train/positive_share"))
-    yield Sentence(LAB, f"{share:.0%}".replace("%", " %") + " of its relabelled goals are reached already", none[FINGER].name)
-    faster = study("target_decay", f"{FINGER}-none-paper-decay0.95", fresh=True)
+    fraction = np.median(none[FINGER].means(metric="train/positive_share"))
+    yield Sentence(
+        LAB, f"{fraction:.0%}".replace("%", " %") + " of its relabelled goals are reached already", none[FINGER].name
+    )
+    faster = study("target_decay", f"{FINGER}-none-paper-decay0.95", is_fresh=True)
     yield Sentence(
         LAB, f"the distance falls from {_distance(none[FINGER], FINGER)} to {_distance(faster, FINGER)}", faster.name
     )
@@ -326,8 +328,8 @@ def _decays() -> Iterator[Sentence]:
 
     def run(task: str, variant: str, decay: float) -> Record:
         if decay == 0.98 and task == FETCH:
-            return study("target_decay", f"{task}-{variant}-paper-decay0.98", fresh=True)
-        return ol_aux.run(task, variant) if decay == 0.98 and task == FINGER else thesis.decayed(task, variant, decay)
+            return study("target_decay", f"{task}-{variant}-paper-decay0.98", is_fresh=True)
+        return ol_aux.run(task, variant) if decay == 0.98 and task == FINGER else thesis.with_decay(task, variant, decay)
 
     def times(task: str, level: float, decay: float) -> str:
         return c.speed_up(run(task, "ol_aux_5", decay), run(task, "none", decay), level)

@@ -108,7 +108,7 @@ def _findings(comparisons: Sequence[Comparison]) -> str:
     return "; ".join(f"{verdict}: {', '.join(places)}" for verdict, places in verdicts.items())
 
 
-def _compared(
+def _comparison_rows(
     claim: str, comparisons: Sequence[Comparison], source: str, wanted: Sequence[str] = ("better",), note: str = ""
 ) -> Claim:
     records = [record for comparison in comparisons for record in (comparison.first, comparison.second)]
@@ -120,22 +120,22 @@ def _compared(
 
 def _better_than_none() -> Claim:
     comparisons = _ol_aux("ol_aux_5", "none", ol_aux.BUDGETS)
-    return _compared("OL-AUX-5 learns faster than no auxiliary losses", comparisons, f"[5.4]({_LAB}#figure-54)")
+    return _comparison_rows("OL-AUX-5 learns faster than no auxiliary losses", comparisons, f"[5.4]({_LAB}#figure-54)")
 
 
 def _better_than_logarithm() -> Claim:
-    return _compared(
+    return _comparison_rows(
         "Our control: OL-AUX-5 learns faster than the logarithm of the main loss alone",
         _ol_aux("ol_aux_5", "none_log", ol_aux.BUDGETS),
         f"[fresh seeds]({_LAB}#fresh-seeds)",
     )
 
 
-def decayed(task: str, variant: str, decay: float) -> Record:
+def with_decay(task: str, variant: str, decay: float) -> Record:
     """Return the run with a decay of the target networks; for the hand, with the authors' view."""
     stem = f"{task}-{variant}-paper" if task != HAND else f"{HAND}-view=fingertips-{variant}-paper"
     if decay != 0.98:
-        return study("target_decay", f"{stem}-decay{decay:g}", fresh=True)
+        return study("target_decay", f"{stem}-decay{decay:g}", is_fresh=True)
     if task == HAND:
         return ol_aux.run(HAND, variant, ol_aux.VIEW)
     return ol_aux.claim(task, variant)
@@ -143,7 +143,7 @@ def decayed(task: str, variant: str, decay: float) -> Record:
 
 def speed_up(task: str, level: float, decay: float) -> str:
     """Format the speed-up of OL-AUX-5 over none to a success level, both with the same decay of the target networks."""
-    return c.speed_up(decayed(task, "ol_aux_5", decay), decayed(task, "none", decay), level)
+    return c.speed_up(with_decay(task, "ol_aux_5", decay), with_decay(task, "none", decay), level)
 
 
 LEVELS = {FETCH: 0.5, HAND: 0.2, FINGER: 0.3}
@@ -152,13 +152,15 @@ LEVELS = {FETCH: 0.5, HAND: 0.2, FINGER: 0.3}
 
 def _speed_ups() -> Claim:
     factors = {task: (speed_up(task, level, 0.98), speed_up(task, level, 0.95)) for task, level in LEVELS.items()}
-    records = [decayed(task, variant, decay) for task in LEVELS for variant in ("none", "ol_aux_5") for decay in (0.98, 0.95)]
+    records = [
+        with_decay(task, variant, decay) for task in LEVELS for variant in ("none", "ol_aux_5") for decay in (0.98, 0.95)
+    ]
     words = {FETCH: "Fetch", HAND: "hand as the authors saw it", FINGER: "finger"}
     finding = "; ".join(f"{words[task]} to {LEVELS[task]:g}: {slow} and {fast} times" for task, (slow, fast) in factors.items())
     comparisons = []
     for task, label in words.items():
         budget = ol_aux.BUDGETS[task]
-        pair = (decayed(task, "ol_aux_5", 0.95), decayed(task, "none", 0.95))
+        pair = (with_decay(task, "ol_aux_5", 0.95), with_decay(task, "none", 0.95))
         comparisons.append(Comparison(f"{label} at 0.95, to {c.show_steps(budget)}", *pair, budget))
     return Claim(
         "OL-AUX-5 needs 2 times fewer steps on Fetch, about 3 times fewer on hand and finger",
@@ -177,7 +179,7 @@ def _single_tasks() -> Claim:
         best = max(records, key=lambda name: records[name].means(budget).mean())
         place = f"{SHORT[task]} to {c.show_steps(budget)} (best: {best.replace('_', ' ')})"
         comparisons.append(Comparison(place, ol_aux.claim(task, "ol_aux_5"), records[best], budget))
-    return _compared(
+    return _comparison_rows(
         "OL-AUX-5 is always better than, or level with, the best single task",
         comparisons,
         f"[5.5]({_LAB}#figure-55)",
@@ -191,33 +193,37 @@ def _best_single_task() -> Claim:
     second = max(others, key=lambda name: others[name].means(budget).mean())
     place = f"hand to {c.show_steps(budget)}, against the second best ({second.replace('_', ' ')})"
     comparison = Comparison(place, ol_aux.claim(HAND, label), others[second], budget)
-    return _compared("Inverse dynamics is the best single task on the hand", [comparison], f"[5.5]({_LAB}#figure-55)")
+    return _comparison_rows("Inverse dynamics is the best single task on the hand", [comparison], f"[5.5]({_LAB}#figure-55)")
 
 
 def _balance() -> Claim:
     comparisons = [*_ol_aux("ol_aux_5", "balance", ol_aux.BUDGETS), *_ol_aux("ol_aux_5", "balance", {HAND: 2_000_000})]
-    return _compared("OL-AUX-5 improves on gradient balancing", comparisons, f"[5.4]({_LAB}#figure-54)")
+    return _comparison_rows("OL-AUX-5 improves on gradient balancing", comparisons, f"[5.4]({_LAB}#figure-54)")
 
 
 def _balance_and_none() -> Claim:
     comparisons = _ol_aux("balance", "none", ol_aux.BUDGETS)
-    return _compared("Gradient balancing is better than none in all environments", comparisons, f"[5.4]({_LAB}#figure-54)")
+    return _comparison_rows(
+        "Gradient balancing is better than none in all environments", comparisons, f"[5.4]({_LAB}#figure-54)"
+    )
 
 
 def _cosine() -> Claim:
     comparisons = _ol_aux("cosine", "none", ol_aux.BUDGETS)
     note = "On Fetch the gate is that of the thesis; on hand and finger it also stops the head of a loss"
-    return _compared("Cosine similarity is better than none (figure 5.4)", comparisons, f"[5.4]({_LAB}#figure-54)", note=note)
+    return _comparison_rows(
+        "Cosine similarity is better than none (figure 5.4)", comparisons, f"[5.4]({_LAB}#figure-54)", note=note
+    )
 
 
 def _n_steps() -> Claim:
     comparisons = _ol_aux("ol_aux_5", "ol_aux_1", {FETCH: 240_000, HAND: 600_000})
-    return _compared("OL-AUX-1 is much worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
+    return _comparison_rows("OL-AUX-1 is much worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
 
 
 def _ablation() -> Claim:
     comparisons = _ol_aux("ol_aux_5", "ol_aux_5_ablation", {FETCH: 240_000, HAND: 600_000})
-    return _compared("The ablation of OL-AUX-5 is worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
+    return _comparison_rows("The ablation of OL-AUX-5 is worse than OL-AUX-5", comparisons, f"[5.7]({_LAB}#figure-57)")
 
 
 def _order() -> Claim:
@@ -244,12 +250,12 @@ def _oracle() -> Claim:
     ends = {metric: ", ".join(_ends(task, pair, metric) for task in tasks) for metric in (SUCCESS, DISTANCE)}
     note = f"Success at the end: {ends[SUCCESS]}; distance at the end in m: {ends[DISTANCE]}"
     claim = "Indicator, balanced and filtered, performs as well as the oracle"
-    return _compared(claim, _rewards(OURS, "oracle", tasks), f"[5.1, 5.2]({_INDICATOR})", ("better", "level"), note)
+    return _comparison_rows(claim, _rewards(OURS, "oracle", tasks), f"[5.1, 5.2]({_INDICATOR})", ("better", "level"), note)
 
 
 def _balancing() -> Claim:
     comparisons = _rewards(OURS, "indicator", (FETCH, SAWYER))
-    return _compared(
+    return _comparison_rows(
         "Balancing and filtering improve on the plain indicator (Fetch and Sawyer)", comparisons, f"[5.1, 5.2]({_INDICATOR})"
     )
 
@@ -260,20 +266,20 @@ def filtered_share(task: str) -> float:
 
 
 def _filter() -> Claim:
-    shares = {task: filtered_share(task) for task in (REACHER, FETCH, SAWYER, HAND)}
+    fractions = {task: filtered_share(task) for task in (REACHER, FETCH, SAWYER, HAND)}
     hand = indicator.run(HAND, OURS)
     precision, chance = (hand.median(metric=f"train/{name}") for name in ("filter_precision", "false_negative_share"))
-    active = [task for task, share in shares.items() if share >= 0.01]
+    active = [task for task, fraction in fractions.items() if fraction >= 0.01]
     comparisons = _rewards(OURS, "balance_only", (REACHER, FETCH))
     return Claim(
         "The filter removes false negatives",
         PARTLY if active else FAILS,
         f"Active (1 % of negatives or more) on {', '.join(SHORT[task] for task in active) or 'none'}; share of negatives "
-        f"dropped: {', '.join(f'{SHORT[task]} {share:.3f}' for task, share in shares.items())}. "
+        f"dropped: {', '.join(f'{SHORT[task]} {fraction:.3f}' for task, fraction in fractions.items())}. "
         f"On the hand {precision:.2f} of these are false at the end, {chance:.2f} of all negatives",
         "without the filter, " + "; ".join(comparison.text for comparison in comparisons),
         f"[the hand]({_INDICATOR}#the-hand)",
-        [indicator.run(task, OURS) for task in shares],
+        [indicator.run(task, OURS) for task in fractions],
     )
 
 
@@ -284,14 +290,14 @@ def _false_positives() -> Claim:
         for comparison, place in zip(comparisons, ("anywhere", "in a cluttered quarter"), strict=True)
     ]
     claim = "False positives of a state estimator harm (here one in ten negatives is paid as a positive)"
-    return _compared(claim, named, f"[estimators]({_INDICATOR}#state-estimators-that-err)", ("worse",))
+    return _comparison_rows(claim, named, f"[estimators]({_INDICATOR}#state-estimators-that-err)", ("worse",))
 
 
-def _ablated(variant: str, claim: str) -> Claim:
+def _ablation_rows(variant: str, claim: str) -> Claim:
     comparisons = _rewards(variant, OURS, (REACHER, FETCH))
     note = "Success at the end: " + ", ".join(_ends(task, (variant, OURS)) for task in (REACHER, FETCH))
     source = f"[parts of the method]({_INDICATOR}#what-each-part-of-the-method-gives)"
-    return _compared(claim, comparisons, source, ("worse",), note)
+    return _comparison_rows(claim, comparisons, source, ("worse",), note)
 
 
 def _finger() -> Claim:
@@ -333,8 +339,10 @@ CLAIMS: tuple[Callable[[], Claim], ...] = (
     _balancing,
     _filter,
     _false_positives,
-    functools.partial(_ablated, "all_relabelled", "p₁ = 1 (no original goals) is clearly worse"),
-    functools.partial(_ablated, "all_next", "p₁ = 0.45, p₂ = 1 (the next observation as every replaced goal) is clearly worse"),
+    functools.partial(_ablation_rows, "all_relabelled", "p₁ = 1 (no original goals) is clearly worse"),
+    functools.partial(
+        _ablation_rows, "all_next", "p₁ = 0.45, p₂ = 1 (the next observation as every replaced goal) is clearly worse"
+    ),
     _finger,
 )
 

@@ -66,7 +66,7 @@ RATES = (
 def _rate_cells(row: Rate, records: list[dict[str, Any]]) -> tuple[str, str, str] | None:
     """Format our rate, the peer's and their ratio; None without records."""
     device = DEVICES[row.device]
-    theirs = find(Figure(row.peer, row.config, "", least="ours_over_peer"), device, records)
+    theirs = find(Figure(row.peer, row.config, "", minimum_of="ours_over_peer"), device, records)
     if theirs is None:
         return None
     same = {name: value for name, value in theirs["config"].items() if name != "images"}  # batch sizes may differ

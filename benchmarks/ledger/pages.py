@@ -72,7 +72,7 @@ def writers(results: Path) -> dict[str, dict[str, Writer]]:
     return merged
 
 
-def filled(text: str, of_page: dict[str, Writer], results: Path = RESULTS) -> str:
+def fill_page(text: str, of_page: dict[str, Writer], results: Path = RESULTS) -> str:
     """Return the text of a page with its tables written from the records.
 
     Raises:
@@ -89,14 +89,14 @@ def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[
     """Write the tables of every page; yield the page, and True if it changed.
 
     Raises:
-        RequestError: As in `filled`; or a page is missing.
+        RequestError: As in `fill_page`; or a page is missing.
     """
     for name, of_page in writers(results).items():
         page = checkout / name
         if not page.exists():
             raise RequestError(f"there is no {page}: tables are written in a checkout")
         before = page.read_text(encoding="utf-8")
-        after = filled(before, of_page, results)
+        after = fill_page(before, of_page, results)
         if after != before:
             write_atomically(page, after)
         yield page, after != before
@@ -114,7 +114,7 @@ def outdated(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[str
             continue
         text = page.read_text(encoding="utf-8")
         try:
-            if filled(text, of_page, results) != text:
+            if fill_page(text, of_page, results) != text:
                 yield f"{name}: its tables differ from the records: make tables"
         except RequestError as error:
             yield f"{name}: {error}"

@@ -23,7 +23,7 @@ EXPECTED = (
 
 def platforms_table(results: Path) -> str | None:
     """Write a row for each machine, Python and JAX, newest first, as Markdown; None without records."""
-    rows = [_row(record) for record in _records(results)] + _benchmarked(results)
+    rows = [_row(record) for record in _records(results)] + _benchmark_rows(results)
     if not rows:
         return None
     rows.sort(key=lambda row: row[0], reverse=True)
@@ -54,17 +54,17 @@ def _row(record: dict[str, Any]) -> tuple[str, ...]:
     return record["date"], place, record["driver"] or "", versions["python"], versions["jax"], ran
 
 
-def _benchmarked(results: Path) -> list[tuple[str, ...]]:
+def _benchmark_rows(results: Path) -> list[tuple[str, ...]]:
     """Return a row for each device, Python and JAX that benchmarks were run on, with the newest date."""
-    found: dict[tuple[str, str, str], tuple[str, set[str]]] = {}
+    rows: dict[tuple[str, str, str], tuple[str, set[str]]] = {}
     for path, record in read_all(results):
         name = record["name"].partition("/")[0]
         if path.parent != results or name not in _BENCHMARKS or not isinstance(record["device"], str):
             continue
         place = (record["device"], record["versions"]["python"], record["versions"]["jax"])
-        date, names = found.get(place, ("", set()))
-        found[place] = (max(date, record["date"][:10]), names | {name})
+        date, names = rows.get(place, ("", set()))
+        rows[place] = (max(date, record["date"][:10]), names | {name})
     return [
         (date, device, "", python, jax, f"benchmarks: {', '.join(name for name in _BENCHMARKS if name in names)}")
-        for (device, python, jax), (date, names) in found.items()
+        for (device, python, jax), (date, names) in rows.items()
     ]

@@ -19,13 +19,13 @@ class Figure:
         name: Name of the record.
         config: Required entries of the record's configuration.
         text: Format string for the record's configuration and details, and for ``value``, which is shortened.
-        least: Detail whose minimum selects the record instead, the one least favourable to us.
+        minimum_of: Detail whose minimum selects the record instead, the one least favourable to us.
     """
 
     name: str
     config: dict[str, Any]
     text: str
-    least: str | None = None
+    minimum_of: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Learning:
         word: Name of the metric in the table, as a format string: ``success {}``.
         targets: Values for which the first steps that reach them are quoted ("X by N steps").
         steps: Environment steps at which values are quoted.
-        least: True if lower is better.
+        lower_is_better: True if lower is better.
         command: Command, if it differs from the training command of the configuration.
     """
 
@@ -62,7 +62,7 @@ class Learning:
     word: str = "success {:.2f}"
     targets: tuple[float, ...] = ()
     steps: tuple[int, ...] = ()
-    least: bool = False
+    lower_is_better: bool = False
     command: str | None = None
 
 
@@ -117,7 +117,7 @@ SPEED = (
                     "render/peer_warp",
                     {"scene": "primitives"},
                     f"{{ours_over_peer}} times MuJoCo Warp's {{value}} images/s {_IMAGES} ({{variant}}, batch {{images:,}})",
-                    least="ours_over_peer",
+                    minimum_of="ours_over_peer",
                 ),
             )
         },
@@ -193,6 +193,6 @@ LEARNING = (
         metric="eval/goal_distance",
         word="mean final distance {:.3f} m",
         targets=(0.03, 0.02),
-        least=True,
+        lower_is_better=True,
     ),
 )

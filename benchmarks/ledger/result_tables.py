@@ -43,8 +43,8 @@ def find(figure: Figure, device: str, records: list[dict[str, Any]]) -> dict[str
         and record["device"] == device
         and all(record["config"].get(name) == value for name, value in figure.config.items())
     ]
-    if figure.least is not None:
-        return min(matches, key=lambda record: record["details"][figure.least], default=None)
+    if figure.minimum_of is not None:
+        return min(matches, key=lambda record: record["details"][figure.minimum_of], default=None)
     return max(matches, key=lambda record: record["value"], default=None)
 
 
@@ -113,7 +113,7 @@ def learning_text(row: Learning, runs: list[Evidence]) -> str:
     points = curve(rows, row.metric)
     parts = []
     for target in row.targets:
-        steps = steps_to(points, target, row.least)
+        steps = steps_to(points, target, row.lower_is_better)
         reached = "not reached" if steps is None else f"by {short(steps)} steps"
         parts.append(row.word.format(target) + f" {reached}")
     for budget in row.steps:
@@ -132,8 +132,8 @@ def learning_text(row: Learning, runs: list[Evidence]) -> str:
 
 def minutes(seconds: float) -> str:
     """Format a duration in seconds: 43 s, or 1 min 37 s."""
-    whole = round(seconds)
-    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"
+    rounded = round(seconds)
+    return f"{rounded} s" if rounded < 60 else f"{rounded // 60} min {rounded % 60} s"
 
 
 def _machine(device: dict[str, Any]) -> str:

@@ -28,8 +28,8 @@ def lens_rows(lenses: dict[str, Any]) -> str:
     ]
     for factor, lens in lenses.items():
         errors = lens["errors_mm"]
-        beside = [errors[stalk] - usual[stalk] for stalk in errors.keys() & usual.keys()]
-        tried = lens["density"] >= TRIED.density and lens["view"] >= TRIED.view
+        differences = [errors[stalk] - usual[stalk] for stalk in errors.keys() & usual.keys()]
+        tried = lens["density"] >= TRIED.pixels_per_metre and lens["view"] >= TRIED.view
         cells = (
             f"x {factor}",
             f"{lens['density']:.0f}",
@@ -40,7 +40,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
             f"{100 * lens['ground']:.0f} %",
             f"{len(errors)}",
             f"{np.median(list(errors.values())):+.2f}" if errors else "",
-            f"{np.median(beside):+.2f}" if beside and factor != "1" else "",
+            f"{np.median(differences):+.2f}" if differences and factor != "1" else "",
             "measures" if tried else "refuses",
         )
         lines.append("| " + " | ".join(cells) + " |")

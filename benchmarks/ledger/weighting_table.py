@@ -51,8 +51,8 @@ def _of_device(record: dict[str, Any]) -> str:
     for method in dict.fromkeys(row["method"] for row in record["ours"]):
         cells = [f"`{method}`"]
         for count in counts:
-            ways = (ours.get((method, count, f"step, {way}")) for way in ("per_loss", "latents"))
-            fastest = min(seconds for seconds in ways if seconds is not None)
+            times = (ours.get((method, count, f"step, {mode}")) for mode in ("per_loss", "latents"))
+            fastest = min(seconds for seconds in times if seconds is not None)
             cells.append(_pair(fastest, theirs.get((method, count, "step"))))
         cells.append(_pair(ours[method, counts[-1], "alone"], theirs.get((method, counts[-1], "alone"))))
         lines.append("| " + " | ".join(cells) + " |")

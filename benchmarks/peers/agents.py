@@ -88,7 +88,7 @@ def train_brax(env: str, steps: int, seed: int) -> Measurement:
     from brax.training.agents.ppo import networks
     from brax.training.agents.ppo import train as ppo
 
-    from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
+    from jaxrl_vis_envs.adapters.brax import BraxEnv, share_jax_with_brax
 
     brax_env = BraxEnv(env, reward="dense")
     reset, step = jax.vmap(brax_env.reset), jax.vmap(brax_env.step)
@@ -126,7 +126,7 @@ def train_brax(env: str, steps: int, seed: int) -> Measurement:
         networks.make_ppo_networks, policy_hidden_layer_sizes=(128, 128), value_hidden_layer_sizes=(128, 128)
     )
     started = time.perf_counter()
-    with lend_jax():
+    with share_jax_with_brax():
         ppo.train(
             brax_env,
             num_timesteps=steps,

@@ -176,7 +176,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
     )
     # Buffers of one environment suffice, because only poses are read; those of thousands of free bodies would fill the memory.
     blank = mjw.make_data(mj_model, nworld=1)
-    datas = [_with_poses(blank, {name: rows[:count] for name, rows in batch.items()}) for batch in comparison.batches]
+    datas = [_set_poses(blank, {name: rows[:count] for name, rows in batch.items()}) for batch in comparison.batches]
 
     def launch(data: Any) -> None:
         mjw.refit_bvh(model, data, context)
@@ -200,7 +200,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
     return context, draws
 
 
-def _with_poses(blank: Any, poses: dict[str, np.ndarray]) -> Any:
+def _set_poses(blank: Any, poses: dict[str, np.ndarray]) -> Any:
     """Make Warp's Data of these poses, with one environment (Warp: world) per row."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 

@@ -29,7 +29,7 @@ from benchmarks.pixels.training_tasks import IMAGE_SIZE, SMOKE, TASKS, Task  # n
 from jaxrl_vis.bench.conditions import Watch  # noqa: E402
 from jaxrl_vis.bench.record import Measurement, compare_and_keep  # noqa: E402
 from jaxrl_vis.errors import RequestError  # noqa: E402
-from jaxrl_vis_envs.adapters.brax import lend_jax  # noqa: E402
+from jaxrl_vis_envs.adapters.brax import share_jax_with_brax  # noqa: E402
 
 
 def train(task: Task, settings: dict[str, Any], seed: int) -> list[dict[str, float]]:
@@ -63,7 +63,7 @@ def train(task: Task, settings: dict[str, Any], seed: int) -> list[dict[str, flo
         print(", ".join(f"{name} {value:,}" for name, value in evaluation.items()), flush=True)
 
     networks: Any = functools.partial(networks_vision.make_ppo_networks_vision, **task.networks)
-    with lend_jax():
+    with share_jax_with_brax():
         ppo.train(
             environment=env,
             eval_env=task.make_evaluated() if task.make_evaluated else None,

@@ -90,9 +90,9 @@ class _UntilFallen:
         return getattr(self.env, name)
 
 
-def _make_cartpole(ends: bool) -> pixels.PixelEnv:
+def _make_cartpole(terminates: bool) -> pixels.PixelEnv:
     env = playground.load("CartpoleBalance", ctrl_dt=_CARTPOLE_STEP)
-    return pixels.wrap(_UntilFallen(env) if ends else env, "fixed", IMAGE_SIZE, frames=_FRAMES, layout="images")
+    return pixels.wrap(_UntilFallen(env) if terminates else env, "fixed", IMAGE_SIZE, frames=_FRAMES, layout="images")
 
 
 def _playground_wrapper() -> Any:
@@ -119,7 +119,7 @@ def _brax_wrapper() -> Any:
 
 TASKS = {
     "CartpoleBalance": Task(
-        functools.partial(_make_cartpole, ends=True),
+        functools.partial(_make_cartpole, terminates=True),
         _playground_wrapper,
         {
             **_COMMON,
@@ -155,7 +155,7 @@ TASKS = {
         "of 1,000",
         900.0,
         {"frames": _FRAMES, "step_s": _CARTPOLE_STEP},
-        functools.partial(_make_cartpole, ends=False),
+        functools.partial(_make_cartpole, terminates=False),
     ),
     "FetchReach": Task(
         _make_fetch,

@@ -31,7 +31,7 @@ from jaxrl_vis.run.compiled.programs import rarely_collecting_garbage
 PARTS = ("update", "rollout", "insert")
 
 
-def traced(call: Callable[[], Any]) -> list[tuple[float, float, str]]:
+def trace_kernels(call: Callable[[], Any]) -> list[tuple[float, float, str]]:
     """Profile a call, which must wait for its results; return start and duration (ns) and name of each kernel, in order."""
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
@@ -42,12 +42,12 @@ def traced(call: Callable[[], Any]) -> list[tuple[float, float, str]]:
 
 
 def kernels(call: Callable[[], Any]) -> tuple[collections.Counter, collections.Counter]:
-    """Return the total time (ns) and the number of launches of each kernel of a call, by name; see `traced`."""
-    return counted(traced(call))
+    """Return the total time (ns) and the number of launches of each kernel of a call, by name; see `trace_kernels`."""
+    return count_kernels(trace_kernels(call))
 
 
-def counted(events: list[tuple[float, float, str]]) -> tuple[collections.Counter, collections.Counter]:
-    """Sum up events of `traced`: total time (ns) and number of launches of each kernel, by name."""
+def count_kernels(events: list[tuple[float, float, str]]) -> tuple[collections.Counter, collections.Counter]:
+    """Sum up events of `trace_kernels`: total time (ns) and number of launches of each kernel, by name."""
     spent, launches = collections.Counter(), collections.Counter()
     for _, duration, name in events:
         spent[name] += duration
@@ -63,8 +63,8 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
         begun = time.perf_counter()
         call()
         seconds.append(time.perf_counter() - begun)
-    events = traced(call)
-    spent, launches = counted(events)
+    events = trace_kernels(call)
+    spent, launches = count_kernels(events)
     print(
         f"{name}: {1e6 * min(seconds) / turns:.0f} us, of which {sum(spent.values()) / turns / 1e3:.0f} us in "
         f"{sum(launches.values()) / turns:.0f} kernels"
@@ -78,9 +78,9 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
     sys.stdout.flush()
 
 
-def measure(program: TrainStep, asked: argparse.Namespace) -> None:
+def measure(program: TrainStep, options: argparse.Namespace) -> None:
     """Compile the parts and report each."""
-    parts: list[str] = asked.parts
+    parts: list[str] = options.parts
     loop, keys = start(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)
     playing = train, keys, jnp.int32(0), program.exploration
@@ -112,7 +112,11 @@ def measure(program: TrainStep, asked: argparse.Namespace) -> None:
     for part in parts:
         _, _, turns, what = arguments[part]
         report(
-            f"{what} of {program.config.run.seeds} learners", lambda part=part: call(part), turns, asked.rows, asked.in_order
+            f"{what} of {program.config.run.seeds} learners",
+            lambda part=part: call(part),
+            turns,
+            options.rows,
+            options.in_order,
         )
 
 

@@ -1,6 +1,6 @@
 """Cost of learning the weights of auxiliary losses, for several numbers of losses.
 
-    python -m benchmarks.profiling.weighting_cost [--losses 5 10] [--ways latents] [--image-size 64] [--batch-size 512]
+    python -m benchmarks.profiling.weighting_cost [--losses 5 10] [--modes latents] [--image-size 64] [--batch-size 512]
 
 An encoder of the preset `paper` reads RGB-D images before and after an action. The main loss is that of a value head with three
 hidden layers; every auxiliary loss is that of a linear head on both latents with its own targets. For every number of auxiliary
@@ -26,7 +26,7 @@ from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.networks.normalizer import Scaling
 from jaxrl_vis.weighting import MAIN, Weighting, make_weighting, weighted_grad
-from jaxrl_vis.weighting.gradients import Way
+from jaxrl_vis.weighting.gradients import GradientMode
 
 STEPS = 40
 """Gradient steps per timed call."""
@@ -87,13 +87,13 @@ class Problem:
             losses[name] = jnp.mean(jnp.square(predicted - target))
         return losses
 
-    def make_steps(self, weighting: Weighting, way: Any) -> Any:
+    def make_steps(self, weighting: Weighting, mode: Any) -> Any:
         """Return the jitted function (params, weighting's state, batches) -> both after `STEPS` updates, and the weights."""
         find = weighted_grad(
             self.losses,
             weighting,
             lambda params: params["critic"]["encoder"],
-            way,
+            mode,
             forwards=forward_mode.with_tangents,
             encode=self.encode,
         )
@@ -111,7 +111,7 @@ class Problem:
         return jaxrl_vis_envs.jit(steps)
 
 
-def time_step(problem: Problem, weighting: Weighting, way: str) -> float:
+def time_step(problem: Problem, weighting: Weighting, mode: str) -> float:
     """Return the time of a gradient step, s.
 
     Raises:
@@ -119,7 +119,7 @@ def time_step(problem: Problem, weighting: Weighting, way: str) -> float:
     """
     params, batches = problem.params(jax.random.key(0)), problem.batches(jax.random.key(1), 4)
     state = weighting.init((MAIN, *problem.names), params["critic"]["encoder"])
-    steps, _ = compile_timed(problem.make_steps(weighting, way), params, state, batches)
+    steps, _ = compile_timed(problem.make_steps(weighting, mode), params, state, batches)
     after, _, weights = steps(params, state, batches)
     moved = [float(jnp.max(jnp.abs(one - other))) for one, other in zip(*map(jax.tree.leaves, (params, after)), strict=True)]
     assert all(0 < change < float("inf") for change in moved), "no gradient step was taken"
@@ -132,7 +132,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--losses", type=int, nargs="+", default=[5, 10], help="numbers of auxiliary losses")
     parser.add_argument(
-        "--ways", nargs="+", choices=get_args(Way), default=["latents"], help="ways to gradients, of weighted_grad"
+        "--modes", nargs="+", choices=get_args(GradientMode), default=["latents"], help="modes of weighted_grad"
     )
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--batch-size", type=int, default=512)
@@ -140,8 +140,8 @@ def main() -> int:
     check_devices()
     spec = jax.ShapeDtypeStruct((4, options.image_size, options.image_size), jnp.uint8)
     networks = Networks(preset("paper", image_size=options.image_size), spec, 4, 0.0)
-    print(f"{'way':12}{'losses':>8}{'fixed, us':>12}{'OL-AUX-5, us':>14}{'added, us':>12}   on {jax.devices()[0].device_kind}")
-    for method in options.ways:
+    print(f"{'mode':12}{'losses':>8}{'fixed, us':>12}{'OL-AUX-5, us':>14}{'added, us':>12}   on {jax.devices()[0].device_kind}")
+    for method in options.modes:
         for count in options.losses:
             problem = Problem(networks, options.batch_size, tuple(f"loss_{number}" for number in range(count)))
             weightings = {"fixed": make_weighting("balance"), "learned": make_weighting("ol_aux", interval=5)}

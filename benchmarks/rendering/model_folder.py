@@ -47,7 +47,7 @@ class Measures:
         segmentation: Fraction of pixels that show the same object.
         depth: Fraction of object pixels with the same depth, within 1 mm or a thousandth.
         rgb: Mean absolute difference, grey levels of 255.
-        most: Maximum absolute difference, grey levels of 255.
+        max_difference: Maximum absolute difference, grey levels of 255.
         loud: Fraction of pixels with a channel that differs by more than 16 grey levels.
         matched: Minimum of `render_comparison.matched_shares`.
         missing: Labels that are visible in MuJoCo's image and absent from ours.
@@ -56,7 +56,7 @@ class Measures:
     segmentation: float = 1.0
     depth: float = 1.0
     rgb: float = 0.0
-    most: int = 0
+    max_difference: int = 0
     loud: float = 0.0
     matched: float = 1.0
     missing: tuple[int, ...] = ()
@@ -75,9 +75,9 @@ class Measures:
 
     def worse(self, other: "Measures") -> "Measures":
         """Return the elementwise worse of two measures."""
-        least, most = ("segmentation", "depth", "matched"), ("rgb", "most", "loud")
-        values: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in least}
-        values |= {name: max(getattr(self, name), getattr(other, name)) for name in most}
+        similarities, differences = ("segmentation", "depth", "matched"), ("rgb", "max_difference", "loud")
+        values: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in similarities}
+        values |= {name: max(getattr(self, name), getattr(other, name)) for name in differences}
         return Measures(**values, missing=tuple(sorted({*self.missing, *other.missing})))
 
 
@@ -98,18 +98,18 @@ def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
     ]
     mean = np.abs(ours.rgb.astype(np.int16) - theirs.rgb)[coloured].mean() if coloured.any() else 0.0
     return Measures(
-        segmentation=_share(inside & ((ours.segmentation == theirs.segmentation) | either), inside),
-        depth=_share(solid & near, solid),
+        segmentation=_fraction(inside & ((ours.segmentation == theirs.segmentation) | either), inside),
+        depth=_fraction(solid & near, solid),
         rgb=float(mean),
-        most=int(difference[coloured].max(initial=0)),
-        loud=1.0 - _share(coloured & (difference <= LOUD), coloured),
+        max_difference=int(difference[coloured].max(initial=0)),
+        loud=1.0 - _fraction(coloured & (difference <= LOUD), coloured),
         matched=min(matched_shares(ours, theirs).values(), default=1.0),
         missing=tuple(missing),
     )
 
 
-def _share(part: np.ndarray, whole: np.ndarray) -> float:
-    return float(part.sum() / whole.sum()) if whole.any() else 1.0
+def _fraction(part: np.ndarray, total: np.ndarray) -> float:
+    return float(part.sum() / total.sum()) if total.any() else 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -314,7 +314,7 @@ def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> in
                     " | | | | |"
                     if measures is None
                     else (
-                        f"{measures.segmentation:.4f} | {measures.depth:.4f} | {measures.rgb:.2f} | {measures.most} |"
+                        f"{measures.segmentation:.4f} | {measures.depth:.4f} | {measures.rgb:.2f} | {measures.max_difference} |"
                         f" {measures.loud:.2%} | {measures.matched:.3f}"
                     )
                 )

@@ -66,7 +66,7 @@ def _command(words: Sequence[str], folder: Path, **variables: str) -> Part:
     return Part.command([*_CLI, *words], folder, variables)
 
 
-def _finished(part: Part, *statuses: int) -> Part:
+def _wait_until_finished(part: Part, *statuses: int) -> Part:
     with killed_afterwards(part):
         status = part.end()
     part.check_words()
@@ -75,15 +75,15 @@ def _finished(part: Part, *statuses: int) -> Part:
     return part
 
 
-def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
+def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
     """Make a reward NaN on one of two seeds: the run stops, names the seed, and resumes from its last intact checkpoint."""
     folder.mkdir()
     (folder / "broken_task.py").write_text(TASK)
     run, steps = folder / "run", 4 * 50
     options = ["broken_task:BrokenReach", "--env-folder", str(folder), "--preset", "debug", "--seeds", "2"]
-    options += ["--env-steps", str(400 * steps), "--seed", str(dice.randrange(10**6)), "--checkpoint-interval", "3"]
-    part = Part.start(run, {"SOAK_NAN": str(1.0 / dice.uniform(100, 800))}, options)
-    _finished(part, 4)
+    options += ["--env-steps", str(400 * steps), "--seed", str(rng.randrange(10**6)), "--checkpoint-interval", "3"]
+    part = Part.start(run, {"SOAK_NAN": str(1.0 / rng.uniform(100, 800))}, options)
+    _wait_until_finished(part, 4)
     (line,) = [line for line in part.lines if "non-finite" in line]
     seeds = re.search(r"seeds? ([\d, ]+)", line)
     if seeds is None or "," in seeds.group(1):
@@ -94,7 +94,7 @@ def nan_on_one_seed(folder: Path, dice: random.Random, _: "References") -> None:
     if not saved:
         return  # in the very first iterations there is nothing to resume from, which the line reports
     rows = read_rows(run)
-    again = _finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
+    again = _wait_until_finished(Part.start(run, None, ["--env-steps", str((saved[-1][0] + 6) * steps)]), 0)
     if not again.count("resumed at iteration"):
         raise Broken(f"it did not go on from the last good checkpoint: {again.lines}")
     if [row for row in read_rows(run) if row in rows] != rows:
@@ -120,36 +120,36 @@ def _is(process: int, words: str) -> bool:
         return False
 
 
-def _kill_a_worker(part: Part, words: str, dice: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
+def _kill_a_worker(part: Part, words: str, rng: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
     """Kill a descendant of a part whose command line contains ``words``, after a random delay; return True if there was one."""
 
     def workers() -> list[int]:
         return [process for process in _children(part.process.pid) if _is(process, words)]
 
     part.wait_for(lambda: bool(workers()) and is_ready())
-    time.sleep(dice.uniform(0.0, delay))
+    time.sleep(rng.uniform(0.0, delay))
     running = workers()
     if not running or not part.runs():
         return False
     try:
-        os.kill(dice.choice(running), signal.SIGKILL)
+        os.kill(rng.choice(running), signal.SIGKILL)
     except ProcessLookupError:
         return False
     return True
 
 
-def _of_one_line(part: Part, words: str) -> None:
+def _parse_single_line(part: Part, words: str) -> None:
     if sum(words in line for line in part.lines) != 1:
         raise Broken(f"not one line says {words!r}: {part.lines[-8:]}")
 
 
-def worker_of_a_study(folder: Path, dice: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
+def worker_of_a_study(folder: Path, rng: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
     """Kill one of two cells: the other continues, and the next start finishes both, with the rows of undisturbed ones."""
     words = _sweep(folder, executor)
     part = _command(words, folder)
     with killed_afterwards(part):
         cells = folder / "runs"
-        struck = _kill_a_worker(part, "jaxrl_vis train", dice, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
+        struck = _kill_a_worker(part, "jaxrl_vis train", rng, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
         part.end()
     part.check_words()
     if struck:
@@ -157,8 +157,8 @@ def worker_of_a_study(folder: Path, dice: random.Random, references: "References
             raise NotStruck
         if part.process.returncode not in (1, 3):
             raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
-        _of_one_line(part, "failed with exit status")
-    _finished(_command(words, folder), 0)
+        _parse_single_line(part, "failed with exit status")
+    _wait_until_finished(_command(words, folder), 0)
     if _cell_rows(folder) != references.study():
         raise Broken(f"rows differ from those of an undisturbed study: {part.lines}")
     if not struck:
@@ -174,9 +174,9 @@ def _cell_rows(folder: Path) -> dict[str, list]:
     return {path.parent.name: read_rows(path.parent) for path in sorted((folder / "runs").glob("*/metrics.jsonl"))}
 
 
-def job_of_a_study(folder: Path, dice: random.Random, references: "References") -> None:
+def job_of_a_study(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a run of a sweep whose runs are submitit jobs; the next start finishes the sweep."""
-    worker_of_a_study(folder, dice, references, ("--executor", "local"))
+    worker_of_a_study(folder, rng, references, ("--executor", "local"))
 
 
 def _phenotype(folder: Path, plots: Path) -> list[str]:
@@ -187,10 +187,10 @@ def _tables(out: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in sorted(out.glob("*.csv"))}
 
 
-def worker_of_phenotyping(folder: Path, dice: random.Random, references: "References") -> None:
+def worker_of_phenotyping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``phenotype run``; the next start writes the same tables."""
     plots, tables = references.phenotyping()
-    _pool(_phenotype(folder, plots), folder, dice)
+    _pool(_phenotype(folder, plots), folder, rng)
     if _tables(folder / "out") != tables:
         raise Broken("tables differ from those of an undisturbed run")
 
@@ -208,10 +208,10 @@ def _figures(file: Path) -> list[dict[str, Any]]:
     return runs
 
 
-def worker_of_grasping(folder: Path, dice: random.Random, references: "References") -> None:
+def worker_of_grasping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``grasp eval``; the next start gives the same figures."""
     spec, figures = references.grasping()
-    _pool(_grasp(folder, spec), folder, dice)
+    _pool(_grasp(folder, spec), folder, rng)
     if _figures(folder / "eval.json") != figures:
         raise Broken("figures differ from those of an undisturbed evaluation")
 
@@ -220,12 +220,12 @@ class NotStruck(Exception):
     """The command finished before the fault."""
 
 
-def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
+def _pool(words: Sequence[str], folder: Path, rng: random.Random) -> None:
     """Kill a worker of a pool, and check that the same command finishes when started again."""
     folder.mkdir(exist_ok=True)
     part = _command(words, folder)
     with killed_afterwards(part):
-        struck = _kill_a_worker(part, "spawn_main", dice, 4.0, lambda: True)
+        struck = _kill_a_worker(part, "spawn_main", rng, 4.0, lambda: True)
         part.end()
     part.check_words()
     if struck and part.process.returncode == 0:
@@ -233,8 +233,8 @@ def _pool(words: Sequence[str], folder: Path, dice: random.Random) -> None:
     if struck:
         if part.process.returncode not in (1, 2):
             raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
-        _of_one_line(part, "processes was killed from outside")
-    _finished(_command(words, folder), 0)
+        _parse_single_line(part, "processes was killed from outside")
+    _wait_until_finished(_command(words, folder), 0)
     if not struck:
         raise NotStruck
 
@@ -261,7 +261,7 @@ class References:
         """Return rows by name of the cell."""
 
         def make(folder: Path) -> dict[str, list]:
-            _finished(_command(_sweep(folder), folder), 0)
+            _wait_until_finished(_command(_sweep(folder), folder), 0)
             return _cell_rows(folder)
 
         return self._once("study", make)
@@ -272,8 +272,8 @@ class References:
         def make(folder: Path) -> tuple[Path, dict[str, bytes]]:
             (folder / "few.json").write_text(json.dumps(FEW_STALKS))
             words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(folder / "few.json"), "--width", "422"]
-            _finished(_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
-            _finished(_command(_phenotype(folder, folder / "plots"), folder), 0)
+            _wait_until_finished(_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
+            _wait_until_finished(_command(_phenotype(folder, folder / "plots"), folder), 0)
             return folder / "plots", _tables(folder / "out")
 
         return self._once("phenotyping", make)
@@ -284,7 +284,7 @@ class References:
         def make(folder: Path) -> tuple[Path, list]:
             spec = folder / "few.json"
             spec.write_text(json.dumps(FEW_TO_GRASP))
-            _finished(_command(_grasp(folder, spec), folder), 0)
+            _wait_until_finished(_command(_grasp(folder, spec), folder), 0)
             return spec, _figures(folder / "eval.json")
 
         return self._once("grasping", make)
@@ -309,10 +309,10 @@ ALONE: dict[str, Alone] = {
 }
 
 
-def strike_alone(name: str, folder: Path, dice: random.Random, references: References) -> bool:
+def strike_alone(name: str, folder: Path, rng: random.Random, references: References) -> bool:
     """Inject a fault of `ALONE` in a new folder; return False if the command finished first."""
     try:
-        ALONE[name].strike(folder, dice, references)
+        ALONE[name].strike(folder, rng, references)
     except NotStruck:
         return False
     shutil.rmtree(folder, ignore_errors=True)

@@ -45,7 +45,9 @@ class Fault:
     goes_back: bool = False
 
 
-def _started(folder: Path, dice: random.Random, variables: dict[str, str] | None = None, file_bytes: int | None = None) -> Part:
+def _start_run(
+    folder: Path, rng: random.Random, variables: dict[str, str] | None = None, file_bytes: int | None = None
+) -> Part:
     """Start a process and return it at a random moment of training, or after its end if it finished first.
 
     Raises:
@@ -55,37 +57,37 @@ def _started(folder: Path, dice: random.Random, variables: dict[str, str] | None
     if not part.wait_for(part.is_training) and (part.runs() or part.end() != 0):
         with killed_afterwards(part):
             raise Broken(f"it did not begin to train: {part.lines[-4:]}")
-    time.sleep(dice.uniform(0.0, 0.8))
+    time.sleep(rng.uniform(0.0, 0.8))
     return part
 
 
-def _signalled(*numbers: int, to_group: bool = False) -> Strike:
-    def strike(folder: Path, dice: random.Random) -> int | None:
-        with killed_afterwards(_started(folder, dice)) as part:
+def _send_signal(*numbers: int, to_group: bool = False) -> Strike:
+    def strike(folder: Path, rng: random.Random) -> int | None:
+        with killed_afterwards(_start_run(folder, rng)) as part:
             for number in numbers:
                 if not part.runs():
                     break
                 with contextlib.suppress(ProcessLookupError):
                     (os.killpg if to_group else os.kill)(part.process.pid, number)
-                time.sleep(dice.uniform(0.0, 0.3) if len(numbers) > 1 else 0.0)
-            return _ended(part)
+                time.sleep(rng.uniform(0.0, 0.3) if len(numbers) > 1 else 0.0)
+            return _wait_for_end(part)
 
     return strike
 
 
-def _ended(part: Part) -> int | None:
+def _wait_for_end(part: Part) -> int | None:
     status = part.end()
     part.check_words()
     return status or None
 
 
-def _killed_in_a_save(folder: Path, dice: random.Random) -> int | None:
-    with killed_afterwards(_started(folder, dice)) as part:
+def _killed_in_a_save(folder: Path, rng: random.Random) -> int | None:
+    with killed_afterwards(_start_run(folder, rng)) as part:
         part.wait_for(part.is_saving, 20.0)
         return part.send(signal.SIGKILL) or None
 
 
-def _second_process(folder: Path, dice: random.Random) -> int | None:
+def _second_process(folder: Path, rng: random.Random) -> int | None:
     with killed_afterwards(Part.start(folder)) as part:
         # Another process takes seconds to start; the first holds the folder from before it compiles.
         part.wait_for(part.is_compiling)
@@ -103,20 +105,20 @@ def _second_process(folder: Path, dice: random.Random) -> int | None:
         return part.stop() or None
 
 
-def _full_disk(folder: Path, dice: random.Random) -> int | None:
+def _full_disk(folder: Path, rng: random.Random) -> int | None:
     """Fill the disk, including any space freed on it; if no disk can be mounted, limit the size of files instead."""
     with small_disk(folder) as (place, fill):
         limit = None if fill() and (place.parent / "other").unlink() is None else 100_000
-        with killed_afterwards(_started(place, dice, file_bytes=limit)) as part:
+        with killed_afterwards(_start_run(place, rng, file_bytes=limit)) as part:
             while part.runs() and limit is None:
                 fill()
                 time.sleep(0.05)
-            return _ended(part)
+            return _wait_for_end(part)
 
 
-def _stalled_disk(folder: Path, dice: random.Random) -> int | None:
-    with freezing_disk(folder) as (place, freeze), killed_afterwards(_started(place, dice)) as part:
-        still = dice.uniform(1.0, 4.0)
+def _stalled_disk(folder: Path, rng: random.Random) -> int | None:
+    with freezing_disk(folder) as (place, freeze), killed_afterwards(_start_run(place, rng)) as part:
+        still = rng.uniform(1.0, 4.0)
         part.wait_for(part.is_saving, 5.0)
         if freeze(True):
             time.sleep(still)
@@ -134,14 +136,14 @@ def _with_site(**variables: str) -> dict[str, str]:
     return {**variables, "PYTHONPATH": os.pathsep.join((str(SITE), environment()["PYTHONPATH"]))}
 
 
-def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
+def _jumping_clock(folder: Path, rng: random.Random) -> int | None:
     clock = folder.with_name(f"{folder.name}.clock")
     clock.unlink(missing_ok=True)
     variables = _with_site(SOAK_CLOCK=str(clock))
-    with killed_afterwards(_started(folder, dice, variables)) as part:
+    with killed_afterwards(_start_run(folder, rng, variables)) as part:
         for _ in range(3):
-            clock.write_text(str(dice.choice((-1, 1)) * dice.uniform(60.0, 30 * 86400.0)))
-            time.sleep(dice.uniform(0.1, 0.5))
+            clock.write_text(str(rng.choice((-1, 1)) * rng.uniform(60.0, 30 * 86400.0)))
+            time.sleep(rng.uniform(0.1, 0.5))
         status = part.stop()
         part.check_words()
         file = folder / "metrics.jsonl"
@@ -153,16 +155,16 @@ def _jumping_clock(folder: Path, dice: random.Random) -> int | None:
         return status or None
 
 
-def _killed(folder: Path, dice: random.Random) -> bool:
+def _kill_run(folder: Path, rng: random.Random) -> bool:
     """Send SIGKILL during training; return True if the run had not finished and has a checkpoint."""
-    with killed_afterwards(_started(folder, dice)) as part:
+    with killed_afterwards(_start_run(folder, rng)) as part:
         part.wait_for(lambda: len(list_checkpoints(folder)) > 1, 20.0)
         return part.send(signal.SIGKILL) != 0 and bool(list_checkpoints(folder))
 
 
-def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
+def _resume_run(folder: Path, rng: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
     """Resume, and stop again during training; return the exit status and the process."""
-    with killed_afterwards(_started(folder, dice, variables)) as part:
+    with killed_afterwards(_start_run(folder, rng, variables)) as part:
         status = part.stop()
         part.check_words()
         if status not in (0, 143):
@@ -170,18 +172,20 @@ def _resumed(folder: Path, dice: random.Random, variables: dict[str, str] | None
         return status, part
 
 
-def _check_went_back(folder: Path, before: list[dict[str, Any]], all_before: list[Checkpoint], good: list[Checkpoint]) -> None:
+def _check_went_back(
+    folder: Path, before: list[dict[str, Any]], all_before: list[Checkpoint], intact: list[Checkpoint]
+) -> None:
     """Check that a run with a damaged checkpoint resumed from the newest intact one.
 
     Args:
         folder: The run, resumed and stopped again.
         before: Its rows before it was resumed.
         all_before: Its checkpoints before it was resumed.
-        good: The undamaged ones among ``all_before``.
+        intact: The undamaged ones among ``all_before``.
     """
     newest, newest_good, last = (
         max((iteration for iteration, *_ in checkpoints), default=0)
-        for checkpoints in (list_checkpoints(folder), good, all_before)
+        for checkpoints in (list_checkpoints(folder), intact, all_before)
     )
     if newest < newest_good:
         raise Broken(f"a good checkpoint was of iteration {newest_good}, and the newest is of {newest}")
@@ -190,61 +194,61 @@ def _check_went_back(folder: Path, before: list[dict[str, Any]], all_before: lis
         raise Broken(f"rows {lost} are neither in metrics.jsonl nor kept for inspection")
 
 
-def _damaged(folder: Path, dice: random.Random) -> int | None:
-    if not _killed(folder, dice):
+def _damage_checkpoint(folder: Path, rng: random.Random) -> int | None:
+    if not _kill_run(folder, rng):
         return None
     rows, there = read_rows(folder), list_checkpoints(folder)
     *good, (_, tier, path) = there
     if path.is_dir():
         files = sorted((file for file in path.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
-        how = dice.choice(("truncate", "no manifest", "no learner"))
+        how = rng.choice(("truncate", "no manifest", "no learner"))
         for file in files if how == "truncate" else []:
             file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
         if how != "truncate":
             shutil.rmtree(path / ("manifest" if how == "no manifest" else "train"))
     else:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    status, part = _resumed(folder, dice)
+    status, part = _resume_run(folder, rng)
     if part.count(f"checkpoint {tier}/") != 1 or part.count("is damaged") != 1:
         raise Broken(f"nothing was said about a damaged checkpoint: {part.lines}")
     _check_went_back(folder, rows, there, good)
     return status or None
 
 
-def flip_a_bit(file: Path, dice: random.Random) -> int:
+def flip_a_bit(file: Path, rng: random.Random) -> int:
     """Flip a random bit of a file; return the index of its byte."""
     contents = bytearray(file.read_bytes())
-    place = dice.randrange(len(contents))
-    contents[place] ^= 1 << dice.randrange(8)
+    place = rng.randrange(len(contents))
+    contents[place] ^= 1 << rng.randrange(8)
     file.write_bytes(bytes(contents))
     return place
 
 
-def _bit_in_a_checkpoint(folder: Path, dice: random.Random) -> int | None:
-    if not _killed(folder, dice):
+def _bit_in_a_checkpoint(folder: Path, rng: random.Random) -> int | None:
+    if not _kill_run(folder, rng):
         return None
     rows, there = read_rows(folder), list_checkpoints(folder)
-    _, tier, path = dice.choice(there[-2:])
+    _, tier, path = rng.choice(there[-2:])
     files = [file for file in path.rglob("*") if file.is_file() and file.stat().st_size] if path.is_dir() else [path]
     if tier == "recent":
         files += list(path.parent.glob("*.rollout"))
-    flip_a_bit(dice.choices(files, [file.stat().st_size for file in files])[0], dice)
+    flip_a_bit(rng.choices(files, [file.stat().st_size for file in files])[0], rng)
     # The bit is either detected or does not affect the state that the run resumes from: rows are compared at the end.
-    status = _resumed(folder, dice)[0]
+    status = _resume_run(folder, rng)[0]
     good = [entry for entry in there if entry[2] != path and not tier == entry[1] == "recent"]  # recent ones share rollouts
     _check_went_back(folder, rows, there, good)
     return status or None
 
 
-def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
-    if not _killed(folder, dice) or not read_rows(folder):
+def _bit_in_metrics(folder: Path, rng: random.Random) -> int | None:
+    if not _kill_run(folder, rng) or not read_rows(folder):
         return None
     before, file = read_rows(folder), folder / "metrics.jsonl"
-    place = flip_a_bit(file, dice)
+    place = flip_a_bit(file, rng)
     number = file.read_bytes()[:place].count(b"\n")
     row = file.read_bytes().splitlines()[number] if number < len(file.read_bytes().splitlines()) else b""
     done = max((iteration for iteration, *_ in list_checkpoints(folder)), default=0)
-    status, part = _resumed(folder, dice)
+    status, part = _resume_run(folder, rng)
     # The row of that line may be lost, and the next one if the line break was hit; all others are kept.
     others = [old for i, old in enumerate(before) if i not in (number, number + 1) and old["iteration"] <= done]
     if missing := [old["iteration"] for old in others if old not in read_rows(folder)]:
@@ -257,12 +261,12 @@ def _bit_in_metrics(folder: Path, dice: random.Random) -> int | None:
     return status or None
 
 
-def _taken_away(is_kept: bool) -> Strike:
+def _move_folder(is_kept: bool) -> Strike:
     """Return a strike that moves the folder, and back after the process has ended; or that deletes it."""
 
-    def strike(folder: Path, dice: random.Random) -> int | None:
+    def strike(folder: Path, rng: random.Random) -> int | None:
         there = folder.with_name(f"{folder.name}-{'moved' if is_kept else 'trash'}")
-        with killed_afterwards(_started(folder, dice)) as part:
+        with killed_afterwards(_start_run(folder, rng)) as part:
             rows = read_rows(folder)
             if not part.runs():
                 return part.end() or None
@@ -284,11 +288,11 @@ def _taken_away(is_kept: bool) -> Strike:
     return strike
 
 
-def _lock_of_the_dead(folder: Path, dice: random.Random) -> int | None:
+def _lock_of_the_dead(folder: Path, rng: random.Random) -> int | None:
     """Leave the lock of a dead process. Without file locks a lease must expire, which takes a minute: rarely tried."""
-    no_locks = dice.random() < 0.15
+    no_locks = rng.random() < 0.15
     variables = _with_site(SOAK_NO_LOCKS="1") if no_locks else _with_site()
-    with killed_afterwards(_started(folder, dice, variables)) as part:
+    with killed_afterwards(_start_run(folder, rng, variables)) as part:
         if part.send(signal.SIGKILL) == 0:
             return None
     lock = folder / "run.lock"
@@ -296,31 +300,34 @@ def _lock_of_the_dead(folder: Path, dice: random.Random) -> int | None:
         raise Broken("a process that was killed left no run.lock")
     lock.write_text(lock.read_text().replace(socket.gethostname(), "elsewhere"))
     os.utime(lock, (time.time() - 3600.0, time.time() - 3600.0))
-    return _resumed(folder, dice, variables)[0] or None
+    return _resume_run(folder, rng, variables)[0] or None
 
 
 EXACT = "goes on exactly"
 FAULTS: dict[str, Fault] = {
-    "SIGTERM": Fault(_signalled(signal.SIGTERM), f"status 143, saved with the replay, {EXACT}", (143,)),
-    "SIGINT": Fault(_signalled(signal.SIGINT), f"status 130, saved with the replay, {EXACT}", (130,)),
-    "SIGHUP": Fault(_signalled(signal.SIGHUP), f"status 129, saved with the replay, {EXACT}", (129,)),
+    "SIGTERM": Fault(_send_signal(signal.SIGTERM), f"status 143, saved with the replay, {EXACT}", (143,)),
+    "SIGINT": Fault(_send_signal(signal.SIGINT), f"status 130, saved with the replay, {EXACT}", (130,)),
+    "SIGHUP": Fault(_send_signal(signal.SIGHUP), f"status 129, saved with the replay, {EXACT}", (129,)),
     "SIGTERM to the group": Fault(
-        _signalled(signal.SIGTERM, to_group=True), "as SIGTERM, though children get the signal, too", (143,)
+        _send_signal(signal.SIGTERM, to_group=True), "as SIGTERM, though children get the signal, too", (143,)
     ),
     "two signals": Fault(
-        _signalled(signal.SIGTERM, signal.SIGTERM),
+        _send_signal(signal.SIGTERM, signal.SIGTERM),
         "status 143 at once; the networks are saved",
         (143, -signal.SIGTERM),  # the second one may arrive when the run is saved and its handler removed
     ),
     "second process": Fault(_second_process, "status 2 and one line; the first process goes on undisturbed", (143,)),
-    "SIGKILL": Fault(_signalled(signal.SIGKILL), f"loses an iteration or two, {EXACT}", (-signal.SIGKILL,)),
+    "SIGKILL": Fault(_send_signal(signal.SIGKILL), f"loses an iteration or two, {EXACT}", (-signal.SIGKILL,)),
     "SIGKILL in a save": Fault(
         _killed_in_a_save, f"goes on from what was saved before the half-written checkpoint, and {EXACT}", (-signal.SIGKILL,)
     ),
     "full disk": Fault(_full_disk, "status 1 (2 before it has begun) and one line; goes on when there is room again", (1, 2)),
     "stalled disk": Fault(_stalled_disk, f"waits for the disk, and {EXACT}", (143,)),
     "damaged checkpoint": Fault(
-        _damaged, "one line; goes on from the one before, and keeps the damaged one for inspection", (143,), goes_back=True
+        _damage_checkpoint,
+        "one line; goes on from the one before, and keeps the damaged one for inspection",
+        (143,),
+        goes_back=True,
     ),
     "bit flipped in a checkpoint": Fault(
         _bit_in_a_checkpoint, "is found, or lies in nothing that is read", (143,), goes_back=True
@@ -329,11 +336,11 @@ FAULTS: dict[str, Fault] = {
         _bit_in_metrics, "all other rows stay; a row that is none any more is put aside, and said", (143,), spoils=True
     ),
     "folder moved": Fault(
-        _taken_away(is_kept=True),
+        _move_folder(is_kept=True),
         "status 1 and one line; nothing is left behind, and the folder goes on at its new place",
         (1,),
     ),
-    "folder gone": Fault(_taken_away(is_kept=False), "status 1 and one line; no half of a run takes its place", (1,)),
+    "folder gone": Fault(_move_folder(is_kept=False), "status 1 and one line; no half of a run takes its place", (1,)),
     "lock of a dead process elsewhere": Fault(_lock_of_the_dead, "is taken over", (143,)),
     "clock jumps by up to a month": Fault(_jumping_clock, f"no duration follows it; {EXACT}", (143,)),
 }

@@ -82,11 +82,11 @@ def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[fl
 
 def report(killed: dict[str, Any], every: float, reference: Sequence[float] | None) -> dict[str, Any]:
     """Print the results, and return them for a file."""
-    beside = "" if reference is None else f", undisturbed {' '.join(f'{value:.3f}' for value in reference)}"
+    comparison = "" if reference is None else f", undisturbed {' '.join(f'{value:.3f}' for value in reference)}"
     print(
         "goodput {goodput:.4f} over {env_steps:,} environment steps and {minutes:g} minutes, killed {kills} times, every "
         "{every:g} s; replay lost {replays_lost} times; success at the end ".format(**killed, every=every)
         + " ".join(f"{value:.3f}" for value in killed["success"])
-        + beside
+        + comparison
     )
     return killed | {"every": every, "undisturbed": None if reference is None else list(reference)}

@@ -86,8 +86,8 @@ class Part:
         file_bytes: int | None = None,
     ) -> "Part":
         """Start or resume the run in ``folder``; ``file_bytes`` limits the size of each file."""
-        goes_on = ["--resume"] if folder.exists() else []
-        command = [sys.executable, "-m", "jaxrl_vis", "train", *options, "--run-dir", str(folder), *goes_on]
+        resume_option = ["--resume"] if folder.exists() else []
+        command = [sys.executable, "-m", "jaxrl_vis", "train", *options, "--run-dir", str(folder), *resume_option]
         return cls.command(command, folder, variables, file_bytes)
 
     @classmethod

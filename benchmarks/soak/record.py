@@ -74,11 +74,11 @@ class Record:
         """Format the table of all faults as Markdown."""
         lines = ["| fault | times | what must hold |", "|---|---|---|"]
         lines += [f"| {name} | {self.faults.get(name, 0)} | {promise} |" for name, promise in PROMISES.items()]
-        share = self.done / self.begun if self.begun else 1.0
+        goodput = self.done / self.begun if self.begun else 1.0
         held = "all of it held" if not self.broken else f"**{len(self.broken)} times it did not**"
         lines += [
             f"| all | {self.total} | {held}; {self.runs} training runs, none with a row missing or twice, {self.exact} of them "
-            f"with the metrics.jsonl of an undisturbed run, bit for bit; goodput {share:.3f} at {self.resumes} resumptions, "
+            f"with the metrics.jsonl of an undisturbed run, bit for bit; goodput {goodput:.3f} at {self.resumes} resumptions, "
             f"replay lost {self.replays_lost} times |"
         ]
         return "\n".join(lines) + "\n"

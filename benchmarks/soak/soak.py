@@ -51,7 +51,7 @@ class Soak:
                 raise Broken("\n".join(part.lines))
         self.reference = read_rows(part.folder)
 
-    def _next(self, kinds: dict[str, Any]) -> str | None:
+    def _next_fault(self, kinds: dict[str, Any]) -> str | None:
         """Draw the next fault of these kinds, all equally often; None if it is time to end."""
         with self._lock:
             if self._left <= 0 or time.monotonic() > self._deadline:
@@ -62,20 +62,20 @@ class Soak:
                 deck += self._dice.sample(list(kinds), len(kinds))
             return deck.pop()
 
-    def _again(self, kinds: dict[str, Any], fault: str) -> None:
+    def _return_fault(self, kinds: dict[str, Any], fault: str) -> None:
         """Return a fault to the deck, because the run had finished before it."""
         with self._lock:
             self._left += 1
             self._decks[next(iter(kinds))].insert(0, fault)
 
-    def _struck(self, where: str, fault: str, outcome: str) -> None:
+    def _note_fault(self, where: str, fault: str, outcome: str) -> None:
         with self._lock:
             self.record.faults[fault] += 1
             self.record.minutes = round((time.monotonic() - self._started) / 60.0, 2)
             print(f"{self.record.total:4}  {where:8} {fault:32} {outcome}", flush=True)
             self._note(self.record)
 
-    def _broke(self, where: Path, faults: list[str], error: Exception) -> None:
+    def _note_violation(self, where: Path, faults: list[str], error: Exception) -> None:
         text = str(error) if isinstance(error, Broken) else traceback.format_exc()
         with self._lock:
             self.record.broken.append(f"{where.name}, {faults}: {text}")
@@ -86,50 +86,50 @@ class Soak:
         """Alternate between a run and a fault with a folder of its own, until it is time to end."""
         for turn in itertools.count():
             number = 1000 * worker + turn
-            dice, place = random.Random(f"{self._seed} {number}"), self._folder / f"run{number}"
+            rng, place = random.Random(f"{self._seed} {number}"), self._folder / f"run{number}"
             faults: list[str] = []
             try:
                 # Workers begin with different kinds, so that a short soak covers both.
                 if self._alone and (turn + worker) % 2:
-                    going = self._one_alone(place, dice, faults)
+                    going = self._one_alone(place, rng, faults)
                 else:
-                    going = self._one_run(place, dice, faults)
+                    going = self._one_run(place, rng, faults)
             except Exception as error:  # the others continue; the folder is kept for inspection
-                self._broke(place, faults, error)
+                self._note_violation(place, faults, error)
                 going = True
             if not going:
                 return
 
-    def _one_alone(self, place: Path, dice: random.Random, faults: list[str]) -> bool:
-        fault = self._next(ALONE)
+    def _one_alone(self, place: Path, rng: random.Random, faults: list[str]) -> bool:
+        fault = self._next_fault(ALONE)
         if fault is None:
             return False
         faults.append(fault)
-        if strike_alone(fault, place, dice, self._references):
-            self._struck(place.name, fault, "")
+        if strike_alone(fault, place, rng, self._references):
+            self._note_fault(place.name, fault, "")
         else:
-            self._again(ALONE, fault)
+            self._return_fault(ALONE, fault)
         return True
 
-    def _one_run(self, folder: Path, dice: random.Random, faults: list[str]) -> bool:
+    def _one_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
         """Train one run to its end, with faults; return False if none is left for it."""
         spoilt, fault = False, None
         while len(faults) < FAULTS_PER_RUN:
-            fault = self._next(FAULTS)
+            fault = self._next_fault(FAULTS)
             if fault is None:
                 break
             faults.append(fault)
             before, good = read_rows(folder), list_checkpoints(folder)
-            status = FAULTS[fault].strike(folder, dice)
+            status = FAULTS[fault].strike(folder, rng)
             if status is None:  # the run finished before the fault
-                self._again(FAULTS, faults.pop())
+                self._return_fault(FAULTS, faults.pop())
                 break
             if status not in FAULTS[fault].statuses:
                 raise Broken(f"status {status}: {LAST.lines[-4:]}")
             spoilt |= FAULTS[fault].spoils
             if folder.exists() and not (FAULTS[fault].spoils or FAULTS[fault].goes_back):
                 self._check_kept(folder, before, good[-1][0] if good else 0)
-            self._struck(folder.name, fault, f"status {status}")
+            self._note_fault(folder.name, fault, f"status {status}")
         if not faults:  # the run finished before the first fault, or it is time to end
             shutil.rmtree(folder, ignore_errors=True)
             return fault is not None

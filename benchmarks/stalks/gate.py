@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes
-from jaxrl_vis.stalks.phenotyping.training.held_out import LEAST_SCORE, match_finds
+from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_finds
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants.pairs import Sequence
 
@@ -37,7 +37,7 @@ FIRST_SEEDS = {"fit": 20_000, "test": 30_000}
 WIDTH, FRAMES = 844, 2
 RIGHT = 0.8
 """Minimum F1 of the detections of an image that counts as correct."""
-MOST_FLAGGED = 0.04
+MAX_FLAGGED = 0.04
 AXES = 8
 Photograph = tuple[np.ndarray, int, Callable[[np.ndarray], int]]
 
@@ -62,14 +62,14 @@ def draw(folder: Path, part: str, family: str, number: int) -> Path:
     seed = FIRST_SEEDS[part] + number
     sequence = Sequence.of(plants.draw(drawn_from.at_width(WIDTH), seed))
     true, arrays = sequence.drive.true, {}
-    for place, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
+    for index, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
         image, instance, depth = sequence.left(int(frame))
         thinned = np.asarray(instance[::4, ::4]), np.asarray(depth[::4, ::4])
         stalks, kinds, _ = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
-        arrays |= {f"image_{place}": np.asarray(image), f"stalks_{place}": stalks, f"kinds_{place}": kinds}
-    density = sequence.drive.stated.focal / sequence.plot.family.rig.distance
+        arrays |= {f"image_{index}": np.asarray(image), f"stalks_{index}": stalks, f"kinds_{index}": kinds}
+    pixels_per_metre = sequence.drive.stated.focal / sequence.plot.family.rig.distance
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez(path, density=density, **arrays)
+    np.savez(path, pixels_per_metre=pixels_per_metre, **arrays)
     return path
 
 
@@ -79,10 +79,12 @@ def plain_measures(image: np.ndarray) -> tuple[float, float]:
     return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
 
 
-def see(finder: Finder, image: np.ndarray, density: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def detect_stalks(
+    finder: Finder, image: np.ndarray, pixels_per_metre: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Detect stalks in an image: return detections [N, 6] in its own coordinates, their scores, and the pooled features."""
     frame = find_frame(image)
-    stalks, scores, pooled = finder.look(fill_borders(image, frame), density)
+    stalks, scores, pooled = finder.look(fill_borders(image, frame), pixels_per_metre)
     over, down = frame.columns[0], frame.lines[0]
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
 
@@ -92,41 +94,41 @@ def f1_of(hits: int, finds: int, stalks: int) -> float:
     return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
 
 
-def seen_in(path: Path, finder: Finder, name: str) -> list[Seen]:
+def detections_in(path: Path, finder: Finder, name: str) -> list[Seen]:
     """Evaluate the images of a file of `draw`, or read the cached results of the detector of this name."""
-    kept = path.with_suffix(f".{name.split()[-1]}.npz")
-    if not kept.exists():
+    cached = path.with_suffix(f".{name.split()[-1]}.npz")
+    if not cached.exists():
         arrays = {}
-        for place, seen in enumerate(_seen_now(path, finder)):
+        for index, seen in enumerate(_detect_images(path, finder)):
             values = {"pooled": seen.pooled, "scores": seen.scores, "f1": seen.f1, "plain": seen.plain}
-            arrays |= {f"{key}_{place}": value for key, value in values.items()}
-        np.savez(kept, **arrays)
+            arrays |= {f"{key}_{index}": value for key, value in values.items()}
+        np.savez(cached, **arrays)
     family = path.stem.split("_", 1)[1].rpartition("_")[0]
-    with np.load(kept) as data:
-        columns = [[data[f"{key}_{place}"] for place in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
+    with np.load(cached) as data:
+        columns = [[data[f"{key}_{index}"] for index in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
     return [
         Seen(family, pooled, scores, float(f1), (float(plain[0]), float(plain[1])))
         for pooled, scores, f1, plain in zip(*columns)
     ]
 
 
-def _seen_now(path: Path, finder: Finder) -> Iterator[Seen]:
+def _detect_images(path: Path, finder: Finder) -> Iterator[Seen]:
     with np.load(path) as data:
-        for place in range(FRAMES):
-            image, truth, kinds = (data[f"{name}_{place}"] for name in ("image", "stalks", "kinds"))
-            stalks, scores, pooled = see(finder, image, float(data["density"]))
+        for index in range(FRAMES):
+            image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
+            stalks, scores, pooled = detect_stalks(finder, image, float(data["density"]))
             right, ignored = match_finds(stalks, scores, truth, kinds)
-            counted = (scores >= LEAST_SCORE) & ~ignored
+            counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
             yield Seen("", pooled, scores, f1, plain_measures(image))
 
 
-def seen_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
+def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
     """Evaluate photographs, whose cameras are unknown."""
-    for image, count, found in photographs:
-        stalks, scores, pooled = see(finder, image, None)
-        boxes = stalks[scores >= LEAST_SCORE][:, :4]
-        yield Seen("photographs", pooled, scores, f1_of(found(boxes), len(boxes), count), plain_measures(image))
+    for image, count, find_boxes in photographs:
+        stalks, scores, pooled = detect_stalks(finder, image, None)
+        boxes = stalks[scores >= MIN_SCORE][:, :4]
+        yield Seen("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
 
 
 def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
@@ -162,8 +164,8 @@ def report(name: str, images: list[Seen], gate: Gate, doubts_of_control: np.ndar
     print(f"{name:14} " + "; ".join(parts), flush=True)
 
 
-def _made(folder: Path, tasks: list[tuple[str, str, int]], place: int) -> dict[str, str]:
-    return {"path": str(draw(folder, *tasks[place]))}
+def _made(folder: Path, tasks: list[tuple[str, str, int]], index: int) -> dict[str, str]:
+    return {"path": str(draw(folder, *tasks[index]))}
 
 
 def main() -> None:
@@ -189,21 +191,21 @@ def main() -> None:
         done = functools.partial(_made, options.folder, tasks)
         evaluate_all(done, range(len(tasks)), options.workers, lambda place, made: print(made["path"], flush=True))
     enable_compilation_cache()
-    finder = load_finder(options.weights, LEAST_SCORE)
+    finder = load_finder(options.weights, MIN_SCORE)
     seen: dict[str, list[Seen]] = {part: [] for part in FIRST_SEEDS}
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
         if path.exists():
-            seen[part] += seen_in(path, finder, detector_name(options.weights))
+            seen[part] += detections_in(path, finder, detector_name(options.weights))
     fitted, tried = seen["fit"], seen["test"]
     wrong = np.array([image.f1 < RIGHT for image in fitted])
     pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES
-    gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MOST_FLAGGED)
+    gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MAX_FLAGGED)
     about = {"images": len(fitted), "families": list(PLOTS), "origin": "synthetic images alone"}
     write_gate(options.weights, gate, about)
     if options.photographs:
         module, _, name = options.photographs.partition(":")
-        tried += seen_in_photographs(getattr(importlib.import_module(module), name)(), finder)
+        tried += detections_in_photographs(getattr(importlib.import_module(module), name)(), finder)
     doubts = control(fitted, tried)
     print(f"{detector_name(options.weights)}: {len(fitted)} images to fit on, {len(tried)} to try; right is F1 >= {RIGHT:g}")
     report("all", tried, gate, doubts)

@@ -54,9 +54,9 @@ if __name__ == "__main__":
     assert len({str([point.point for point in run.points]) for run in runs}) > 1, "all runs gave the same"
     count = len(scenes[0].views)
     height, width = scenes[0].views[0].left.shape[:2]
-    whole = [sum(run.seconds.values()) / count for run in runs]
+    seconds = [sum(run.seconds.values()) / count for run in runs]
     print(f"{width} x {height}, runs of {count} pairs, {len(runs[0].points)} grasp points in the first, on {device_name()}")
-    print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first run, which compiles, {first:.1f} s")
+    print(f"{np.median(seconds):.3f} s a pair (least {min(seconds):.3f}); the first run, which compiles, {first:.1f} s")
     for name in runs[0].seconds:
         print(f"  {np.median([run.seconds[name] / count for run in runs]):.4f} s  {name}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB, drawing the pairs included")

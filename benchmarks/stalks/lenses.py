@@ -63,15 +63,15 @@ def look(plot: Path, finder: Finder) -> dict[str, Any]:
     names = {field.name for field in dataclasses.fields(StalkInView)}
     frames: list[list[Sighting]] = []
     owners: list[list[int | None]] = []
-    clear = found = false = grounds = 0
+    clear = detected = false = grounds = 0
     for row in rows:
         left, right = (read_image(plot / row[side]) for side in ("left", "right"))
-        seen = [each for each in truth["seen"] if each["pair"] == int(row["pair"])]
-        stalks = [StalkInView(**{name: each[name] for name in names}) for each in seen]
+        seen = [stalk for stalk in truth["seen"] if stalk["pair"] == int(row["pair"])]
+        stalks = [StalkInView(**{name: stalk[name] for name in names}) for stalk in seen]
         view = view_pair(finder, left, right, calibration)
         matched, scored = match(view.detections, stalks)
         clear += sum(stalk.band_box is not None and stalk.band_visible >= 0.3 for stalk in stalks)
-        found += sum(hit > 0 for _, hit in scored)
+        detected += sum(hit > 0 for _, hit in scored)
         false += sum(not hit for _, hit in scored)
         grounds += view.ground is not None
         frames.append(view.sightings)
@@ -90,7 +90,7 @@ def look(plot: Path, finder: Finder) -> dict[str, Any]:
         "true": truth["count"],
         "counted": len(counted),
         "clear": clear,
-        "found": found,
+        "found": detected,
         "false": false,
         "ground": grounds / len(rows),
         "errors_mm": errors,

@@ -37,9 +37,9 @@ def plots(path: Path) -> str:
     """Describe the plots of a folder: names and pairs."""
     parts = []
     for plot in find_plots(path):
-        whole = sum(pair.left is not None and pair.right is not None for pair in plot.pairs)
+        complete = sum(pair.left is not None and pair.right is not None for pair in plot.pairs)
         parts.append(
-            f"{plot.name}: {whole} of {len(plot.pairs)} pairs whole, {', '.join(pair.name for pair in plot.pairs[:3])}"
+            f"{plot.name}: {complete} of {len(plot.pairs)} pairs whole, {', '.join(pair.name for pair in plot.pairs[:3])}"
         )
     return "; ".join(parts)
 

@@ -30,16 +30,16 @@ def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]
         stalk = sequence.plot.stalks[view.stalk]
         row = {"seen": view.band_visible}
         for method in ("strip", "ellipse"):
-            got = measure(mask, (top, begin), left, right, drive.stated, method=method)
-            if got.diameter_mm is None:
+            measurement = measure(mask, (top, begin), left, right, drive.stated, method=method)
+            if measurement.diameter_mm is None:
                 break
             heights = np.linspace(0.0, 0.6, 1201)
             lines = outline(stalk, pair.pose, drive.true, heights)[:, :, 1].mean(axis=1)
-            height = float(heights[np.argmin(np.abs(lines - got.line))])
+            height = float(heights[np.argmin(np.abs(lines - measurement.line))])
             # Near a node, the true diameter is the mean of those above and below it.
-            beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
-            true = 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
-            row |= {method: got.diameter_mm - true, "confidence": got.confidence}
+            offsets = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
+            true = 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in offsets]))
+            row |= {method: measurement.diameter_mm - true, "confidence": measurement.confidence}
         else:
             rows.append(row)
     return rows
@@ -54,12 +54,12 @@ if __name__ == "__main__":
     family = FAMILIES[options.family].at_width(options.width)
     rows = [row for seed in range(options.pairs) for row in width_errors(family, 5000 + seed, family.rig.frames // 2)]
     print("synthetic, family", family.name)
-    for least in (0.0, 0.5, 0.8):
-        confident = [row for row in rows if row["confidence"] >= least]
+    for min_confidence in (0.0, 0.5, 0.8):
+        confident = [row for row in rows if row["confidence"] >= min_confidence]
         if not confident:
             break
         for method in ("strip", "ellipse"):
             errors = np.array([row[method] for row in confident])
             size = np.abs(errors)
             text = f"mean absolute {size.mean():.2f}, median absolute {np.median(size):.2f}, bias {errors.mean():+.2f} mm"
-            print(f"{method:8} confidence >= {least:.1f}: {len(confident)} of {len(rows)} stalks, {text}")
+            print(f"{method:8} confidence >= {min_confidence:.1f}: {len(confident)} of {len(rows)} stalks, {text}")

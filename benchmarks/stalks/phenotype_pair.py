@@ -61,17 +61,17 @@ if __name__ == "__main__":
     detections, ground, sightings = once()
     first = time.perf_counter() - started
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
-    whole = timed(once, asked.repeats)
+    seconds = timed(once, asked.repeats)
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
-    print(f"{np.median(whole):.3f} s a pair (least {min(whole):.3f}); the first one, which compiles, {first:.1f} s")
-    density = stated.focal / USUAL_DISTANCE
-    small = pad(resize(left, settings, density)[0])
+    print(f"{np.median(seconds):.3f} s a pair (least {min(seconds):.3f}); the first one, which compiles, {first:.1f} s")
+    pixels_per_metre = stated.focal / USUAL_DISTANCE
+    small = pad(resize(left, settings, pixels_per_metre)[0])
     dtype = finder.dtype
     parts = {
         "image to the device": lambda: jax.block_until_ready(jax.device_put(left)),
-        "reduced image": lambda: resize(left, settings, density),
+        "reduced image": lambda: resize(left, settings, pixels_per_metre),
         "detector": lambda: jax.block_until_ready(detect(params["detector"], small, settings, dtype)),
-        "all of finding, with masks and edges": lambda: finder(left, density),
+        "all of finding, with masks and edges": lambda: finder(left, pixels_per_metre),
         "ground, beside that": lambda: find_ground(grey_at(left), grey_at(right), stated),
         "disparities and widths": lambda: measure_pair(detections, left, right, stated, ground=ground),
     }

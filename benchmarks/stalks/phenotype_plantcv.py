@@ -50,7 +50,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
         views = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
         ideal = perfect_detections(map(dataclasses.asdict, views), instance)
         finds, ground = find_with_ground(
-            (lambda image, density, ideal=ideal: ideal) if options.truth else finder, left, right, stated
+            (lambda image, pixels_per_metre, ideal=ideal: ideal) if options.truth else finder, left, right, stated
         )
         sightings = measure_pair(finds, left, right, stated, ground=ground)
         owners, _ = match(finds, views)
@@ -105,7 +105,7 @@ def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
 
 
 def compare(file: Path) -> None:
-    """Print the errors of both, mm."""
+    """Print the width errors of both methods, mm."""
     try:
         from plantcv import plantcv as pcv  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -132,7 +132,7 @@ def compare(file: Path) -> None:
     ):
         _print(name, theirs[some], ours[some], truth[some])
     names, which = np.unique(stalks, axis=0, return_inverse=True)
-    groups = [which.ravel() == place for place in range(len(names))]
+    groups = [which.ravel() == index for index in range(len(names))]
     medians = [np.array([np.median(widths[group]) for group in groups]) for widths in (theirs, ours, truth)]
     _print("each stalk, median over its pairs", *medians)
 

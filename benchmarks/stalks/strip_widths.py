@@ -15,20 +15,20 @@ RATIOS = (1.5, 3.0, 6.0, 12.0)
 LEANS = (0.0, 2.0, 8.0, 14.0, 20.0)
 
 
-def ideal_strip(width: float, ratio: float, lean: float, place: tuple[float, float], soft: bool) -> np.ndarray:
+def ideal_strip(width: float, ratio: float, lean: float, position: tuple[float, float], soft: bool) -> np.ndarray:
     """Rasterise the mask of a strip [H, W]: covered fraction of each pixel, float32, or bool.
 
     Args:
         width: Width across the axis, pixels.
         ratio: Ratio of length to width.
         lean: Tilt, degrees.
-        place: Offset (x, y) of its centre from a pixel's centre, pixels.
+        position: Offset (x, y) of its centre from a pixel's centre, pixels.
         soft: Return fractions instead of bool.
     """
     fine = 8 if soft else 1
     half = int(0.5 * width * np.hypot(ratio, 1.0)) + 4
     ticks = (np.arange((2 * half + 1) * fine) + 0.5) / fine - half - 0.5
-    x, y = ticks[None, :] - place[0], ticks[:, None] - place[1]
+    x, y = ticks[None, :] - position[0], ticks[:, None] - position[1]
     angle = np.radians(lean)
     across, along = x * np.cos(angle) + y * np.sin(angle), -x * np.sin(angle) + y * np.cos(angle)
     inside = (np.abs(across) < width / 2) & (np.abs(along) < width * ratio / 2)

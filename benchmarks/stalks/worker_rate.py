@@ -39,19 +39,19 @@ def options() -> argparse.Namespace:
     return parsed
 
 
-def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, each_is: float = 1.0) -> None:
+def print_rate(make: Callable[[], tuple[Once, int]], workers: int, seconds: float, count: float = 1.0) -> None:
     """Print the time per pair with several parallel processes, each working on its own pairs.
 
     Args:
         make: Called in each process; returns the job and the number of inputs, all of which are processed once before timing.
         workers: Number of processes.
         seconds: Duration of the timing, once all are ready, s.
-        each_is: Number of pairs per call of the job.
+        count: Number of pairs per call of the job.
     """
     with tempfile.TemporaryDirectory() as folder:
         with worker_pool(workers) as pool:
             counts = list(pool(functools.partial(_work, make, Path(folder), workers, seconds), range(workers)))
-    pairs = sum(counts) * each_is
+    pairs = sum(counts) * count
     print(f"{workers} processes: {seconds / pairs:.4f} s a pair ({pairs:.0f} pairs in {seconds:.0f} s)")
 
 

@@ -21,7 +21,7 @@ import jaxrl_vis_envs
 from benchmarks.tasks import environments
 from jaxrl_vis_envs.tasks import stalk_arm
 
-LEAST_SUCCESS = 0.95
+MIN_SUCCESS = 0.95
 Policy = Callable[[Any, Any, Any], tuple[jax.Array, Any]]
 """Function (state, configuration of the goal, memory) -> (action [A], memory)."""
 
@@ -201,7 +201,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.env:
         rate = success_rate(name, options.episodes)
         print(f"{name:<12} {rate:.4f} of {options.episodes} episodes", flush=True)
-        status |= rate < LEAST_SUCCESS
+        status |= rate < MIN_SUCCESS
     return int(status)
 
 

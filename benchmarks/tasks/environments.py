@@ -34,13 +34,13 @@ def _make(name: str, config: Any) -> Any:
 
 def reset(env: Any, keys: jax.Array) -> tuple[State, Any]:
     """Reset N episodes with typed keys [N]; return their states, and the configurations (`mjx.Data`) of their goals."""
-    return _in_lanes(_reset_program(env), keys)
+    return _map_over_lanes(_reset_program(env), keys)
 
 
 def advance(env: Any, state: State, actions: Any) -> State:
     """Advance N episodes by one control step with actions [N, A]; observations are left unchanged (and thus stale)."""
     # Physics does not need observations; states with and without them would need separate programs.
-    moved = _in_lanes(_advance_program(env), state.replace(obs=None), np.asarray(actions, np.float32))
+    moved = _map_over_lanes(_advance_program(env), state.replace(obs=None), np.asarray(actions, np.float32))
     return moved.replace(obs=state.obs)
 
 
@@ -53,7 +53,7 @@ def start_at(env: Any, qpos: Any, qvel: Any) -> State:
     still = jax.tree.map(lambda leaf: np.tile(leaf, (len(qpos), *(1,) * leaf.ndim)), still)
     data = still.replace(qpos=np.asarray(qpos, np.float32), qvel=np.asarray(qvel, np.float32))
     begin = jaxrl_vis_envs.jit(jax.vmap(lambda data: env.state_at(data, jnp.zeros_like(env.achieved(data)))))
-    return jax.device_get(begin(data))  # on the host, as from `_in_lanes`: device arrays would compile the programs again
+    return jax.device_get(begin(data))  # on the host, as from `_map_over_lanes`: device arrays would compile the programs again
 
 
 @functools.cache
@@ -72,7 +72,7 @@ def _advance_program(env: Any) -> Callable:
     return jaxrl_vis_envs.jit(jax.vmap(env.advance))
 
 
-def _in_lanes(program: Callable, *trees: Any) -> Any:
+def _map_over_lanes(program: Callable, *trees: Any) -> Any:
     """Apply ``program`` to [N, ...] leaves, LANES rows at a time; return NumPy arrays, which are fast to index."""
     count = len(jax.tree.leaves(trees)[0])
     parts = []

@@ -86,20 +86,20 @@ def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, i
     differences = np.array([np.count_nonzero(flat[i] != flat[j]) for i, j in zip(first, second, strict=True)])
     if not len(differences):
         return identical, 0, -1, (-1, -1)
-    least = int(np.argmin(differences))
-    return identical, len(differences), int(differences[least]), (int(first[least]), int(second[least]))
+    nearest = int(np.argmin(differences))
+    return identical, len(differences), int(differences[nearest]), (int(first[nearest]), int(second[nearest]))
 
 
 def report(name: str, count: int, size: int) -> bool:
     """Print the results of a task; return True if there are no identical images and no occluded parts."""
     env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
     goals = draw_goals(env, count)
-    identical, near, least, pair = compare(goals, env.threshold)
+    identical, near, nearest, pair = compare(goals, env.threshold)
     print(f"{name}: {count} goals at {size}x{size}, {len(goals.images[0])} channels")
     print(f"  identical images of goals more than {env.threshold:g} {env.distance_unit} apart: {identical} pairs")
     span = f"{env.threshold:g} to {_NEAR * env.threshold:g} {env.distance_unit}"
-    nearest = f"{least} bytes differ (goals {pair[0]} and {pair[1]})" if near else "none"
-    print(f"  nearest images of {near} pairs {span} apart: {nearest}")
+    shown = f"{nearest} bytes differ (goals {pair[0]} and {pair[1]})" if near else "none"
+    print(f"  nearest images of {near} pairs {span} apart: {shown}")
     good = identical == 0
     for part, geoms in PARTS.get(name, {}).items():
         pixels = visible_pixels(env, goals.labels, geoms)

@@ -103,9 +103,9 @@ class HostFetch:
 def _evaluate(learner: indicator.Learner, noise: float, episodes: int) -> float:
     """Return the success rate over a fixed set of goals."""
     robot = HostFetch(noise, seed=10_000)
-    share = np.mean([robot.episode(lambda image, goal, _: learner.act(image, goal))[3] for _ in range(episodes)])
+    success = np.mean([robot.episode(lambda image, goal, _: learner.act(image, goal))[3] for _ in range(episodes)])
     robot.close()
-    return float(share)
+    return float(success)
 
 
 def _options(args: argparse.Namespace) -> dict[str, Any]:

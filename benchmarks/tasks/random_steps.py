@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import jaxrl_vis_envs
 from jaxrl_vis_envs.names import TASKS
 
-_BAD_SHARE = 0.01
+_BAD_FRACTION = 0.01
 _BAD = (1e6, -1e6, jnp.inf, -jnp.inf, jnp.nan)
 
 
@@ -34,7 +34,7 @@ def count_bad_episodes(name: str, steps: int, count: int) -> tuple[int, int]:
         def step(state, step_key):
             uniform_key, is_bad_key, bad_key = jax.random.split(step_key, 3)
             action = jax.random.uniform(uniform_key, (env.action_size,), minval=-1.0, maxval=1.0)
-            is_bad = jax.random.bernoulli(is_bad_key, _BAD_SHARE, action.shape)
+            is_bad = jax.random.bernoulli(is_bad_key, _BAD_FRACTION, action.shape)
             action = jnp.where(is_bad, jax.random.choice(bad_key, jnp.array(_BAD), action.shape), action)
             state = env.advance(state, action)
             numbers = (state.data.qpos, state.data.qvel, state.achieved_state, state.reward)

@@ -81,7 +81,7 @@ def main() -> int:
     parser.add_argument("--site", type=Path, default=ROOT / "build" / "site")
     parser.add_argument("--seconds", type=float, default=300, help="time that the page has")
     options = parser.parse_args()
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         print(f"there is none of {', '.join(BROWSERS)} to open the page with", file=sys.stderr)
         return 2

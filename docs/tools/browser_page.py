@@ -27,7 +27,7 @@ import jaxrl_vis
 import jaxrl_vis_envs
 from jaxrl_vis.run.exported.export import export_run
 from jaxrl_vis_envs.physics import inverse_kinematics, mjx_model
-from jaxrl_vis_envs.tasks import fetch_reach
+from jaxrl_vis_envs.tasks import fetch_arm, fetch_reach
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = ROOT / "build" / "play"
@@ -74,9 +74,9 @@ def fetch_packages(folder: Path) -> None:
             archives = list(Path(temporary).glob("*.tgz"))
             if done.returncode or len(archives) != 1:
                 sys.exit(f"npm cannot fetch {package}: {done.stderr.strip()[-300:]}")
-            found = hashlib.sha256(archives[0].read_bytes()).hexdigest()
-            if found != digest:
-                sys.exit(f"{package} has the digest {found}, not {digest}: nothing of it is used")
+            actual = hashlib.sha256(archives[0].read_bytes()).hexdigest()
+            if actual != digest:
+                sys.exit(f"{package} has the digest {actual}, not {digest}: nothing of it is used")
             with tarfile.open(archives[0]) as archive:
                 for file in files:
                     member = archive.extractfile(f"package/{file}")
@@ -146,7 +146,7 @@ def describe_task(env: Any) -> dict[str, Any]:
         "hand": hand,
         "grip": grip,
         "fingers": env._fingers.tolist(),
-        "down": list(fetch_reach._DOWN),
+        "down": list(fetch_arm._DOWN),
         "goal_box": [np.asarray(low, float).tolist(), np.asarray(high, float).tolist()],
         "grip_offset": (fetch_reach._DOWN_ROTATION @ mj_model.site_pos[grip]).tolist(),
         "lowest": fetch_reach._TABLE_TOP + float(mj_model.geom_pos[fingertip, 0] + mj_model.geom_size[fingertip, 0]),

@@ -19,7 +19,7 @@ class CheckedConfig:
         """
 
 
-def whole(config: Any, *fields: str, minimum: int = 1) -> None:
+def integers(config: Any, *fields: str, minimum: int = 1) -> None:
     """Check that fields are integers of at least ``minimum``."""
     for field in fields:
         value = getattr(config, field)

@@ -86,9 +86,9 @@ def _parse_with_max_depth(parse: Any, text: Any) -> Any:
     for _ in range(MAX_DEPTH + 1):
         level = [
             part
-            for whole in level
-            if isinstance(whole, dict | list)
-            for part in (whole.values() if isinstance(whole, dict) else whole)
+            for container in level
+            if isinstance(container, dict | list)
+            for part in (container.values() if isinstance(container, dict) else container)
             if isinstance(part, dict | list)
         ]
         if not level:

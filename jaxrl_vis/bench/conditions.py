@@ -138,7 +138,7 @@ class Watch:
         }
 
 
-def why_not_comparable(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str | None:
+def comparison_fault(new: dict[str, Any] | None, old: dict[str, Any] | None) -> str | None:
     """Return the reason why two results are not comparable, in words; None if they are.
 
     Args:

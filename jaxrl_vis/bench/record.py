@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.bench.conditions import why_not_comparable
+from jaxrl_vis.bench.conditions import comparison_fault
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import files, provenance
 from jaxrl_vis.host.files import user_cache, write_atomically
@@ -118,7 +118,7 @@ def describe(record: dict[str, Any], previous: dict[str, Any] | None) -> str:
     if previous is None:
         return line + "  (first record)"
     before = f"{format_figure(previous['value'])} of {previous['revision']}, {previous['date'][:10]}"
-    reason = why_not_comparable(record["conditions"], previous.get("conditions"))
+    reason = comparison_fault(record["conditions"], previous.get("conditions"))
     if reason is not None:
         return line + f"  (not compared with {before}: {reason})"
     change = record["value"] / previous["value"] - 1 if previous["value"] else float("nan")

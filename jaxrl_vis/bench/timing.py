@@ -10,7 +10,7 @@ import jax
 
 from jaxrl_vis_envs.compiling.compilation import tracing_for_default_device
 
-_LEAST_SECONDS = 0.2
+_MIN_SECONDS = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,7 @@ def measure(
 
     wait(call())
     # Repeat short calls until their duration is well above the noise of clock and scheduler.
-    calls = max(1, min(1000, round(_LEAST_SECONDS / max(seconds_per_call(1), 1e-6))))
+    calls = max(1, min(1000, round(_MIN_SECONDS / max(seconds_per_call(1), 1e-6))))
     seconds: list[float] = []
     while len(seconds) < repeats and (len(seconds) < 3 or sum(seconds) * calls < budget_s):
         seconds.append(seconds_per_call(calls))

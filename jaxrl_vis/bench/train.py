@@ -73,7 +73,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
     return loop, timing, {"compile": compile_s, "host": max(0.0, timing.median_s - alone.median_s)}
 
 
-def _settled(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
+def _wait_for_result(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
     """Wrap a call to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
     if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
         return call
@@ -93,13 +93,13 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     """
     program, iteration = programs.program, loop.iteration
     keys, key = seed_keys(program, 3), jax.random.key(4)
-    evaluation = measure_time(_settled(program, lambda: programs.evaluate(loop.train, key)), repeats)
+    evaluation = measure_time(_wait_for_result(program, lambda: programs.evaluate(loop.train, key)), repeats)
     num_envs = programs.config.run.num_envs
 
     def play() -> tuple[Episodes, Metrics]:
         return jax.tree.map(lambda *leaves: join_parts(leaves, num_envs, axis=1), *programs.play(loop.train, keys))
 
-    rollout = measure_time(_settled(program, play), repeats)
+    rollout = measure_time(_wait_for_result(program, play), repeats)
     episodes, _ = play()
     insert, _ = compile_timed(program.insert, loop.train, loop.replay, episodes, keys, iteration)
     train, replay = loop.train, loop.replay
@@ -121,8 +121,8 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
 
 def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
     """Format a table of the parts: milliseconds, and percent of an iteration."""
-    whole = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
-    rows = {**parts, "sum without evaluation": whole, "iteration": iteration, "promised": promised}
+    total = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
+    rows = {**parts, "sum without evaluation": total, "iteration": iteration, "promised": promised}
     lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]
     return "\n".join(lines)
 
@@ -142,8 +142,10 @@ def share_of_one(config: Config) -> Config:
 
 def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
     """Time an iteration of `share_of_one`, in seconds."""
-    share = share_of_one(config)
-    return time_iterations(Programs(share, make_train_step(env, share), cache=False), settings.repeats)[1].median_s
+    config_of_one = share_of_one(config)
+    return time_iterations(Programs(config_of_one, make_train_step(env, config_of_one), cache=False), settings.repeats)[
+        1
+    ].median_s
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:

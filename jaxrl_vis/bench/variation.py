@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 
-def assert_varied(rows: Any, what: str) -> None:
+def assert_varied(rows: Any, label: str) -> None:
     """Assert that [N, ...] ``rows`` are not copies: more than half of them are distinct.
 
     If all environments of a benchmark behave the same, it measures one environment and a broadcast.
@@ -17,7 +17,7 @@ def assert_varied(rows: Any, what: str) -> None:
     count = rows.shape[0]
     distinct = len({row.tobytes() for row in rows})
     if count > 1 and distinct <= count // 2:
-        raise AssertionError(f"only {distinct} of {count} {what} differ: this would measure a broadcast")
+        raise AssertionError(f"only {distinct} of {count} {label} differ: this would measure a broadcast")
 
 
 def alternate(draw: Callable[[Any], Any], batches: list[Any]) -> Callable[[], Any]:

@@ -194,8 +194,8 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
             target[option.name] = value
         elif option.required and option.name not in values:
             choices = fields.choices(option.hint)
-            mend = f"; choose one of {', '.join(choices)}" if choices else f": {option.help} See {program} --help"
-            raise RequestError(f"no {option.name if choices else option.metavar} given{mend}")
+            hint = f"; choose one of {', '.join(choices)}" if choices else f": {option.help} See {program} --help"
+            raise RequestError(f"no {option.name if choices else option.metavar} given{hint}")
     return command(**values)
 
 

@@ -108,12 +108,12 @@ def training_config(options: Train) -> Config:
     return preset(name, **changes)
 
 
-def config_lines(config: Config, given: Collection[str]) -> list[str]:
+def config_lines(config: Config, set_options: Collection[str]) -> list[str]:
     """List a configuration, group by group: the value of each option, and the source of those that are not defaults.
 
     Args:
         config: Configuration.
-        given: Names of the options that were given.
+        set_options: Names of the options that were given.
     """
     name, environment = config.run.preset, config.environment
     of_preset, of_task = PRESETS[name], preset(name, env=environment.env, method=config.reward.method)
@@ -124,7 +124,7 @@ def config_lines(config: Config, given: Collection[str]) -> list[str]:
             group = OPTIONS[option].group
             lines += ["", f"[{group}]"]
         source = ""
-        if option in given or value != of_algorithm.value(option):
+        if option in set_options or value != of_algorithm.value(option):
             source = "given"
         elif value != of_task.value(option) and option != "algorithm":
             source = f"preset {name}, for {config.run.algorithm}"
@@ -158,7 +158,7 @@ def run(options: Train) -> int:
         check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
     if options.show_config:
-        streams.say("\n".join(config_lines(config, set(options.changes))))
+        streams.echo("\n".join(config_lines(config, set(options.changes))))
         return 0
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)
@@ -176,7 +176,7 @@ def run(options: Train) -> int:
         resume=options.resume,
         overwrite=options.overwrite,
         log=options.log or None,
-        keep_programs=True,
+        cache_programs=True,
     )
     for _ in run_trainer.run():
         pass

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, NoReturn
 
 from jaxrl_vis.errors import RequestError, nearest
 
-_LONGEST = 200  # maximum number of characters of a value quoted in a message
+_MAX_LENGTH = 200  # maximum number of characters of a value quoted in a message
 _TRUTH = {"true": True, "false": False}
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "a word", Path: "a path"}
 
@@ -97,10 +97,13 @@ class Field:
 
 
 def describe(record: type, group: str = "") -> list[Field]:
-    """List the fields of a dataclass, with groups (fields that are dataclasses themselves) replaced by their fields."""
+    """List the fields of a dataclass, with groups (fields that are dataclasses themselves) replaced by their fields.
+
+    Keyword-only fields, such as those of a mixin, come last.
+    """
     annotated = typing.get_type_hints(record, include_extras=True)
     described = []
-    for field in dataclasses.fields(record):
+    for field in sorted(dataclasses.fields(record), key=lambda field: bool(field.kw_only)):
         hint = annotated[field.name]
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             described += describe(hint, field.name)
@@ -173,7 +176,7 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
     return hint, optional, several
 
 
-def names_parts(hint: Any) -> bool:
+def is_name_or_parts(hint: Any) -> bool:
     """Return True if a field with this annotation names one or several components."""
     return _names(unwrap(hint)[0]) is not None
 
@@ -215,11 +218,11 @@ def check(label: str, hint: Any, value: Any) -> Any:
         return tuple(check(label, one, item) for item in value)
     if names := _names(one):
         if value not in names.known and not _is_own(value):
-            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_LONGEST], names.known)}")
+            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_MAX_LENGTH], names.known)}")
         return value
     if typing.get_origin(one) is Literal:
         if value not in typing.get_args(one):
-            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_LONGEST], typing.get_args(one))}")
+            raise RequestError(f"{label} cannot be {_quote(value)}{nearest(str(value)[:_MAX_LENGTH], typing.get_args(one))}")
         return value
     if isinstance(value, bool):  # which is an int as well
         if one is bool:
@@ -268,20 +271,20 @@ def _is_finite(value: Any) -> bool:
         return False
 
 
-def _refuse(label: str, one: Any, value: Any) -> NoReturn:
-    raise RequestError(f"{label} must be {_KINDS[one]}, not {_quote(value)}{_suggestion(one, value)}")
+def _refuse(label: str, kind: Any, value: Any) -> NoReturn:
+    raise RequestError(f"{label} must be {_KINDS[kind]}, not {_quote(value)}{_suggestion(kind, value)}")
 
 
 def _quote(value: Any) -> str:
     """Format a value for a one-line message."""
     text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
 
 
-def _suggestion(one: Any, value: Any) -> str:
+def _suggestion(kind: Any, value: Any) -> str:
     """Return a hint with the integer spelling of a whole number written otherwise, such as 1e6; empty if not applicable."""
     try:
-        number = float(value) if one is int and not isinstance(value, bool) else math.nan
+        number = float(value) if kind is int and not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
         return ""
     return f": write {int(number)}" if number.is_integer() and abs(number) < 2**53 else ""

@@ -41,9 +41,9 @@ Randomized = Literal["camera", "lights", "colours", "dynamics"]
 BestBy = Literal["success", "goal_distance", "goal_distance_median"]
 ComputeDtype = Literal["auto", "float32", "bfloat16"]
 
-LARGEST_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without bound
-Count = Annotated[int, Bounds(1, LARGEST_COUNT)]
-Share = Annotated[float, Bounds(0.0, 1.0)]
+MAX_COUNT = 2**31 - 1  # arrays are indexed by int32; environment steps are counted on the host, without bound
+Count = Annotated[int, Bounds(1, MAX_COUNT)]
+Fraction = Annotated[float, Bounds(0.0, 1.0)]
 Positive = Annotated[float, Bounds(0.0, exclusive=True)]
 T = TypeVar("T")
 NotNegative = Annotated[float, Bounds(0.0)]
@@ -83,7 +83,7 @@ class RunOptions:
     """Number of episodes in an evaluation; they are the same every time."""
     checkpoint_interval: Annotated[Count, HOST, RESUMABLE, UNMEASURED] = 5
     """Iterations between light checkpoints (networks and optimisers; enough for eval and play)."""
-    full_checkpoint_interval: Annotated[int, Bounds(0, LARGEST_COUNT), HOST, RESUMABLE, UNMEASURED] = 0
+    full_checkpoint_interval: Annotated[int, Bounds(0, MAX_COUNT), HOST, RESUMABLE, UNMEASURED] = 0
     """Iterations between full checkpoints (with the replay, for an exact resume). 0: only when a run is interrupted."""
     best_by: Annotated[BestBy | None, HOST, RESUMABLE, UNMEASURED] = None
     """Evaluation metric (mean over seeds) by which the best learner is kept as an additional checkpoint, for
@@ -123,9 +123,9 @@ class EnvironmentOptions:
 class GoalOptions:
     """Goal relabelling, balancing and filtering (thesis, section 5.1.4)."""
 
-    relabel_probability: Share = 0.9
+    relabel_probability: Fraction = 0.9
     """p1: fraction of samples whose goal is replaced by an observation from the same episode."""
-    balance_probability: Share | None = None
+    balance_probability: Fraction | None = None
     """p2: fraction of relabelled samples whose goal is the next observation, a certain positive. None: 0.5 for balancing
     methods, else 0."""
     filter_threshold: float | None = None
@@ -133,7 +133,7 @@ class GoalOptions:
     future_goals: Literal["even", "geometric"] = "even"
     """Distribution of relabelled goals over the rest of the episode: uniform (even), or proportional to gamma^k after k further
     steps (geometric)."""
-    trivial_goals: Share = 1.0
+    trivial_goals: Fraction = 1.0
     """Fraction of the relabelled goals already reached before the action, as the oracle or an indicator judges, that is kept;
     the rest are replaced by observations from other episodes."""
 
@@ -151,7 +151,7 @@ class RewardOptions:
     """R-. None: 0 for autoencoder, classifier and features, -1 for other methods."""
     tolerance: Annotated[NotNegative, OfMethod("indicator_tolerance")] = 8.0
     """Maximum difference of elements that count as equal, in the observation's unit (grey levels for images)."""
-    tolerance_share: Annotated[Share, OfMethod("indicator_tolerance")] = 0.99
+    tolerance_share: Annotated[Fraction, OfMethod("indicator_tolerance")] = 0.99
     """Fraction of the elements that must be equal."""
     reward_encoder: Annotated[str | None, OfMethod("features")] = None
     """File with the frozen encoder, from `jaxrl-vis encoder`."""
@@ -167,7 +167,7 @@ class DDPGOptions:
     """Adam step size of the actor."""
     critic_learning_rate: Positive = 1e-3
     """Adam step size of the critic."""
-    target_decay: Share = 0.99
+    target_decay: Fraction = 0.99
     """Decay rate of the target networks: weight of the old target parameters in each target update."""
     target_update_interval: Count = 1
     """Gradient steps between target updates."""
@@ -181,7 +181,7 @@ class DDPGOptions:
     their ratio."""
     clip_targets_above: bool = True
     """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
-    random_action_probability: Share = 0.3
+    random_action_probability: Fraction = 0.3
     """Exploration: fraction of actions sampled uniformly."""
     action_noise: NotNegative = 0.2
     """Exploration: standard deviation of the Gaussian noise added to the other actions."""
@@ -228,7 +228,7 @@ class NetworkOptions:
     """Encoder of the actor: its own (separate), or the critic's, which the actor's loss does not update (shared)."""
     target_encoder: bool = True
     """Use slowly updated target encoders; if false, the target heads read the latents of the online encoders."""
-    random_shift: Annotated[int, Bounds(0, LARGEST_COUNT)] = 0
+    random_shift: Annotated[int, Bounds(0, MAX_COUNT)] = 0
     """Random shift augmentation: maximum shift in pixels per axis, the same for the three images of a transition (Kostrikov et
     al., 2020)."""
     compute_dtype: ComputeDtype = "auto"
@@ -251,11 +251,11 @@ class StudyOptions:
     filter."""
     reward_noise: Annotated[NotNegative, NEEDS_STATES] = 0.0
     """Standard deviation of the noise on the state from which the oracle's reward is computed, in the unit of the state."""
-    reward_false_positives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
+    reward_false_positives: Annotated[Fraction, NEEDS_STATES, FALSE_REWARD] = 0.0
     """Fraction of the oracle's negatives that are turned into positives."""
-    reward_false_negatives: Annotated[Share, NEEDS_STATES, FALSE_REWARD] = 0.0
+    reward_false_negatives: Annotated[Fraction, NEEDS_STATES, FALSE_REWARD] = 0.0
     """Fraction of the oracle's positives that are turned into negatives."""
-    reward_clutter: Share = 1.0
+    reward_clutter: Fraction = 1.0
     """Fraction of the workspace, from the low end of the state's first coordinate, to which the false rewards are confined."""
     normalizers: Literal["shared", "separate"] = "shared"
     """Statistics for normalising goals: those of all observations (shared) or, as in the authors' release, separate ones."""

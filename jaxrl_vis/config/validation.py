@@ -22,7 +22,7 @@ from jaxrl_vis.config.groups import (
 from jaxrl_vis.config.methods import ALGORITHMS, METHODS
 from jaxrl_vis.errors import RequestError
 
-_LARGEST_SEED = 2**32 - 1  # random keys use 32 bits of the seed: larger seeds would repeat smaller ones
+_MAX_SEED = 2**32 - 1  # random keys use 32 bits of the seed: larger seeds would repeat smaller ones
 
 
 def validate(config: Config) -> Config:
@@ -66,8 +66,8 @@ def validate(config: Config) -> Config:
     _validate_devices(config)
     if run.stop_at is not None and run.stop_at > 1 and run.best_by in (None, "success"):
         raise RequestError(f"stop_at {run.stop_at:g} can never be reached: success is from 0 to 1, such as --stop-at 0.95")
-    if run.seed + run.seeds - 1 > _LARGEST_SEED:
-        raise RequestError(f"seed {run.seed} is too large: the last of {run.seeds} must be at most {_LARGEST_SEED}")
+    if run.seed + run.seeds - 1 > _MAX_SEED:
+        raise RequestError(f"seed {run.seed} is too large: the last of {run.seeds} must be at most {_MAX_SEED}")
     return config
 
 

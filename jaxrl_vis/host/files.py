@@ -84,32 +84,32 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def read_json(path: Path, kind: type = dict, mend: str = "") -> Any:
+def read_json(path: Path, kind: type = dict, hint: str = "") -> Any:
     """Read a JSON file.
 
     Args:
         path: The file.
         kind: Expected type of the value: dict, list, or object for any.
-        mend: Hint on how to fix an unusable file, appended to the message.
+        hint: Hint on how to fix an unusable file, appended to the message.
 
     Raises:
         RequestError: The file is missing, unreadable, not UTF-8, not JSON, nested too deeply, or holds a value of another type.
     """
-    mend = f": {mend}" if mend else ""
+    hint = f": {hint}" if hint else ""
     check_path(path)
     try:
         text = read_text(path, _MOST_BYTES)
     except OSError as error:
-        raise RequestError(f"cannot read {path} ({error.strerror or type(error).__name__}){mend}") from error
+        raise RequestError(f"cannot read {path} ({error.strerror or type(error).__name__}){hint}") from error
     except ValueError as error:
-        raise RequestError(f"{path} {error}{mend}") from error
+        raise RequestError(f"{path} {error}{hint}") from error
     try:
         value = parse_json(text)
     except ValueError as error:
-        raise RequestError(f"{path} is not JSON ({' '.join(str(error).split())}){mend}") from error
+        raise RequestError(f"{path} is not JSON ({' '.join(str(error).split())}){hint}") from error
     if not isinstance(value, kind):
         wanted = "a table" if kind is dict else "a list"
-        raise RequestError(f"{path} must hold {wanted}, not {type(value).__name__}{mend}")
+        raise RequestError(f"{path} must hold {wanted}, not {type(value).__name__}{hint}")
     return value
 
 

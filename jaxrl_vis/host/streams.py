@@ -83,7 +83,7 @@ def safe(stream: Any) -> SafeStream:
     return stream if isinstance(stream, SafeStream) else SafeStream(stream)
 
 
-def say(line: str) -> None:
+def echo(line: str) -> None:
     """Print a line to stdout; never raises."""
     print(line, flush=True, file=safe(sys.stdout))
 

@@ -25,7 +25,7 @@ from typing import Any, Protocol, TypeVar
 
 from jaxrl_vis.errors import RequestError, WorkerError
 from jaxrl_vis.host.files import is_count, read_json, write_atomically
-from jaxrl_vis.run.signals import heed_parent_only, shielded_children
+from jaxrl_vis.run.signals import obey_parent_only, shielded_children
 from jaxrl_vis_envs.cores import num_cores
 
 Record = dict[str, Any]
@@ -161,7 +161,7 @@ def _end_with_parent() -> None:
 
 def _prepare(counter: Any, environments: list[dict[str, str]]) -> None:
     """Initialise a worker process."""
-    heed_parent_only()  # a signal to the process group would otherwise interrupt parent and worker at once
+    obey_parent_only()  # a signal to the process group would otherwise interrupt parent and worker at once
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
         index = counter.value
@@ -272,13 +272,13 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     Raises:
         RequestError: The file has other conditions, or cannot be read.
     """
-    mend = "delete it, or name another file with --json"
-    contents = read_json(path, mend=f"it holds no records to resume; {mend}")
+    hint = "delete it, or name another file with --json"
+    contents = read_json(path, hint=f"it holds no records to resume; {hint}")
     records = contents.get("each")
     if not isinstance(records, list) or not all(
         isinstance(record, dict) and is_count(record.get("number")) for record in records
     ):
-        raise RequestError(f"{path} holds no records to resume: {mend}")
+        raise RequestError(f"{path} holds no records to resume: {hint}")
     other = [name for name, value in about.items() if contents.get(name) != value]
     if other:
         name = other[0]
@@ -288,7 +288,7 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
         )
     numbers = [record["number"] for record in records]
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
-        raise RequestError(f"{path} holds number {twice[0]} twice: {mend}")
+        raise RequestError(f"{path} holds number {twice[0]} twice: {hint}")
     return records
 
 

@@ -14,7 +14,7 @@ from jaxrl_vis_envs.registry import config_class, load
 from jaxrl_vis_envs.task_modules import import_folder
 
 
-def _own_option(name: str) -> str | None:
+def _option_of_environment(name: str) -> str | None:
     """Return the option of the command line that sets a field of an environment; None if only ``env_options`` sets it."""
     if name == "randomization":
         return "--randomize"
@@ -76,18 +76,18 @@ def _read_options(environment: EnvironmentOptions) -> dict[str, Any]:
     if not environment.env_options:
         return {}
     hints = fields.hints(config_class(environment.env))
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for option in environment.env_options:
         name, equals, value = option.partition("=")
         if not equals:
             raise RequestError(f"an environment's option is written name=value, not {option!r}")
-        if own := _own_option(name):
+        if own := _option_of_environment(name):
             raise RequestError(f"{name} has an option of its own: {own}")
         if name not in hints:
-            choices = [choice for choice in hints if _own_option(choice) is None]
+            choices = [choice for choice in hints if _option_of_environment(choice) is None]
             raise RequestError(f"{environment.env} has no option {name!r}{nearest(name, choices)}")
         if not fields.is_known(hints[name]):
             raise RequestError(f"{name} cannot be set by name=value: it is a {hints[name]}, neither a number nor a word")
         _, _, several = fields.unwrap(hints[name])
-        found[name] = fields.read(name, hints[name], value.split(",") if several else [value])
-    return found
+        options[name] = fields.read(name, hints[name], value.split(",") if several else [value])
+    return options

@@ -120,7 +120,7 @@ def make_learn(
     def learn(loop: LoopState, parts: Sequence[Played]) -> Learned:
         episodes, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, num_envs), *parts)
         key = split_key(loop.key, loop.iteration)[1]
-        train, replay_state = insert(loop.train, layout.unfolded(loop.replay), episodes, key, loop.iteration)
+        train, replay_state = insert(loop.train, layout.unfold_replay(loop.replay), episodes, key, loop.iteration)
         batches = choose_batches(config, sampler, replay_state, key, loop.iteration)
         agent, metrics = algorithm.update(train.agent, train.statistics, batches, jax.random.fold_in(key, _UPDATES))
         train = train.replace(agent=agent)
@@ -128,7 +128,7 @@ def make_learn(
         means |= algorithm.diagnose(train.agent, train.statistics, episodes.observations[:, -1])
         metrics |= shards.mean(means)
         metrics["guard/nonfinite"] = shards.total(_count_nonfinite((metrics, episodes.states, episodes.actions)))
-        replay_state = layout.folded(replay_state, num_envs)
+        replay_state = layout.fold_replay(replay_state, num_envs)
         return Learned(LoopState(train=train, replay=replay_state, key=loop.key, iteration=loop.iteration + 1), metrics)
 
     return learn

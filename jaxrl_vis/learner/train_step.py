@@ -146,8 +146,8 @@ class TrainStep:
         def insert(
             train: TrainState, replay_state: ReplayState, episodes: Episodes, key: jax.Array, iteration: jax.Array
         ) -> tuple[TrainState, ReplayState]:
-            train, replay_state = self.pure_insert(train, layout.unfolded(replay_state), episodes, key, iteration)
-            return train, layout.folded(replay_state, self.replay.num_envs)
+            train, replay_state = self.pure_insert(train, layout.unfold_replay(replay_state), episodes, key, iteration)
+            return train, layout.fold_replay(replay_state, self.replay.num_envs)
 
         return layout.spread(
             jax.vmap(insert, (0, 0, 0, 0, None)),
@@ -170,7 +170,7 @@ class TrainStep:
         def update_many(
             train: TrainState, replay_state: ReplayState, key: jax.Array, iteration: jax.Array
         ) -> tuple[TrainState, Metrics]:
-            return self.pure_update(train, layout.unfolded(replay_state), key, iteration)
+            return self.pure_update(train, layout.unfold_replay(replay_state), key, iteration)
 
         return layout.spread(
             jax.vmap(update_many, (0, 0, 0, None)),
@@ -243,7 +243,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         empty = jax.tree.map(lambda leaf: jnp.zeros((len(keys), *leaf.shape), leaf.dtype), replay_spec)
         return LoopState(
             train=jax.vmap(init_learner)(keys),
-            replay=jax.vmap(lambda replay_state: layout.folded(replay_state, replay.num_envs))(empty),
+            replay=jax.vmap(lambda replay_state: layout.fold_replay(replay_state, replay.num_envs))(empty),
             key=keys,
             iteration=jnp.zeros((), jnp.int32),
         )
@@ -257,7 +257,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         return episodes, outcome
 
     learn = iterations.make_learn(config, insert, algorithm, sampler, layout)
-    seeds, environments, whole = layout.by_seed, layout.by_environment, layout.everywhere
+    seeds, environments, replicated = layout.by_seed, layout.by_environment, layout.everywhere
     host = layout.read_by_host
 
     def spread(name: str, function: Any, in_specs: tuple, out_specs: Any, kept_as: Any = None) -> Any:
@@ -275,8 +275,8 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         plays_any=plays_any,
         part_size=num_played * shards.count,
         init=spread("init", init, (seeds,), layout.loop),
-        keys=spread("keys", rollout_keys, (seeds, whole), seeds),
-        play=spread("play", play_part, (seeds, seeds, whole, whole), (environments, environments)),
+        keys=spread("keys", rollout_keys, (seeds, replicated), seeds),
+        play=spread("play", play_part, (seeds, seeds, replicated, replicated), (environments, environments)),
         learn=spread(
             "learn",
             jax.vmap(learn, (_SEED_AXES, 0), Learned(_SEED_AXES, 0)),  # type: ignore[arg-type]
@@ -287,7 +287,7 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
         evaluate=spread(
             "evaluate",
             make_evaluate(acting, config.run.eval_episodes, shards),
-            (seeds, whole),
+            (seeds, replicated),
             Evaluation(seeds, environments),  # type: ignore[arg-type]
             kept_as=Evaluation(host, host) if jax.process_count() > 1 else None,  # type: ignore[arg-type]
         ),

@@ -47,14 +47,14 @@ class Recordings:
         Raises:
             RequestError: An array is invalid; the message names it.
         """
-        seen, actions = self.observations, self.actions
-        images = seen.dtype == np.uint8 and seen.ndim == 5 and seen.shape[-1] in _CHANNELS
-        if not images and not (seen.dtype == np.float32 and seen.ndim == 3):
+        observations, actions = self.observations, self.actions
+        images = observations.dtype == np.uint8 and observations.ndim == 5 and observations.shape[-1] in _CHANNELS
+        if not images and not (observations.dtype == np.float32 and observations.ndim == 3):
             raise RequestError(
                 "observations must be images [N, T+1, H, W, C] uint8 with 1, 3 or 4 channels, or vectors [N, T+1, S] float32, "
-                f"not {seen.dtype} of {seen.shape}"
+                f"not {observations.dtype} of {observations.shape}"
             )
-        count, slots = seen.shape[:2]
+        count, slots = observations.shape[:2]
         if not count or slots < 2:
             raise RequestError(f"observations of {count} episodes and {slots} times: there must be an episode of a step")
         steps = slots - 1
@@ -64,7 +64,7 @@ class Recordings:
             )
         size = 0 if self.states is None else self.states.shape[-1]
         wanted: dict[str, tuple[tuple[int, ...], Any]] = {
-            "goals": ((count, *seen.shape[2:]), seen.dtype),
+            "goals": ((count, *observations.shape[2:]), observations.dtype),
             "states": ((count, slots, size), np.float32),
             "goal_states": ((count, size), np.float32),
             "success": ((count,), np.bool_),
@@ -112,14 +112,15 @@ class Recordings:
             success: [N], at the last step.
             about: As in `Recordings`.
         """
-        seen = np.asarray(episodes.observations)
-        if seen.dtype == np.uint8:
-            seen = np.moveaxis(seen[:, :, : seen.shape[2] // int(about.get("frame_stack", 1))], 2, -1)
+        images_or_states = np.asarray(episodes.observations)
+        if images_or_states.dtype == np.uint8:
+            channels = images_or_states.shape[2] // int(about.get("frame_stack", 1))
+            images_or_states = np.moveaxis(images_or_states[:, :, :channels], 2, -1)
         states = np.asarray(episodes.states)
         return cls(
-            observations=np.ascontiguousarray(seen[:, :-1]),
+            observations=np.ascontiguousarray(images_or_states[:, :-1]),
             actions=np.asarray(episodes.actions),
-            goals=np.ascontiguousarray(seen[:, -1]),
+            goals=np.ascontiguousarray(images_or_states[:, -1]),
             states=states[:, :-1],
             goal_states=states[:, -1],
             success=np.asarray(success) > 0,
@@ -138,12 +139,12 @@ class Recordings:
         missing true states by zeros with G = 1.
         """
         goals = self.observations[:, -1] if self.goals is None else self.goals
-        seen = np.concatenate([self.observations, goals[:, None]], axis=1)
+        with_goals = np.concatenate([self.observations, goals[:, None]], axis=1)
         if self.states is None or self.goal_states is None:
             states = np.zeros((self.count, self.horizon + 2, 1), np.float32)
         else:
             states = np.concatenate([self.states, self.goal_states[:, None]], axis=1)
-        planar = np.moveaxis(seen, -1, 2) if self.are_images else seen
+        planar = np.moveaxis(with_goals, -1, 2) if self.are_images else with_goals
         return Episodes(observations=jnp.asarray(planar), states=jnp.asarray(states), actions=jnp.asarray(self.actions))
 
     def to_replay(self) -> tuple[Replay, ReplayState]:

@@ -47,11 +47,11 @@ def write(recordings: Recordings, folder: Path) -> None:
         raise RequestError(f"{folder} is not empty: name a new folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as temporary:
-        whole = Path(temporary) / "dataset"
-        _Writer(recordings, whole).write()
+        dataset = Path(temporary) / "dataset"
+        _Writer(recordings, dataset).write()
         if folder.exists():
             folder.rmdir()
-        shutil.move(whole, folder)
+        shutil.move(dataset, folder)
 
 
 class _Writer:
@@ -126,7 +126,7 @@ class _Writer:
                 encoded = [
                     {"bytes": data, "path": None}
                     for episode in range(self._recordings.count)
-                    for data in self._encoded(name, episode)
+                    for data in self._encode_video(name, episode)
                 ]
                 columns[name] = pa.array(encoded, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
             elif feature["dtype"] != "video":
@@ -138,7 +138,7 @@ class _Writer:
                 )
         pq.write_table(pa.table(columns), self._path(form.DATA))
 
-    def _encoded(self, name: str, episode: int) -> list[bytes]:
+    def _encode_video(self, name: str, episode: int) -> list[bytes]:
         """Encode the images of an episode before each action; the goal's image is encoded only once."""
         shown = self._images(name, episode)[:-1]
         if name == form.GOAL_DEPTH:
@@ -198,9 +198,9 @@ class _Writer:
         for name, feature in self._features.items():
             if feature["dtype"] in ("image", "video"):
                 shown = [self._images(name, episode)[:-1] for episode in episodes]
-                statistics[name] = _of_images(shown)
+                statistics[name] = _image_statistics(shown)
             else:
-                statistics[name] = _of_numbers(numbers[name].reshape(-1, *feature["shape"]))
+                statistics[name] = _number_statistics(numbers[name].reshape(-1, *feature["shape"]))
         return statistics
 
     def _write_tables(self, videos: list[str]) -> None:
@@ -231,7 +231,7 @@ class _Writer:
         return f"{self._recordings.about.get('task', 'recordings')}: reach the goal"
 
 
-def _of_numbers(values: np.ndarray) -> dict[str, Any]:
+def _number_statistics(values: np.ndarray) -> dict[str, Any]:
     """Return statistics of values [steps, D], as lists of D numbers."""
     quantiles = np.quantile(values, list(_QUANTILES.values()), axis=0)
     return {
@@ -243,20 +243,20 @@ def _of_numbers(values: np.ndarray) -> dict[str, Any]:
     } | dict(zip(_QUANTILES, quantiles.tolist(), strict=True))
 
 
-def _of_images(episodes: list[np.ndarray]) -> dict[str, Any]:
+def _image_statistics(episodes: list[np.ndarray]) -> dict[str, Any]:
     """Return statistics of images [..., H, W, C] uint8, scaled by 1/255, [3, 1, 1] each; computed from exact histograms."""
     channels = episodes[0].shape[-1]
     counts = sum(np.stack([np.bincount(part[..., c].ravel(), minlength=256) for c in range(channels)]) for part in episodes)
     counts, levels = np.broadcast_to(counts, (3, 256)), np.arange(256) / 255.0
     total = counts.sum(axis=1)
     mean = counts @ levels / total
-    share = np.cumsum(counts, axis=1) / total[:, None]
+    fraction = np.cumsum(counts, axis=1) / total[:, None]
     occurs = counts > 0
     statistics = {
         "min": levels[occurs.argmax(axis=1)],
         "max": levels[255 - occurs[:, ::-1].argmax(axis=1)],
         "mean": mean,
         "std": np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0.0)),
-    } | {name: levels[(share >= quantile).argmax(axis=1)] for name, quantile in _QUANTILES.items()}
+    } | {name: levels[(fraction >= quantile).argmax(axis=1)] for name, quantile in _QUANTILES.items()}
     as_lists: dict[str, Any] = {name: values.reshape(3, 1, 1).tolist() for name, values in statistics.items()}
     return as_lists | {"count": [sum(len(part) for part in episodes)]}

@@ -73,8 +73,8 @@ def features_of(recordings: Recordings, fps: float) -> dict[str, dict[str, Any]]
         height, width, channels = recordings.observations.shape[2:]
         pairs = [(CAMERA, GOAL_CAMERA, fps)] if channels >= 3 else []
         pairs += [(DEPTH, GOAL_DEPTH, None)] if channels in (1, 4) else []
-        for seen, goal, rate in pairs:
-            features[seen] = image_feature(height, width, rate)
+        for observation, goal, rate in pairs:
+            features[observation] = image_feature(height, width, rate)
             if recordings.goals is not None:
                 features[goal] = image_feature(height, width, rate)
     else:

@@ -34,7 +34,7 @@ def read(folder: Path) -> Recordings:
         RequestError: It is missing, damaged, of another version, or has episodes of different lengths or several cameras.
     """
     check_packages()
-    info = read_json(folder / form.INFO, mend="export it again")
+    info = read_json(folder / form.INFO, hint="export it again")
     if not str(info.get("codebase_version")).startswith("v3."):
         raise RequestError(
             f"{folder} is a LeRobot dataset of version {info.get('codebase_version')}: convert it to {form.VERSION}"
@@ -68,17 +68,17 @@ class _Reader:
             raise RequestError(f"there are {len(self._data)} steps in place of {len(rows)} times {self._steps}")
         is_ours = any(name.startswith(form.LAST) for name in rows[0])
         actions = self._numbers(form.ACTION)
-        seen, goals = self._observations(is_ours)
+        observations, goals = self._observations(is_ours)
         states = goal_states = success = None
         if is_ours and form.TRUE_STATE in self._features:
-            states = self._closed(form.TRUE_STATE, self._numbers(form.TRUE_STATE))
+            states = self._append_last(form.TRUE_STATE, self._numbers(form.TRUE_STATE))
             goal_states = self._numbers(form.TRUE_GOAL)[:, 0]
         if is_ours and form.SUCCESS in rows[0]:
             success = np.array([row[form.SUCCESS] for row in rows], np.bool_)
         about = {"task": self._info.get("robot_type"), "control_period": 1.0 / float(self._info["fps"])}
         if (self._folder / form.ABOUT).is_file():
-            about |= read_json(self._folder / form.ABOUT, mend="export it again")
-        return Recordings(seen, actions if is_ours else actions[:, :-1], goals, states, goal_states, success, about)
+            about |= read_json(self._folder / form.ABOUT, hint="export it again")
+        return Recordings(observations, actions if is_ours else actions[:, :-1], goals, states, goal_states, success, about)
 
     def _table(self, folder: str) -> Any:
         """Return all .parquet files of a folder as one table."""
@@ -96,7 +96,7 @@ class _Reader:
         values = flat.to_numpy(zero_copy_only=False).astype(np.float32)
         return values.reshape(len(self._rows), self._steps, size)
 
-    def _closed(self, name: str, values: np.ndarray) -> np.ndarray:
+    def _append_last(self, name: str, values: np.ndarray) -> np.ndarray:
         """Append the value after the last action to a column [N, T, ...]: [N, T+1, ...]."""
         last = np.array([row[form.LAST + name] for row in self._rows], values.dtype)
         return np.concatenate([values, last[:, None]], axis=1)
@@ -110,20 +110,20 @@ class _Reader:
             for index, name in enumerate(names):
                 last = np.stack([images.decode_png(row[form.LAST + name]) for row in self._rows])
                 parts[index] = np.concatenate([parts[index], last[:, None]], axis=1)
-            seen = np.concatenate([_channels(name, part) for name, part in zip(names, parts, strict=True)], axis=-1)
+            observations = np.concatenate([_channels(name, part) for name, part in zip(names, parts, strict=True)], axis=-1)
             if not goals:
-                return seen, None
-            return seen, np.concatenate([_channels(name, self._images(name, 1)[:, 0]) for name in goals], axis=-1)
+                return observations, None
+            return observations, np.concatenate([_channels(name, self._images(name, 1)[:, 0]) for name in goals], axis=-1)
         cameras = [name for name, feature in self._features.items() if feature["dtype"] in ("image", "video")]
         if len(cameras) > 1:
             raise RequestError(f"there are {len(cameras)} cameras ({', '.join(cameras)}): keep one of them")
         if cameras:
             return self._images(cameras[0]), None
-        seen = self._numbers(form.STATE)
+        observations = self._numbers(form.STATE)
         if not is_ours:
-            return seen, None
+            return observations, None
         goals_of_all = self._numbers(form.GOAL)[:, 0] if form.GOAL in self._features else None
-        return self._closed(form.STATE, seen), goals_of_all
+        return self._append_last(form.STATE, observations), goals_of_all
 
     def _images(self, name: str, count: int | None = None) -> np.ndarray:
         """Return the first ``count`` images of every episode, or all T: [N, count, H, W, 3] uint8."""

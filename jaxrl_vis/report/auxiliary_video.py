@@ -101,13 +101,13 @@ def _columns(
 
 
 def _heat(values: np.ndarray, maximum: float) -> np.ndarray:
-    share = np.clip(values / maximum, 0.0, 1.0)
-    return (matplotlib.colormaps["viridis"](share)[..., :3] * 255).round().astype(np.uint8)
+    fraction = np.clip(values / maximum, 0.0, 1.0)
+    return (matplotlib.colormaps["viridis"](fraction)[..., :3] * 255).round().astype(np.uint8)
 
 
 def _compose(columns: Sequence[Sequence[Tile]], footer: tuple[str, str], colour: tuple[int, int, int]) -> Image.Image:
     """Compose one frame of the video; ``colour`` is that of the observation's border."""
-    whole = columns[0][0][1].shape[:2]
+    shape = columns[0][0][1].shape[:2]
     width, height = videos.enlarge(columns[0][0][1], _SIZE).size
     cell = (width + 2 * videos.BORDER + videos.GAP, height + 2 * videos.BORDER + _CAPTION)
     rows = max(map(len, columns))
@@ -122,7 +122,7 @@ def _compose(columns: Sequence[Sequence[Tile]], footer: tuple[str, str], colour:
             right, bottom = x + width + 2 * videos.BORDER - 1, y + _CAPTION + height + 2 * videos.BORDER - 1
             draw.rectangle((x, y + _CAPTION, right, bottom), fill=border)
             # Borders that do not fill a block of the encoder are not predicted, and stay empty.
-            size = (width * image.shape[1] // whole[1], height * image.shape[0] // whole[0])
+            size = (width * image.shape[1] // shape[1], height * image.shape[0] // shape[0])
             shown = Image.fromarray(image).resize(size, Image.Resampling.NEAREST)
             canvas.paste(shown, (x + videos.BORDER, y + _CAPTION + videos.BORDER))
     y = canvas.height - videos.FOOTER // 2

@@ -18,8 +18,8 @@ def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     """
     import matplotlib
 
-    share = np.clip((depth.astype(np.float32) - near) / (far - near), 0.0, 1.0)
-    return (matplotlib.colormaps["magma"](0.97 - 0.92 * share)[..., :3] * 255).round().astype(np.uint8)
+    fraction = np.clip((depth.astype(np.float32) - near) / (far - near), 0.0, 1.0)
+    return (matplotlib.colormaps["magma"](0.97 - 0.92 * fraction)[..., :3] * 255).round().astype(np.uint8)
 
 
 def label_colours(labels: np.ndarray, geoms: int, sky: tuple[int, int, int]) -> np.ndarray:

@@ -26,16 +26,16 @@ def curve(rows: Sequence[Mapping[str, Any]], metric: str) -> list[tuple[int, flo
     return [(steps, statistics.median(by_seed.values())) for steps, by_seed in sorted(values.items()) if set(by_seed) == seeds]
 
 
-def steps_to(points: Sequence[tuple[int, float]], target: float, least: bool = False) -> int | None:
+def steps_to(points: Sequence[tuple[int, float]], target: float, lower_is_better: bool = False) -> int | None:
     """Return the first step whose evaluation and the next `CONFIRMATIONS` all reach ``target``; None if there is none.
 
     Args:
         points: From `curve`.
         target: Value to be reached.
-        least: Lower values are better.
+        lower_is_better: Lower values are better.
     """
     for index in range(len(points) - CONFIRMATIONS):
         window = [value for _, value in points[index : index + 1 + CONFIRMATIONS]]
-        if all(value <= target if least else value >= target for value in window):
+        if all(value <= target if lower_is_better else value >= target for value in window):
             return points[index][0]
     return None

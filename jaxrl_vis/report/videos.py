@@ -87,7 +87,7 @@ def _compose(
     goal: np.ndarray,
     depth_range: tuple[float, float],
     footer: tuple[str, str],
-    share: float,
+    fraction: float,
     colour: tuple[int, int, int],
 ) -> Image.Image:
     """Compose one frame of the video.
@@ -97,7 +97,7 @@ def _compose(
         goal: [C, H, W] uint8.
         depth_range: See `range_of_depth`.
         footer: The texts at the left and at the right.
-        share: Elapsed fraction of the episode, 0 to 1.
+        fraction: Elapsed fraction of the episode, 0 to 1.
         colour: Colour of the border.
     """
     left, right = (image_rows(image, depth_range) for image in (observation, goal))
@@ -118,7 +118,7 @@ def _compose(
             canvas.paste(image, (x + BORDER, y + BORDER))
     y = size[1] - FOOTER
     draw.rectangle((GAP, y, size[0] - GAP, y + 3), fill=PLAIN)
-    draw.rectangle((GAP, y, GAP + (size[0] - 2 * GAP) * share, y + 3), fill=colour if colour != PLAIN else FAINT)
+    draw.rectangle((GAP, y, GAP + (size[0] - 2 * GAP) * fraction, y + 3), fill=colour if colour != PLAIN else FAINT)
     draw.text((GAP + 2, y + 20), footer[0], font=small, fill=FAINT, anchor="lm")
     draw.text((size[0] - GAP - 2, y + 20), footer[1], font=font, fill=colour if colour != PLAIN else FAINT, anchor="rm")
     return canvas
@@ -141,9 +141,9 @@ def draw_frames(episodes: EpisodeImages, frame_seconds: float, max_episodes: int
             colour = REACHED if reached else MISSED if is_last else PLAIN
             verdict = "goal reached" if reached else "missed" if is_last else ""
             footer = (f"episode {episode + 1} of {count}   step {t} of {num_frames - 1}", verdict)
-            share = t / max(1, num_frames - 1)
+            fraction = t / max(1, num_frames - 1)
             frame, goal = episodes.frames[episode, t], episodes.goals[episode]
-            images.append(_compose(frame, goal, depth_range, footer, share, colour))
+            images.append(_compose(frame, goal, depth_range, footer, fraction, colour))
             seconds.append(HOLD if is_last else frame_seconds)
     return images, seconds
 
@@ -175,7 +175,7 @@ def _strip(episodes: EpisodeImages) -> Image.Image:
     """Draw six steps of up to four episodes, one episode per row, with the goal at the right."""
     num_frames = episodes.frames.shape[1]
     depth_range = range_of_depth(episodes)
-    steps = sorted({round(share * (num_frames - 1)) for share in (0, 0.1, 0.2, 0.35, 0.6, 1)})
+    steps = sorted({round(fraction * (num_frames - 1)) for fraction in (0, 0.1, 0.2, 0.35, 0.6, 1)})
     rows = []
     for episode in range(min(4, episodes.frames.shape[0])):
         success = np.asarray(episodes.success[episode], bool)

@@ -79,10 +79,10 @@ def write_page(program: Any, train: TrainState, key: jax.Array, episodes: int, o
     hold = max(1, round(_HOLD / env.control_period))
     steps = np.append(np.arange(env.horizon + 1), np.full(hold, env.horizon))
 
-    def joined(values: np.ndarray) -> np.ndarray:
+    def flatten_episodes(values: np.ndarray) -> np.ndarray:
         return values[:, steps].reshape(-1, *values.shape[2:])
 
-    poses = Poses(joined(played.positions), joined(played.rotations))
+    poses = Poses(flatten_episodes(played.positions), flatten_episodes(played.rotations))
     goals = Poses(*(np.repeat(of_goals, len(steps), axis=0) for of_goals in (played.goal_positions, played.goal_rotations)))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(viewer_page(env.mj_model, poses, goals, env.control_period), encoding="utf-8")

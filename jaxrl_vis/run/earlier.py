@@ -10,14 +10,15 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.storage import metrics, scores
-from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.storage.checkpoint import DAMAGED, FOREIGN, FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, read_run_id
 from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.types import LoopState
 
 
 def is_finished(
-    folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, say: Callable[[str], None]
+    folder: RunFolder, checkpoints: Checkpoints, programs: Programs, total: int, echo: Callable[[str], None]
 ) -> bool:
     """Return True if a run is complete, with a valid last checkpoint, its evaluation, and its images.
 
@@ -28,7 +29,7 @@ def is_finished(
         return False
     restored = checkpoints.restore_train(programs.shapes)
     if restored is None or restored.iteration < min(last, total):
-        say("the last checkpoint is not usable, so the run is not finished: resuming from the last good one")
+        echo("the last checkpoint is not usable, so the run is not finished: resuming from the last good one")
         return False
     files = [folder.curve, folder.video] if programs.shows_images else [folder.curve]
     return is_evaluated(folder, programs.seeds, restored) and all(file.exists() for file in files)
@@ -39,7 +40,7 @@ def has_ended_early(folder: RunFolder, config: Config, seeds: Collection[int], i
     return config.run.stop_at is not None and iteration in scores.enough_at(config, folder.rows(), seeds)
 
 
-def say_finished(folder: RunFolder, checkpoints: Checkpoints, config: Config, total: int) -> str:
+def finished_message(folder: RunFolder, checkpoints: Checkpoints, config: Config, total: int) -> str:
     """Return the message for a complete run, including how to continue it."""
     last = _last_saved(checkpoints)
     if last < total:
@@ -111,10 +112,10 @@ def set_others_aside(folder: RunFolder, checkpoints: Checkpoints) -> list[str]:
         return []
     moved = checkpoints.set_foreign_aside()
     report = cut_back(folder, checkpoints, sys.maxsize, keeps_later=False)
-    return [*map(say_foreign, moved), *([report] if report else [])]
+    return [*map(foreign_message, moved), *([report] if report else [])]
 
 
-def say_foreign(path: Path) -> str:
+def foreign_message(path: Path) -> str:
     """Return a message about another run's file and its new location."""
     return f"not of this run, and left out: {path}"
 

@@ -40,11 +40,12 @@ from jaxrl_vis.run.reports import Callback, Report
 from jaxrl_vis.run.saving import Saver, import_saving_libraries
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage import metrics
-from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints, Restored
+from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
 from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
 from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.run.storage.progress import Progress
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.run.trained.results import Results, describe
 from jaxrl_vis.types import LoopState
 
@@ -77,13 +78,13 @@ class RunLoop:
         self._config, self._program = programs.config, programs.program
         self._writes = distributed.is_first()
         self._console = RunConsole(quiet=not self._writes)
-        self._say = self._console.say
-        self._checkpoints = Checkpoints(folder.checkpoints, self._say)
+        self._echo = self._console.echo
+        self._checkpoints = Checkpoints(folder.checkpoints, self._echo)
         self._held: Held | None = None  # by the first process
-        self._saver = Saver(programs, folder, self._checkpoints, self._say, self._check_ours)
-        self._milestones = Milestones(self._config, self._checkpoints, self._saver, self._say)
-        self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._say)
-        self._results = Results(programs, folder, self._loggers, self._say)
+        self._saver = Saver(programs, folder, self._checkpoints, self._echo, self._check_ours)
+        self._milestones = Milestones(self._config, self._checkpoints, self._saver, self._echo)
+        self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._echo)
+        self._results = Results(programs, folder, self._loggers, self._echo)
         self._total: int = self._program.num_iterations
         self._progress = Progress()
         self._goodput = Goodput(folder.processes)
@@ -105,29 +106,29 @@ class RunLoop:
     def reports(self, resume: bool, overwrite: bool) -> Iterator[Report]:
         """Run to the end, yielding reports; see `Trainer.run`."""
         reserve_standard_files()
-        goes_on = self._folder.check(self._config, resume, overwrite)
-        if resume and not goes_on:
-            self._say(f"nothing to resume in {self._folder.path}: starting at the beginning")
+        is_resumed = self._folder.check(self._config, resume, overwrite)
+        if resume and not is_resumed:
+            self._echo(f"nothing to resume in {self._folder.path}: starting at the beginning")
         steps = self._program.steps_per_iteration
         shapes, layout = self._programs.shapes, self._programs.layout
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
         distributed.meet("checked")  # before the first process writes anything that the others would detect
-        if goes_on:
+        if is_resumed:
             self._checkpoints.run_id = read_run_id(self._folder.path)
-        with run_lock(self._folder.path, self._say) if self._writes else contextlib.nullcontext() as self._held, self._console:
-            if goes_on and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._say):
+        with run_lock(self._folder.path, self._echo) if self._writes else contextlib.nullcontext() as self._held, self._console:
+            if is_resumed and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._echo):
                 if self._writes and (said := earlier.cut_back(self._folder, self._checkpoints, sys.maxsize, keeps_later=False)):
-                    self._say(said)
-                self._say(earlier.say_finished(self._folder, self._checkpoints, self._config, self._total))
+                    self._echo(said)
+                self._echo(earlier.finished_message(self._folder, self._checkpoints, self._config, self._total))
                 return
             interruption = Interruption()
             try:
                 with safe_streams():  # for warnings of libraries during compilation
-                    compiled = self._prepare(goes_on, memory)
+                    compiled = self._prepare(is_resumed, memory)
                 # Not before: while XLA compiles, no Python code can check the flag, and there is nothing to save.
                 with interruption:
-                    self._begin(compiled, goes_on, overwrite)
+                    self._begin(compiled, is_resumed, overwrite)
                     yield from self._train(interruption)
                     self._finish(interruption)
                 self._checkpoints.close()
@@ -189,34 +190,34 @@ class RunLoop:
 
     # -- Before
 
-    def _prepare(self, goes_on: bool, memory: str) -> dict[str, Any]:
+    def _prepare(self, is_resumed: bool, memory: str) -> dict[str, Any]:
         """Restore and compile; return the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
-        self._say(f"{self._config.environment.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
-        self._say(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
-        restored = self._checkpoints.restore_for_resume(programs.shapes) if goes_on else None
+        self._echo(f"{self._config.environment.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
+        self._echo(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")
+        restored = self._checkpoints.restore_for_resume(programs.shapes) if is_resumed else None
         if restored is not None:
             earlier.refuse_missing_rows(self._folder, restored)
             self._take_over(restored)
-        elif goes_on:
-            self._say("no usable checkpoint: starting at the beginning")
+        elif is_resumed:
+            self._echo("no usable checkpoint: starting at the beginning")
 
         started = time.monotonic()
-        self._say(f"compiling ({programs.says_of_cache()}) ...")
-        compiled = programs.compile(meanwhile=import_saving_libraries)
+        self._echo(f"compiling ({programs.cache_message()}) ...")
+        compiled = programs.compile(concurrent_work=import_saving_libraries)
         self._compile_s = time.monotonic() - started
         self._progress.compile_s += self._compile_s
         return compiled
 
-    def _begin(self, compiled: dict[str, Any], goes_on: bool, overwrite: bool) -> None:
+    def _begin(self, compiled: dict[str, Any], is_resumed: bool, overwrite: bool) -> None:
         """Check the memory again, the last check that can refuse the run; then prepare folder and state."""
-        self._say(f"compiled in {show_seconds(self._compile_s)}")
+        self._echo(f"compiled in {show_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
         has_room = not distributed.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
         self._evaluates_ahead = self._programs.evaluates_ahead and has_room
         if self._writes:
-            self._open(goes_on, overwrite)
+            self._open(is_resumed, overwrite)
             if trust.is_own(self._config):  # and here it runs
                 trust.trust(self._folder.path, self._config, was_trained_here=True)
         distributed.meet("opened")
@@ -226,18 +227,18 @@ class RunLoop:
         self._milestones.begin()
         with self._saver.writing():
             foreign = self._checkpoints.set_foreign_aside()
-            damaged = self._checkpoints.set_aside_after(self._done) if goes_on else []
+            damaged = self._checkpoints.set_aside_after(self._done) if is_resumed else []
             if self._writes:
                 self._checkpoints.recent.resume_from(self._recent_at)
                 self._goodput.begin(self._done, self._replay_lost)
-                self._begin_log(goes_on, damaged, foreign)
+                self._begin_log(is_resumed, damaged, foreign)
         distributed.meet("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
         self._pace.begin(self._done)
 
-    def _open(self, goes_on: bool, overwrite: bool) -> None:
+    def _open(self, is_resumed: bool, overwrite: bool) -> None:
         """Prepare the folder, unless it was moved or deleted during compilation."""
         assert self._held is not None
         self._folder.check_place(self._held)
@@ -245,28 +246,28 @@ class RunLoop:
             if overwrite and self._folder.config.exists():
                 with self._saver.writing():
                     for line in earlier.set_others_aside(self._folder, self._checkpoints):
-                        self._say(line)
-            self._folder.open(self._config, goes_on, overwrite, self._log)
+                        self._echo(line)
+            self._folder.open(self._config, is_resumed, overwrite, self._log)
         except RequestError:
             self._folder.check_place(self._held)
             raise
 
-    def _begin_log(self, goes_on: bool, damaged: list[Path], foreign: list[Path]) -> None:
+    def _begin_log(self, is_resumed: bool, damaged: list[Path], foreign: list[Path]) -> None:
         """Truncate the metrics to the iteration from which the run continues, and open the loggers.
 
         Args:
-            goes_on: True if the run resumes.
+            is_resumed: True if the run resumes.
             damaged: Damaged checkpoints that were set aside.
             foreign: Checkpoints of other runs that were set aside.
         """
-        if goes_on:
+        if is_resumed:
             if said := earlier.cut_back(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
-                self._say(said)
+                self._echo(said)
             self._evaluated_there = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
         for path in damaged:
-            self._say(f"kept for inspection: {path}")
+            self._echo(f"kept for inspection: {path}")
         for path in foreign:
-            self._say(earlier.say_foreign(path))
+            self._echo(earlier.foreign_message(path))
         self._loggers.open(read_record(self._folder.path), self._programs.seeds, self._folder.rows())
 
     def _take_over(self, restored: Restored) -> None:
@@ -282,12 +283,12 @@ class RunLoop:
         if restored.loop is not None:
             self._loop = restored.loop
             self._recent_at = restored.iteration if restored.tier == RECENT else None
-            self._say(f"resumed at iteration {self._done} of {self._total}, exactly")
+            self._echo(f"resumed at iteration {self._done} of {self._total}, exactly")
             return
         self._loop = earlier.without_replay(self._programs, restored)
         if self._done < self._total:
             self._progress.replay_lost_at, self._replay_lost = self._done, True
-        self._say(
+        self._echo(
             f"resumed at iteration {self._done} of {self._total} from a light checkpoint: replay lost; networks go on, but the "
             "replay fills up anew, so this is not an exact continuation (--full-checkpoint-interval saves the replay)"
         )
@@ -338,8 +339,8 @@ class RunLoop:
 
     def _end_early(self, report: Report) -> None:
         """Make this iteration the last one if an evaluation or a callback requests it."""
-        if (reason := self._milestones.ends(report, self._callbacks)) and self._done < self._total:
-            self._say(f"stopped at iteration {self._done} of {self._total}: {reason}")
+        if (reason := self._milestones.end_reason(report, self._callbacks)) and self._done < self._total:
+            self._echo(f"stopped at iteration {self._done} of {self._total}: {reason}")
             self._total = self._done
 
     def _is_due(self, interval: int) -> bool:
@@ -420,13 +421,13 @@ class RunLoop:
             words.append(f"{speed:,.0f} steps/s")
             if self._done < self._total:
                 words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")
-        self._say("  ".join(words))
+        self._echo("  ".join(words))
 
-    def _warn_if_filtered(self, means: PerSeed) -> None:
-        too_much = max(means.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
+    def _warn_if_filtered(self, values: PerSeed) -> None:
+        too_much = max(values.get("train/filtered_share", [0.0])) > _FILTERED_TOO_MUCH
         self._progress.filtered = self._progress.filtered + 1 if too_much else 0
         if self._progress.filtered == _FILTERED_EVALUATIONS:
-            self._say(
+            self._echo(
                 f"warning: more than {_FILTERED_TOO_MUCH:.0%} of the negatives were filtered since "
                 f"{_FILTERED_EVALUATIONS} evaluations: Q lies above q0 almost everywhere and cannot come down; "
                 "check reward_positive, reward_negative and filter_threshold"
@@ -449,11 +450,11 @@ class RunLoop:
                 self._results.draw_curve(self._done)
         interruption.end()
 
-    def _stop_nonfinite(self, where: str, values: PerSeed) -> None:
+    def _stop_nonfinite(self, place: str, values: PerSeed) -> None:
         """Dump the state and raise NonFiniteError."""
         assert self._loop is not None
         self._console.stop()
-        self._saver.stop_nonfinite(self._loop, self._done, where, values)
+        self._saver.stop_nonfinite(self._loop, self._done, place, values)
 
     # -- After
 
@@ -466,13 +467,13 @@ class RunLoop:
         self._saver.finish()
         self._console.stop()
         if interruption.reached_any():
-            self._say(f"{interruption.name}: all is trained and saved; to draw the curve and the video, {self._saver.resume}")
+            self._echo(f"{interruption.name}: all is trained and saved; to draw the curve and the video, {self._saver.resume}")
             interruption.end()
         if self._programs.shows_images and not self._recorded:
             # Killed after the last evaluation, before this: resumed with nothing left to evaluate.
             _, self._recorded = self._programs.evaluate(self._loop.train)
         if self._writes:
-            self._say(self._goodput.account(self._done).describe(self._program.updates_per_iteration))
+            self._echo(self._goodput.account(self._done).describe(self._program.updates_per_iteration))
             self._check_ours()
             with self._saver.writing():
                 self._results.show(self._done, self._progress_now, self._recorded)

@@ -24,11 +24,11 @@ class Milestones:
         config: The run.
         checkpoints: Its checkpoints.
         saver: Saves them.
-        say: Prints a line.
+        echo: Prints a line.
     """
 
-    def __init__(self, config: Config, checkpoints: Checkpoints, saver: Saver, say: Callable[[str], None]):
-        self._config, self._checkpoints, self._saver, self._say = config, checkpoints, saver, say
+    def __init__(self, config: Config, checkpoints: Checkpoints, saver: Saver, echo: Callable[[str], None]):
+        self._config, self._checkpoints, self._saver, self._echo = config, checkpoints, saver, echo
         self._best: float | None = None
 
     def begin(self) -> None:
@@ -39,7 +39,7 @@ class Milestones:
             try:
                 progress = self._checkpoints.manifest(BEST, iteration)["progress"]
             except RequestError as error:
-                self._say(f"{error}: the next evaluation is the best")
+                self._echo(f"{error}: the next evaluation is the best")
                 continue
             score = progress.get(SCORE)
             if progress.get(SCORED) == scores.metric(self._config) and isinstance(score, float):
@@ -63,8 +63,8 @@ class Milestones:
             self._saver.best(loop, iteration, progress, about)
             self._best = score
 
-    def ends(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
-        """Return why the run ends after this evaluation; None if it continues."""
+    def end_reason(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
+        """Return the reason to end the run after this evaluation; None to continue."""
         asked = False
         for callback in callbacks:  # each of them, also after one that asks to stop
             asked |= callback(report) is True

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxrl_vis.errors import NonFiniteError, StorageError
 from jaxrl_vis.host import distributed
-from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
+from jaxrl_vis.run.compiled.nonfinite import dump, nonfinite_simulation
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
@@ -44,7 +44,7 @@ class Saver:
         programs: Programs of the run.
         folder: Folder of its files.
         checkpoints: Checkpoints of that folder.
-        say: Called with one line about each event.
+        echo: Called with one line about each event.
         check: Raises a `StorageError` if the folder no longer belongs to this run; called before anything is written.
     """
 
@@ -53,10 +53,10 @@ class Saver:
         programs: Programs,
         folder: RunFolder,
         checkpoints: Checkpoints,
-        say: Callable[[str], None],
+        echo: Callable[[str], None],
         check: Callable[[], None],
     ):
-        self._programs, self._folder, self._checkpoints, self._say = programs, folder, checkpoints, say
+        self._programs, self._folder, self._checkpoints, self._echo = programs, folder, checkpoints, echo
         self._check = check
         self._keeps_full = programs.config.run.full_checkpoint_interval > 0
 
@@ -142,7 +142,7 @@ class Saver:
             NonFiniteError, StorageError: As `light`.
         """
         hint = f"{interruption.hurry} at once, without the replay"
-        self._say(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
+        self._echo(f"{interruption.name}: saving iteration {iteration} ({hint}) ...")
         if self.is_recent_due(light=True):  # in case the user does not wait
             self.recent(loop, iteration, progress)
         self._checkpoints.wait()  # one of this iteration may still be on its way: it is not written twice
@@ -154,11 +154,11 @@ class Saver:
                 self.full(loop, iteration, progress)
             except StorageError as error:
                 missing = "there is no full checkpoint" if self.has(RECENT, iteration) else "the replay is not"
-                self._say(f"the networks are saved, {missing}: {error}; {self.resume}")
+                self._echo(f"the networks are saved, {missing}: {error}; {self.resume}")
                 return
         if distributed.is_first():
             self._checkpoints.recent.clear()
-        self._say(f"saved; {self.resume}")
+        self._echo(f"saved; {self.resume}")
 
     def rescue(self, loop: LoopState | None, iteration: int, progress: Progress) -> None:
         """Try to save the learner after an unexpected error; failures are not reported."""
@@ -195,23 +195,23 @@ class Saver:
         good = "there is no checkpoint yet" if newest is None else f"the last checkpoint is of iteration {newest}"
         cause = error.__cause__
         is_full = "no space left" in str(error).lower() or getattr(cause, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
-        mend = "make room" if is_full else "fix that"
-        return StorageError(f"{error}; {good}: {mend}, then {self.resume}")
+        hint = "make room" if is_full else "fix that"
+        return StorageError(f"{error}; {good}: {hint}, then {self.resume}")
 
     def _refuse_nonfinite(self, loop: LoopState, iteration: int) -> None:
         # The guard checks losses and states; a parameter that breaks in the very last update appears in those of the next
         # iteration.
-        if broken := self._programs.broken_leaves(loop):
+        if broken := self._programs.nonfinite_leaves(loop):
             self.stop_nonfinite(loop, iteration, f"the state after iteration {iteration}", {}, broken)
 
     def stop_nonfinite(
-        self, loop: LoopState, iteration: int, where: str, values: PerSeed, broken: list[str] | None = None
+        self, loop: LoopState, iteration: int, place: str, values: PerSeed, broken: list[str] | None = None
     ) -> None:
         """Dump the state and raise NonFiniteError."""
         with contextlib.suppress(StorageError):
             self._checkpoints.wait()
         newest = self._checkpoints.newest()
-        leaves = self._programs.broken_leaves(loop) if broken is None else broken
+        leaves = self._programs.nonfinite_leaves(loop) if broken is None else broken
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
         simulated, dumped = None, "the state is distributed over several processes and is not dumped"
@@ -221,11 +221,11 @@ class Saver:
                 dumped = f"state dumped to {file}"
             except OSError as error:
                 dumped = f"the state cannot be written to {file} ({error.strerror or type(error).__name__})"
-            simulated = made_by_simulation(loop, self._programs.config.run.num_envs)
+            simulated = nonfinite_simulation(loop, self._programs.config.run.num_envs)
             if simulated is None and not leaves and values and all(name.startswith("eval/") for name in values):
                 simulated = "the networks are finite"
         names = [name for name, row in values.items() if not np.isfinite(row).all()] + leaves
         shown = f" ({', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''})" if names else ""
         good = "there is no checkpoint yet" if newest is None else f"the last good checkpoint is of iteration {newest}"
         origin = f"they come from the simulation, not from the learner ({simulated}); " if simulated else ""
-        raise NonFiniteError(f"non-finite numbers in {where}{shown}: {origin}{dumped}; {good}")
+        raise NonFiniteError(f"non-finite numbers in {place}{shown}: {origin}{dumped}; {good}")

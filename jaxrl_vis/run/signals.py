@@ -190,29 +190,29 @@ class Ending(_Handlers):
     """Context in which `SIGNALS` raise `Terminated` or KeyboardInterrupt in the main thread, as Ctrl-C does anyway.
 
     Args:
-        give_up: Called in another thread with a signal that has not ended this process after some seconds, because the main
+        should_stop: Called in another thread with a signal that has not ended this process after some seconds, because the main
             thread does not return to Python. It must end the process. None: no such watchdog.
 
     Attributes:
         signal: The first signal received, except those handled by an `Interruption`; None if there was none.
     """
 
-    def __init__(self, give_up: Callable[[int], None] | None = None) -> None:
+    def __init__(self, should_stop: Callable[[int], None] | None = None) -> None:
         super().__init__()
         self.signal: int | None = None
-        self._give_up = give_up
+        self._should_stop = should_stop
         self._wakeup_sockets: list[socket.socket] = []
         self._wakeup_before = -1
 
     def __enter__(self) -> Self:
         self._install(self._end)
-        if self._give_up is not None and self._before:
+        if self._should_stop is not None and self._before:
             # Python's C-level handler, which runs at once whatever the main thread does, writes the signal's number here.
             reader, writer = socket.socketpair()
             writer.setblocking(False)
             self._wakeup_sockets = [reader, writer]
             self._wakeup_before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-            threading.Thread(target=self._watch, args=(reader, self._give_up), daemon=True).start()
+            threading.Thread(target=self._watch, args=(reader, self._should_stop), daemon=True).start()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -228,17 +228,17 @@ class Ending(_Handlers):
         self.signal = self.signal or number
         _raise(number)
 
-    def _watch(self, reader: socket.socket, give_up: Callable[[int], None]) -> None:
+    def _watch(self, reader: socket.socket, should_stop: Callable[[int], None]) -> None:
         shield_this_thread()
         with reader:
             while received := reader.recv(1):
                 # An `Interruption` has handlers of its own: the code that it guards has no time limit.
                 if received[0] in SIGNALS and signal.getsignal(received[0]) == self._end:
                     time.sleep(_PATIENCE_S)
-                    give_up(received[0])
+                    should_stop(received[0])
 
 
-def heed_parent_only() -> None:
+def obey_parent_only() -> None:
     """Let a child process, in which `SIGNALS` are blocked (`shielded_children`), end only by a SIGTERM of its parent.
 
     If the system does not report the sender of a signal (macOS), any SIGTERM ends it.

@@ -44,7 +44,7 @@ class Trainer:
         resume: Continue the run in ``run_dir``.
         overwrite: Delete the run in ``run_dir`` and start again.
         log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
-        keep_programs: Cache traced programs between processes (`jaxrl_vis.run.compiled.trace_cache`).
+        cache_programs: Cache traced programs between processes (`jaxrl_vis.run.compiled.trace_cache`).
 
     Attributes:
         config: The run.
@@ -62,9 +62,9 @@ class Trainer:
         resume: bool = False,
         overwrite: bool = False,
         log: Sequence[str] | None = None,
-        keep_programs: bool = False,
+        cache_programs: bool = False,
     ):
-        self.config, self.programs = config, Programs(config, program, keep_programs)
+        self.config, self.programs = config, Programs(config, program, cache_programs)
         self.env, self.seeds = self.programs.env, self.programs.seeds
         self.folder = RunFolder(default_folder(config) if run_dir is None else Path(run_dir))
         self._resume, self._overwrite = resume, overwrite
@@ -156,10 +156,10 @@ class Trainer:
             Terminated: A signal other than Ctrl-C, after saving.
             KeyboardInterrupt: Ctrl-C, after saving.
         """
-        loop = RunLoop(self.programs, self.folder, self._log, self._go_on_next_time, callbacks)
+        loop = RunLoop(self.programs, self.folder, self._log, self._allow_resume, callbacks)
         return loop.reports(self._resume, self._overwrite)
 
-    def _go_on_next_time(self) -> None:
+    def _allow_resume(self) -> None:
         """Prepare the next call of `run`, which resumes; after a finished run, it reports that nothing is left to do."""
         self._resume, self._overwrite = True, False
 
@@ -175,7 +175,7 @@ def make_trainer(
     resume: bool = False,
     overwrite: bool = False,
     log: Sequence[str] | None = None,
-    keep_programs: bool = False,
+    cache_programs: bool = False,
     policy_alone: bool = False,
 ) -> Trainer:
     """Build the environment and the programs of a configuration. Nothing is compiled, allocated or written.
@@ -186,7 +186,7 @@ def make_trainer(
         resume: Continue the run in that folder; an empty one starts a new run, with a message.
         overwrite: Delete the run in that folder and start again.
         log: Loggers in addition to metrics.jsonl: ``tensorboard``, ``wandb``. None: those of the resumed run.
-        keep_programs: Cache traced programs between processes. Only for processes that do not modify this package's modules,
+        cache_programs: Cache traced programs between processes. Only for processes that do not modify this package's modules,
             which the cache would not detect (`jaxrl_vis.run.compiled.trace_cache`).
         policy_alone: The learner is only a policy, which cannot be trained (`Algorithm.of_policies`).
 
@@ -207,4 +207,4 @@ def make_trainer(
             check_devices()
         config = locate_env(config)
         program = make_train_step(make_env(config), config, policy_alone=policy_alone)
-    return Trainer(config, program, run_dir, resume, overwrite, log, keep_programs)
+    return Trainer(config, program, run_dir, resume, overwrite, log, cache_programs)

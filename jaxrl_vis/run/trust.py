@@ -21,7 +21,7 @@ from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
-_MOST = 2000  # maximum number of stored runs; the oldest are deleted
+_MAX_RUNS = 2000  # maximum number of stored runs; the oldest are deleted
 _trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 
@@ -57,18 +57,18 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
         make_private(_folder())
         with replacing(_folder() / name, durable=False, mode=0o600) as file:
             file.write(json.dumps(about).encode() + b"\n")
-        for path in sorted(_folder().iterdir(), key=lambda path: path.stat().st_mtime)[:-_MOST]:
+        for path in sorted(_folder().iterdir(), key=lambda path: path.stat().st_mtime)[:-_MAX_RUNS]:
             path.unlink(missing_ok=True)
 
 
-def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True") -> None:
+def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True") -> None:
     """Check that the code of a run may be imported; the permission ``may`` is stored.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
         may: Permission by the user.
-        mend: Hint on how to give the permission, for the message.
+        hint: Hint on how to give the permission, for the message.
 
     Raises:
         RequestError: Permission is missing.
@@ -76,7 +76,7 @@ def check(run_dir: Path, config: Config, may: bool, mend: str = "pass trust=True
     if not is_own(config) or is_trusted(run_dir, config):
         return
     if not may:
-        raise RequestError(f"{question(run_dir, config)}: look at it, and if you trust it, {mend}")
+        raise RequestError(f"{question(run_dir, config)}: look at it, and if you trust it, {hint}")
     trust(run_dir, config)
 
 
@@ -115,7 +115,7 @@ def _names(run_dir: Path, config: Config) -> tuple[str, str]:
     about = [str(run_dir.resolve()), read_run_id(run_dir), *(word for pair in files.items() for word in map(str, pair))]
     paths = {file for file in files.values() if file is not None and not _is_inside(run_dir, file)}
     if any(_is_inside(run_dir, file) for file in files.values()):
-        paths |= set(_modules_in(run_dir))
+        paths |= set(_importable_files(run_dir))
     contents = [[str(path), hashlib.sha256(path.read_bytes()).hexdigest()] for path in sorted(paths) if path.is_file()]
     return _digest(about), _digest([*about, contents])
 
@@ -128,7 +128,7 @@ def _is_inside(run_dir: Path, file: Path | None) -> bool:
     return file is not None and file.is_relative_to(run_dir.resolve())
 
 
-def _modules_in(run_dir: Path) -> list[Path]:
+def _importable_files(run_dir: Path) -> list[Path]:
     """List all files below a run folder that Python could import."""
     suffixes = tuple(importlib.machinery.all_suffixes())
     return sorted(path for path in run_dir.resolve().rglob("*") if path.name.endswith(suffixes) and path.is_file())

@@ -66,7 +66,7 @@ def is_current(path: Path, sources: Any, is_whole: Callable[[dict[str, Any]], bo
 
 def claim(
     out: Path,
-    noun: str,
+    unit: str,
     folders: Iterable[PlotFolder],
     calibrations: Mapping[str, Calibration | None],
     about: Mapping[str, Any],
@@ -79,7 +79,7 @@ def claim(
 
     Args:
         out: The folder; created if missing.
-        noun: Noun for the folders of pairs, in the plural: their key in run.json.
+        unit: Noun for the folders of pairs, in the plural: their key in run.json.
         folders: Folders of pairs.
         calibrations: Calibration of each folder by name; None if there is none.
         about: Everything else that results depend on, as JSON.
@@ -95,7 +95,7 @@ def claim(
         "calibrations": {
             name: None if calibration is None else dataclasses.asdict(calibration) for name, calibration in calibrations.items()
         },
-        noun: {folder.name: str(folder.folder.resolve()) for folder in folders},
+        unit: {folder.name: str(folder.folder.resolve()) for folder in folders},
     }
     request = json.loads(json.dumps(request))
     path = out / "run.json"
@@ -112,11 +112,11 @@ def claim(
     write_atomically(path, json.dumps(request, indent=2) + "\n")
 
 
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+def _differences(recorded: Mapping[str, Any], current: Mapping[str, Any]) -> str:
     """Describe the relevant differences between two requests; empty if there are none."""
     differences = []
-    for name in dict.fromkeys([*now, *before]):
-        old, new = before.get(name), now.get(name)
+    for name in dict.fromkeys([*current, *recorded]):
+        old, new = recorded.get(name), current.get(name)
         if name == "calibrations" and isinstance(old, dict) and isinstance(new, dict):
             # A calibration added later is no conflict: records store theirs and are made again.
             old = {plot: new.get(plot) if calibration is None else calibration for plot, calibration in old.items()}

@@ -72,8 +72,8 @@ def descend(weighting: Weighting) -> Paths:
 
         (last, _), points = jax.lax.scan(step, (start, weighting.init(NAMES, start)), jnp.arange(STEPS))
         points = jnp.concatenate([points, last[None]])
-        found = jax.vmap(losses)(points)
-        return points, jnp.stack([found[name] for name in NAMES], axis=-1)
+        values = jax.vmap(losses)(points)
+        return points, jnp.stack([values[name] for name in NAMES], axis=-1)
 
     return Paths(*map(np.asarray, jax.jit(jax.vmap(path))(jnp.array(STARTS))))
 
@@ -91,8 +91,8 @@ def draw(path: Path) -> None:
         path: Path of the file, .png or any other format that Matplotlib can write.
     """
     figure = Figure(figsize=(12.5, 9.4), dpi=100, facecolor="white")
-    for place, (axes, name) in enumerate(zip(figure.subplots(3, 4).flat, DRAWN, strict=True)):
-        _draw_paths(axes, descend(make_weighting(name)), name, has_labels=place == 0)
+    for index, (axes, name) in enumerate(zip(figure.subplots(3, 4).flat, DRAWN, strict=True)):
+        _draw_paths(axes, descend(make_weighting(name)), name, has_labels=index == 0)
     figure.text(0.03, 0.965, "Gradient descent on two losses", fontsize=14, weight="bold", color=INK, va="center")
     subtitle = "minima at the stars, the second loss's gradients four times as long; the line between them is the Pareto front"
     figure.text(0.03, 0.935, subtitle, fontsize=10, color=FAINT, va="center")

@@ -21,7 +21,7 @@ gradients       `weighted_grad`: weighted gradient of any dictionary of losses
 from jaxrl_vis.weighting.base import MAIN, Direction, Weighting, WeightingState, weighted_sum
 from jaxrl_vis.weighting.constant import balance, cosine, fixed, none, none_log, plain_sum
 from jaxrl_vis.weighting.directions import db_mtl, graddrop, moco
-from jaxrl_vis.weighting.gradients import Way, Weighted, gramian, loss_gradients, measure, weighted_grad
+from jaxrl_vis.weighting.gradients import GradientMode, Weighted, gramian, loss_gradients, measure, weighted_grad
 from jaxrl_vis.weighting.gramian_based import aligned_mtl, cagrad, config, dualproj, fairgrad, imtl_g, mgda, nash_mtl, upgrad
 from jaxrl_vis.weighting.learned import auxinash, gradnorm
 from jaxrl_vis.weighting.limits import limited, with_cosines
@@ -35,7 +35,7 @@ __all__ = [
     "MAIN",
     "WEIGHTINGS",
     "Direction",
-    "Way",
+    "GradientMode",
     "Weighted",
     "Weighting",
     "WeightingState",

@@ -178,8 +178,8 @@ def split_result(result: Any, has_aux: bool) -> tuple[Losses, Any]:
     losses, extra = result if has_aux and is_pair else (result, None)
     if not isinstance(losses, Mapping) or (has_aux and not is_pair):
         wanted = "losses by name, and what is beside them" if has_aux else "a dictionary of losses by name"
-        mend = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
-        raise RequestError(f"losses_fn must return {wanted}, not a {type(result).__name__}{mend}")
+        hint = "" if has_aux or not is_pair else "; has_aux=True takes what is beside them"
+        raise RequestError(f"losses_fn must return {wanted}, not a {type(result).__name__}{hint}")
     for name, loss in losses.items():
         if shape := getattr(loss, "shape", ()):
             raise RequestError(f"loss {name!r} has shape {shape} and must be one number, such as its mean")
@@ -241,12 +241,12 @@ def to_vector(by_name: Mapping[str, jax.Array]) -> jax.Array:
 
 def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
     """Split a vector [K] into scalars by the names of the losses."""
-    return {name: vector[place] for place, name in enumerate(loss_order(names))}
+    return {name: vector[index] for index, name in enumerate(loss_order(names))}
 
 
-def settled(after: WeightingState, before: WeightingState) -> WeightingState:
+def keep_dtypes(updated: WeightingState, previous: WeightingState) -> WeightingState:
     """Cast a state to the dtypes of the previous one, as required for the carry of a scan."""
-    return jax.tree.map(lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype), after, before)
+    return jax.tree.map(lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype), updated, previous)
 
 
 def all_names(weighting: str, names: Iterable[str]) -> tuple[str, ...]:
@@ -331,7 +331,7 @@ def start_alike(label: str, names: Iterable[str], **more: Any) -> WeightingState
     return WeightingState(weights=weights, updates=jnp.zeros((), jnp.int32), **more)
 
 
-def moved(state: WeightingState, weights: Weights, **more: Any) -> tuple[WeightingState, Metrics]:
+def next_state(state: WeightingState, weights: Weights, **more: Any) -> tuple[WeightingState, Metrics]:
     """Return the state after an update, and metrics ``weight/NAME`` of all losses.
 
     Args:
@@ -339,7 +339,7 @@ def moved(state: WeightingState, weights: Weights, **more: Any) -> tuple[Weighti
         weights: Weights of this step; or of the next one, if they do not depend on the gradients that they combine.
         more: New values of other fields.
     """
-    after = settled(state.replace(weights=weights, updates=state.updates + 1, **more), state)
+    after = keep_dtypes(state.replace(weights=weights, updates=state.updates + 1, **more), state)
     return after, {f"weight/{name}": weight for name, weight in after.weights.items()}
 
 

@@ -93,7 +93,7 @@ def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool =
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         if not more.get("main", True):
             ones = start_alike(name, names)
-            return ones.replace(weights={each: jnp.ones_like(share) for each, share in ones.weights.items()})
+            return ones.replace(weights={loss: jnp.ones_like(weight) for loss, weight in ones.weights.items()})
         others = auxiliary_names(name, names, needed=auxiliary)
         if not isinstance(weights, Mapping):
             return start(others, dict.fromkeys(others, weights))

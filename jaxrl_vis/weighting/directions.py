@@ -24,7 +24,7 @@ from jaxrl_vis.weighting.base import (
     by_name,
     checked,
     dot,
-    moved,
+    next_state,
     scaled,
     start_alike,
     to_float32,
@@ -62,30 +62,30 @@ def graddrop(leak: float = 0.0, seed: int = 0) -> Weighting:
         model = next(iter(statistics.values()))
         leaves, structure = jax.tree.flatten(model)
         keys = jax.tree.unflatten(structure, list(jax.random.split(key, len(leaves))))
-        drawn = jax.tree.map(lambda key, leaf: jax.random.uniform(key, leaf.shape, leaf.dtype), keys, model)
-        step = Direction(graddrop_direction(statistics, drawn, leak), state.weights)
-        return step, *moved(state, state.weights)
+        uniform = jax.tree.map(lambda key, leaf: jax.random.uniform(key, leaf.shape, leaf.dtype), keys, model)
+        step = Direction(graddrop_direction(statistics, uniform, leak), state.weights)
+        return step, *next_state(state, state.weights)
 
     return Weighting("graddrop", init, update, needs="gradients", heads="always", main=False, reads_losses=False)
 
 
-def graddrop_direction(gradients: Mapping[str, Params], drawn: Params, leak: float = 0.0) -> Params:
+def graddrop_direction(gradients: Mapping[str, Params], uniform: Params, leak: float = 0.0) -> Params:
     """Compute the direction of `graddrop`: a tree like each gradient.
 
     Args:
         gradients: Trees of the same structure, by name.
-        drawn: Tree of the same structure, samples of the uniform distribution on [0, 1).
+        uniform: Tree of the same structure, samples of the uniform distribution on [0, 1).
         leak: See `graddrop`.
     """
 
-    def masked(drawn: jax.Array, *leaves: jax.Array) -> jax.Array:
+    def masked(uniform: jax.Array, *leaves: jax.Array) -> jax.Array:
         rows = to_float32(jnp.stack(leaves))
         total = jnp.sum(jnp.abs(rows), axis=0)
         purity = 0.5 * (1.0 + jnp.where(total > 0.0, jnp.sum(rows, axis=0) / jnp.where(total > 0.0, total, 1.0), 0.0))
-        kept = jnp.where(purity > drawn, rows > 0.0, rows < 0.0)
-        return jnp.sum((leak + (1.0 - leak) * kept) * rows, axis=0)
+        selected = jnp.where(purity > uniform, rows > 0.0, rows < 0.0)
+        return jnp.sum((leak + (1.0 - leak) * selected) * rows, axis=0)
 
-    return jax.tree.map(masked, drawn, *gradients.values())
+    return jax.tree.map(masked, uniform, *gradients.values())
 
 
 def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: float = 1e-8) -> Weighting:
@@ -122,7 +122,7 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
             name: jnp.where(length > 0.0, longest / jnp.where(length > 0.0, length, 1.0), 0.0)
             for name, length in lengths.items()
         }
-        return Direction(weighted_sum(averages, weights), weights), *moved(state, weights, memory=averages)
+        return Direction(weighted_sum(averages, weights), weights), *next_state(state, weights, memory=averages)
 
     weighting = checked(
         Weighting("db_mtl", init, update, needs="gradients", log=True, eps=eps, main_eps=main_eps, heads="always", main=False)
@@ -161,7 +161,7 @@ def moco(beta: float = 0.5, gamma: float = 0.1, sigma: float = 0.5, rho: float =
         before = to_vector(state.weights)
         slope = jnp.dot(gramian(tracked), before, precision=jax.lax.Precision.HIGHEST) + rho * before
         weights = by_name(state.weights, solvers.to_simplex(before - gamma * decay * slope))
-        return Direction(weighted_sum(tracked, weights), weights), *moved(state, weights, memory=tracked)
+        return Direction(weighted_sum(tracked, weights), weights), *next_state(state, weights, memory=tracked)
 
     return Weighting("moco", init, update, needs="gradients", heads="always", main=False, reads_losses=False)
 

@@ -18,6 +18,7 @@ operations are replaced during tracing.
 """
 
 import contextlib
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -42,7 +43,7 @@ from jaxrl_vis.weighting.base import (
     weighted_sum,
 )
 
-Way = Literal["per_loss", "latents"]
+GradientMode = Literal["per_loss", "latents"]
 LossesFunction = Callable[..., Any]
 Encode = Callable[..., Any] | Mapping[str, Callable[..., Any]]
 Selector = Callable[[Params], Params]
@@ -138,7 +139,7 @@ def weighted_grad(
     losses_fn: LossesFunction,
     weighting: Weighting,
     shared: Selector = everything,
-    way: Way = "per_loss",
+    mode: GradientMode = "per_loss",
     has_aux: bool = False,
     reduce: Callable[[Any], Any] = everything,
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
@@ -153,7 +154,7 @@ def weighted_grad(
         weighting: Weighting, such as from `make_weighting`.
         shared: Function that selects the parameters in which gradients are compared, for instance
             ``lambda params: params["encoder"]``. It must return parts of its argument unmodified.
-        way: Method of computing gradients, see the module docstring.
+        mode: Method of computing gradients, see the module docstring.
         has_aux: See ``losses_fn``.
         reduce: Function applied to losses, gradients and dots before the weighting reads them, for use if each device has its
             own part of the data and the losses are means: ``lambda tree: jax.lax.pmean(tree, axis)``. Inside `jax.shard_map`
@@ -170,12 +171,14 @@ def weighted_grad(
         RequestError: The method is unknown, or does not support the weighting; from the returned function: ``losses_fn`` does
             not return a dictionary of scalars, or the losses are not those with which the state was initialised.
     """
-    if way not in get_args(Way):
-        raise RequestError(f"unknown way to find gradients {way!r}{nearest(way, get_args(Way))}")
-    if way == "latents" and weighting.needs == "gradients":
+    if mode not in get_args(GradientMode):
+        raise RequestError(f"unknown gradient mode {mode!r}{nearest(mode, get_args(GradientMode))}")
+    if mode == "latents" and weighting.needs == "gradients":
         raise RequestError(f"weighting {weighting.name} needs whole gradients, which latents does not find; use per_loss")
-    if way == "latents" and encode is None:
-        raise RequestError("way latents needs to know what the latents are: give encode")
+    if mode == "latents":
+        if encode is None:
+            raise RequestError("mode latents needs to know what the latents are: give encode")
+        return functools.partial(_gradient_by_latents, losses_fn, weighting, shared, has_aux, reduce, forwards, encode)
 
     def encoded_losses(params: Params, *args: Any) -> Any:
         if encode is None:
@@ -185,61 +188,84 @@ def weighted_grad(
             return losses_fn(params, {name: one(picked, *args) for name, one in encode.items()}, *args)
         return losses_fn(params, encode(picked, *args), *args)
 
-    def find_per_loss(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        losses, gradients, extra = loss_gradients(encoded_losses, params, *args, has_aux=has_aux)
-        check_names(losses, state)
-        losses, gradients = reduce((losses, gradients))
-        compared_losses, compared = losses, gradients
-        if weighting.hold is not None:
-            state = weighting.hold(params, state)
-            compared_losses, compared = reduce(loss_gradients(encoded_losses, state.params, *args, has_aux=has_aux)[:2])
-        statistics = measure(weighting, compared_losses, {name: shared(tree) for name, tree in compared.items()})
-        step, state, metrics = weighting.update(compared_losses, statistics, state)
-        weights = step.weights if isinstance(step, Direction) else step
-        combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
-        if weighting.heads == "always":
-            in_heads = weighted_sum(gradients, weighting.coefficients(weighting.head_weights(weights), losses))
-            combined = _replaced(shared, params, combined, in_heads)
-        if isinstance(step, Direction):
-            combined = _replaced(shared, params, _embed(shared, params, step.shared), combined)
-        return Weighted(combined, state, losses, metrics, weights, extra)
-
-    def find_by_latents(params: Params, state: WeightingState, *args: Any) -> Weighted:
-        assert encode is not None
-        through = latents.encode(encode, shared(params), *args)
-        # Trace the losses to find which latents and parameters each of them reads.
-        program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
-        differentiated = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
-        check_names(differentiated.losses, state)
-        losses = reduce(differentiated.losses)
-        statistics = of_main = None
-        if weighting.needs == "dots":
-            of_main = through.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
-            others = {name: at for name, at in differentiated.at_latents.items() if name != MAIN}
-            with forwards():
-                dots = through.dots(reduce(of_main), others)
-            statistics = reduce(dots)
-        elif weighting.needs == "gramian":
-            with forwards():
-                statistics = reduce(through.gramian(differentiated.at_latents, reduce))
-        step, state, metrics = weighting.update(losses, statistics, state)
-        assert not isinstance(step, Direction)  # only weightings that need whole gradients return one
-        weights = step
-        coefficients = weighting.coefficients(weights, losses)
-        rest = coefficients
-        if of_main is not None:
-            rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
-        added = through.backward(differentiated.at_latents, rest)
-        if of_main is not None:  # add the main loss's gradient, which is known already
-            added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
-        in_heads = differentiated.combined(params, weighting.coefficients(weighting.head_weights(weights), losses))
-        combined = jax.tree.map(jnp.add, in_heads, _embed(shared, params, added))
-        return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
-
-    return find_per_loss if way == "per_loss" else find_by_latents
+    return functools.partial(_gradient_per_loss, encoded_losses, weighting, shared, has_aux, reduce)
 
 
-def _replaced(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
+def _gradient_per_loss(
+    losses_fn: LossesFunction,
+    weighting: Weighting,
+    shared: Selector,
+    has_aux: bool,
+    reduce: Callable[[Any], Any],
+    params: Params,
+    state: WeightingState,
+    *args: Any,
+) -> Weighted:
+    """Compute the weighted gradient from the whole gradient of each loss; arguments as for `weighted_grad`."""
+    losses, gradients, extra = loss_gradients(losses_fn, params, *args, has_aux=has_aux)
+    check_names(losses, state)
+    losses, gradients = reduce((losses, gradients))
+    compared_losses, compared = losses, gradients
+    if weighting.hold is not None:
+        state = weighting.hold(params, state)
+        compared_losses, compared = reduce(loss_gradients(losses_fn, state.params, *args, has_aux=has_aux)[:2])
+    statistics = measure(weighting, compared_losses, {name: shared(tree) for name, tree in compared.items()})
+    step, state, metrics = weighting.update(compared_losses, statistics, state)
+    weights = step.weights if isinstance(step, Direction) else step
+    combined = weighted_sum(gradients, weighting.coefficients(weights, losses))
+    if weighting.heads == "always":
+        in_heads = weighted_sum(gradients, weighting.coefficients(weighting.head_weights(weights), losses))
+        combined = _replace_subtree(shared, params, combined, in_heads)
+    if isinstance(step, Direction):
+        combined = _replace_subtree(shared, params, _embed(shared, params, step.shared), combined)
+    return Weighted(combined, state, losses, metrics, weights, extra)
+
+
+def _gradient_by_latents(
+    losses_fn: LossesFunction,
+    weighting: Weighting,
+    shared: Selector,
+    has_aux: bool,
+    reduce: Callable[[Any], Any],
+    forwards: Callable[[], contextlib.AbstractContextManager],
+    encode: Encode,
+    params: Params,
+    state: WeightingState,
+    *args: Any,
+) -> Weighted:
+    """Compute the weighted gradient with one pass through the shared parameters; arguments as for `weighted_grad`."""
+    through = latents.encode(encode, shared(params), *args)
+    # Trace the losses to find which latents and parameters each of them reads.
+    program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
+    differentiated = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
+    check_names(differentiated.losses, state)
+    losses = reduce(differentiated.losses)
+    statistics = of_main = None
+    if weighting.needs == "dots":
+        of_main = through.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
+        others = {name: at for name, at in differentiated.at_latents.items() if name != MAIN}
+        with forwards():
+            dots = through.dots(reduce(of_main), others)
+        statistics = reduce(dots)
+    elif weighting.needs == "gramian":
+        with forwards():
+            statistics = reduce(through.gramian(differentiated.at_latents, reduce))
+    step, state, metrics = weighting.update(losses, statistics, state)
+    assert not isinstance(step, Direction)  # only weightings that need whole gradients return one
+    weights = step
+    coefficients = weighting.coefficients(weights, losses)
+    rest = coefficients
+    if of_main is not None:
+        rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
+    added = through.backward(differentiated.at_latents, rest)
+    if of_main is not None:  # add the main loss's gradient, which is known already
+        added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
+    in_heads = differentiated.combine_heads(params, weighting.coefficients(weighting.head_weights(weights), losses))
+    combined = jax.tree.map(jnp.add, in_heads, _embed(shared, params, added))
+    return Weighted(reduce(combined), state, losses, metrics, weights, differentiated.extra)
+
+
+def _replace_subtree(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
     """Merge two trees like the parameters: shared parameters from ``inside``, all others from ``outside``."""
     is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(outside)))
     return jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, inside, outside)

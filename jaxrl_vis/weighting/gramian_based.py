@@ -24,7 +24,7 @@ from jaxrl_vis.weighting.base import (
     Weights,
     by_name,
     checked,
-    moved,
+    next_state,
     start_alike,
     to_vector,
 )
@@ -78,7 +78,7 @@ def of_gramian(
         slopes = to_vector(weighting.slopes(losses))
         vector, remembered = solve(slopes[:, None] * statistics * slopes[None, :] if log else statistics, state)
         weights = by_name(losses, vector)
-        return weights, *moved(state, weights, memory=remembered)
+        return weights, *next_state(state, weights, memory=remembered)
 
     weighting = checked(
         Weighting(
@@ -127,8 +127,8 @@ def upgrad(**options: Unpack[Options]) -> Weighting:
     """
 
     def weights(gramian: jax.Array) -> jax.Array:
-        each = jnp.eye(len(gramian), dtype=gramian.dtype) / len(gramian)
-        return jnp.sum(jax.vmap(lambda one: solvers.dual_cone(gramian, one))(each), axis=0)
+        preferences = jnp.eye(len(gramian), dtype=gramian.dtype) / len(gramian)
+        return jnp.sum(jax.vmap(lambda one: solvers.dual_cone(gramian, one))(preferences), axis=0)
 
     return of_gramian("upgrad", _plain(weights), **options)
 
@@ -223,11 +223,11 @@ def nash_mtl(max_norm: float | None = None, **options: Unpack[Options]) -> Weigh
         raise RequestError(f"max_norm of weighting nash_mtl must be greater than 0, not {max_norm}")
 
     def weights(gramian: jax.Array) -> jax.Array:
-        found = solvers.bargain(gramian, jnp.ones(len(gramian), gramian.dtype))
+        solution = solvers.bargain(gramian, jnp.ones(len(gramian), gramian.dtype))
         if max_norm is None:
-            return found
-        length = jnp.sqrt(jnp.maximum(solvers.quadratic(gramian, found), 0.0))
-        return found * jnp.minimum(1.0, max_norm / jnp.where(length > 0.0, length, max_norm))
+            return solution
+        length = jnp.sqrt(jnp.maximum(solvers.quadratic(gramian, solution), 0.0))
+        return solution * jnp.minimum(1.0, max_norm / jnp.where(length > 0.0, length, max_norm))
 
     return of_gramian("nash_mtl", _plain(weights), **options)
 
@@ -270,11 +270,11 @@ def aligned_mtl(**options: Unpack[Options]) -> Weighting:
         values, vectors = jnp.linalg.eigh(gramian)
         some = values > count * jnp.finfo(gramian.dtype).eps * jnp.max(values)
         inverse = jnp.where(some, 1.0 / jnp.sqrt(jnp.where(some, values, 1.0)), 0.0)
-        least = jnp.sqrt(jnp.min(jnp.where(some, values, jnp.inf)))
+        smallest = jnp.sqrt(jnp.min(jnp.where(some, values, jnp.inf)))
         mean = jnp.full(count, 1.0 / count, gramian.dtype)
         components = jnp.dot(vectors.T, mean, precision=jax.lax.Precision.HIGHEST)
-        found = jnp.dot(vectors, inverse * components, precision=jax.lax.Precision.HIGHEST)
-        return jnp.where(jnp.any(some), jnp.where(jnp.isfinite(least), least, 0.0) * found, mean)
+        combination = jnp.dot(vectors, inverse * components, precision=jax.lax.Precision.HIGHEST)
+        return jnp.where(jnp.any(some), jnp.where(jnp.isfinite(smallest), smallest, 0.0) * combination, mean)
 
     return of_gramian("aligned_mtl", _plain(weights), **options)
 

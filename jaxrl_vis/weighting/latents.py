@@ -37,14 +37,14 @@ class Through:
         latents: Latents by group.
         pullbacks: By group, function from a gradient in its latents to the gradient in the shared parameters.
         functions: By group, function from the shared parameters to its latents.
-        picked: Shared parameters.
+        encoder_params: Shared parameters.
         has_names: Whether losses take a dictionary of groups rather than a single one.
     """
 
     latents: dict[str, Any]
     pullbacks: dict[str, Callable[[Any], tuple[Params]]]
     functions: Mapping[str, Callable[[Params], Any]]
-    picked: Params
+    encoder_params: Params
     has_names: bool
 
     @property
@@ -54,7 +54,9 @@ class Through:
 
     def backward(self, at_latents: AtLatents, coefficients: Mapping[str, jax.Array]) -> Params:
         """Compute the gradient of a weighted sum of losses in the shared parameters, float32."""
-        total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32)), self.picked)
+        total = jax.tree.map(
+            lambda leaf: jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32)), self.encoder_params
+        )
         for group, pullback in self.pullbacks.items():
             readers = {name: at[group] for name, at in at_latents.items() if name in coefficients and group in at}
             if readers:
@@ -64,9 +66,11 @@ class Through:
 
     def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
         """Compute the inner products of the losses' gradients with a direction in the shared parameters, [] float32 by name."""
-        along, read = like(direction, self.picked), {group for at in at_latents.values() for group in at}
+        along, read = like(direction, self.encoder_params), {group for at in at_latents.values() for group in at}
         tangents = {
-            group: jax.jvp(encode, (self.picked,), (along,))[1] for group, encode in self.functions.items() if group in read
+            group: jax.jvp(encode, (self.encoder_params,), (along,))[1]
+            for group, encode in self.functions.items()
+            if group in read
         }
         return {
             name: sum((dot(tangents[group], gradient) for group, gradient in at.items()), jnp.zeros(()))
@@ -96,20 +100,22 @@ class Through:
         return 0.5 * (matrix + matrix.T)
 
 
-def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], picked: Params, *args: Any) -> Through:
+def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], encoder_params: Params, *args: Any) -> Through:
     """Compute latents and their pullbacks to the shared parameters.
 
     Args:
         functions: ``encode`` of `gradients.weighted_grad`.
-        picked: Shared parameters.
+        encoder_params: Shared parameters.
         *args: Further arguments of ``functions``.
     """
     has_names = isinstance(functions, Mapping)
     named = functions if isinstance(functions, Mapping) else {_ALL: functions}
-    of_picked = {group: (lambda picked, encode=encode: encode(picked, *args)) for group, encode in named.items()}
-    passes = {group: jax.vjp(function, picked) for group, function in of_picked.items()}
+    of_picked = {
+        group: (lambda encoder_params, encode=encode: encode(encoder_params, *args)) for group, encode in named.items()
+    }
+    passes = {group: jax.vjp(function, encoder_params) for group, function in of_picked.items()}
     latents = {group: values for group, (values, _) in passes.items()}
-    return Through(latents, {group: back for group, (_, back) in passes.items()}, of_picked, picked, has_names)
+    return Through(latents, {group: back for group, (_, back) in passes.items()}, of_picked, encoder_params, has_names)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +134,7 @@ class Differentiated:
     at_latents: AtLatents
     extra: Any
 
-    def combined(self, params: Params, coefficients: Mapping[str, jax.Array]) -> Params:
+    def combine_heads(self, params: Params, coefficients: Mapping[str, jax.Array]) -> Params:
         """Sum the weighted gradients with respect to the parameters, except for the paths through latents: float32."""
         leaves, structure = jax.tree.flatten(params)
 
@@ -168,9 +174,9 @@ def differentiate(
 
         # Differentiate each loss separately, so that the compiler can remove the computation of all others as dead code.
         chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
-        losses[name], pullback, beside = jax.vjp(one, chosen, read, has_aux=True)
+        losses[name], pullback, aux = jax.vjp(one, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
-        extra = beside if name == MAIN or MAIN not in reads else extra
+        extra = aux if name == MAIN or MAIN not in reads else extra
     return Differentiated(losses, of_params, at_latents, extra)
 
 
@@ -190,6 +196,6 @@ def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, throug
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):
                 needed.update(variable for variable in equation.invars if not isinstance(variable, Literal))
-        places = [place for place, variable in enumerate(of_leaf) if variable in needed]
+        places = [index for index, variable in enumerate(of_leaf) if variable in needed]
         reads[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
     return reads

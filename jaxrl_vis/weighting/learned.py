@@ -19,13 +19,13 @@ from jaxrl_vis.weighting.base import (
     auxiliary_names,
     by_name,
     loss_order,
-    moved,
+    next_state,
     start_alike,
     to_vector,
 )
 from jaxrl_vis.weighting.gramian_based import Options, of_gramian
 
-_LEAST_SHARE = 1e-4  # minimum weight of GradNorm before rescaling to mean 1: its rule may overshoot 0
+_MIN_FRACTION = 1e-4  # minimum weight of GradNorm before rescaling to mean 1: its rule may overshoot 0
 
 
 def gradnorm(alpha: float = 1.5, learning_rate: float = 0.025, heads: Heads = "weighted") -> Weighting:
@@ -59,9 +59,9 @@ def gradnorm(alpha: float = 1.5, learning_rate: float = 0.025, heads: Heads = "w
         slope = jnp.sign(weights * lengths - jnp.mean(weights * lengths) * relative**alpha) * lengths
         changes, rule_state = rule.update(slope.astype(weights.dtype), state.memory["rule"])
         stepped: Any = optax.apply_updates(weights, changes)
-        after = jnp.maximum(stepped, _LEAST_SHARE)
+        after = jnp.maximum(stepped, _MIN_FRACTION)
         after = after * (len(losses) / jnp.sum(after))
-        later, _ = moved(state, by_name(losses, after), memory={"first": first, "rule": rule_state})
+        later, _ = next_state(state, by_name(losses, after), memory={"first": first, "rule": rule_state})
         return state.weights, later, {f"weight/{name}": weight for name, weight in state.weights.items()}
 
     return Weighting("gradnorm", init, update, needs="gramian", heads=heads, main=False)
@@ -88,9 +88,9 @@ def auxinash(learning_rate: float = 0.01, **options: Unpack[Options]) -> Weighti
     def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, Any]:
         logits, main = state.memory["logits"], loss_order(state.weights).index(MAIN)
         count = len(gramian)
-        shares, pullback = jax.vjp(lambda logits: count * jax.nn.softmax(logits), logits)
-        weights = solvers.bargain(gramian, shares)
-        (gradient,) = pullback(preference_slope(gramian, shares, weights, main).astype(logits.dtype))
+        preferences, pullback = jax.vjp(lambda logits: count * jax.nn.softmax(logits), logits)
+        weights = solvers.bargain(gramian, preferences)
+        (gradient,) = pullback(preference_slope(gramian, preferences, weights, main).astype(logits.dtype))
         changes, rule_state = rule.update(gradient, state.memory["rule"])
         return weights, {"logits": optax.apply_updates(logits, changes), "rule": rule_state}
 
@@ -104,14 +104,14 @@ def auxinash(learning_rate: float = 0.01, **options: Unpack[Options]) -> Weighti
     return weighting._replace(init=init)
 
 
-def preference_slope(gramian: jax.Array, shares: jax.Array, weights: jax.Array, main: int) -> jax.Array:
+def preference_slope(gramian: jax.Array, preferences: jax.Array, weights: jax.Array, main: int) -> jax.Array:
     """Compute the derivative of the main loss with respect to the preferences, per unit of step size and of 1 / a_main: [K].
 
     Args:
         gramian: [K, K] float.
-        shares: [K] float, p.
+        preferences: [K] float, p.
         weights: [K] float, a, with G a = p / a.
         main: Index of the main loss.
     """
     scaled = weights[:, None] * gramian * weights[None, :]
-    return -jnp.linalg.solve(scaled + jnp.diag(shares), scaled[main])
+    return -jnp.linalg.solve(scaled + jnp.diag(preferences), scaled[main])

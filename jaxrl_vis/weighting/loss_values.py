@@ -20,12 +20,12 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     by_name,
-    moved,
+    next_state,
     start_alike,
     to_vector,
 )
 
-_LARGEST = 1e6  # bound of ratios and slopes, so that sums of squares do not overflow
+_MAX_VALUE = 1e6  # bound of ratios and slopes, so that sums of squares do not overflow
 Result = tuple[Weights | Direction, WeightingState, Metrics]
 
 
@@ -37,7 +37,7 @@ def uniform() -> Weighting:
     """
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
-        return state.weights, *moved(state, state.weights)
+        return state.weights, *next_state(state, state.weights)
 
     return Weighting("uniform", _begin("uniform"), update, main=False, reads_losses=False)
 
@@ -58,14 +58,14 @@ def random(seed: int = 0) -> Weighting:
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         drawn = jax.random.normal(jax.random.fold_in(state.key, state.updates), (len(losses),))
         weights = by_name(losses, random_weights(drawn))
-        return weights, *moved(state, weights)
+        return weights, *next_state(state, weights)
 
     return Weighting("random", init, update, main=False, reads_losses=False)
 
 
-def random_weights(drawn: jax.Array) -> jax.Array:
+def random_weights(normal: jax.Array) -> jax.Array:
     """Compute the weights of `random`, [K], from K standard normal samples."""
-    return jax.nn.softmax(drawn)
+    return jax.nn.softmax(normal)
 
 
 def uncertainty(learning_rate: float = 1e-2) -> Weighting:
@@ -108,7 +108,7 @@ def geometric_mean(eps: float = 1e-8) -> Weighting:
         values = jnp.maximum(to_vector(losses), 0.0) + eps
         mean = jnp.exp(jnp.mean(jnp.log(values)))
         weights = by_name(losses, mean / (len(losses) * values))
-        return weights, *moved(state, weights)
+        return weights, *next_state(state, weights)
 
     return Weighting("geometric_mean", _begin("geometric_mean"), update, main=False)
 
@@ -133,7 +133,7 @@ def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weigh
         values = to_vector({name: loss - (reference or {}).get(name, 0.0) for name, loss in losses.items()})
         # Subtract the maximum before dividing: with a fused multiply-add, 1e15 / mu minus itself may be -3e7.
         weights = by_name(losses, jax.nn.softmax((values - jnp.max(values)) / (count * mu)) / count)
-        return weights, *moved(state, weights)
+        return weights, *next_state(state, weights)
 
     return Weighting("stch", _begin("stch"), update, main=False)
 
@@ -166,11 +166,11 @@ def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
         is_last = (state.updates + 1) % epoch == 0
         mean = total / epoch
         rate = jnp.where(last == 0.0, 1.0, mean / jnp.where(last == 0.0, 1.0, last))
-        later = jax.nn.softmax(jnp.clip(rate, -_LARGEST, _LARGEST) / temperature) * len(losses)
+        later = jax.nn.softmax(jnp.clip(rate, -_MAX_VALUE, _MAX_VALUE) / temperature) * len(losses)
         later = jnp.where(state.updates < epoch, 1.0, later)  # there is no ratio after the first epoch
         before = to_vector(state.weights)
         memory = {"sum": jnp.where(is_last, 0.0, total), "last": jnp.where(is_last, mean, last)}
-        after, _ = moved(state, by_name(losses, jnp.where(is_last, later, before)), memory=memory)
+        after, _ = next_state(state, by_name(losses, jnp.where(is_last, later, before)), memory=memory)
         return state.weights, after, {f"weight/{name}": weight for name, weight in state.weights.items()}
 
     return Weighting("dwa", init, update, main=False)
@@ -208,12 +208,12 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         (gradient,) = pullback((memory["logs"] - jnp.log(above)).astype(memory["logits"].dtype))
         changes, rule_state = rule.update(gradient, memory["rule"], memory["logits"])
         learned = {"logits": optax.apply_updates(memory["logits"], changes), "rule": rule_state}
-        kept = {name: memory[name] for name in learned}
+        previous = {name: memory[name] for name in learned}
         # There are no losses before the first ones.
-        now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, kept)
-        shares = jax.nn.softmax(now["logits"]) / above
-        weights = by_name(losses, shares / jnp.sum(shares))
-        return weights, *moved(state, weights, memory={**now, "logs": jnp.log(above)})
+        now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, previous)
+        ratios = jax.nn.softmax(now["logits"]) / above
+        weights = by_name(losses, ratios / jnp.sum(ratios))
+        return weights, *next_state(state, weights, memory={**now, "logs": jnp.log(above)})
 
     return Weighting("famo", init, update, main=False)
 
@@ -250,10 +250,10 @@ def _learned(
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         scales = state.memory["scales"]
-        gradient = jnp.clip(slope(scales, to_vector(losses)), -_LARGEST, _LARGEST).astype(scales.dtype)
+        gradient = jnp.clip(slope(scales, to_vector(losses)), -_MAX_VALUE, _MAX_VALUE).astype(scales.dtype)
         changes, rule_state = rule.update(gradient, state.memory["rule"])
         scales: Any = optax.apply_updates(scales, changes)
-        after, _ = moved(state, by_name(losses, to_weights(scales)), memory={"scales": scales, "rule": rule_state})
+        after, _ = next_state(state, by_name(losses, to_weights(scales)), memory={"scales": scales, "rule": rule_state})
         return state.weights, after, {f"weight/{name}": weight for name, weight in state.weights.items()}
 
     return Weighting(label, init, update, main=False)

@@ -82,8 +82,8 @@ def make_weighting(name: str, **options: Any) -> Weighting:
     allowed = _parameters(maker)
     for option in options:
         if option not in allowed:
-            mend = nearest(option, allowed) if allowed else "; it has none"
-            raise RequestError(f"weighting {name} has no option {option!r}{mend}")
+            hint = nearest(option, allowed) if allowed else "; it has none"
+            raise RequestError(f"weighting {name} has no option {option!r}{hint}")
     return maker(**options)
 
 

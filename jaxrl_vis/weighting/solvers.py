@@ -24,22 +24,22 @@ _NEWTON_STEPS = 60
 _HALVINGS = 16
 
 
-def unit_gramian(gramian: jax.Array, least: float | None = None) -> tuple[jax.Array, jax.Array]:
+def unit_gramian(gramian: jax.Array, min_length: float | None = None) -> tuple[jax.Array, jax.Array]:
     """Scale gradients to unit norm.
 
     Args:
         gramian: [K, K] float.
-        least: Minimum norm by which gradients are divided, relative to the largest norm; None for the machine epsilon.
+        min_length: Minimum norm by which gradients are divided, relative to the largest norm; None for the machine epsilon.
 
     Returns:
         [K, K] Gramian of the scaled gradients; [K] norms of the gradients relative to the largest norm, and not less than
-        ``least``. If all gradients vanish, the Gramian is 0 and every norm is ``least``.
+        ``min_length``. If all gradients vanish, the Gramian is 0 and every norm is ``min_length``.
     """
     eps = jnp.finfo(gramian.dtype).eps
     lengths = jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
     greatest = jnp.max(lengths)
     greatest = jnp.where(greatest > 0.0, greatest, 1.0)
-    relative = jnp.maximum(lengths / greatest, eps if least is None else least)
+    relative = jnp.maximum(lengths / greatest, eps if min_length is None else min_length)
     # Divide by one factor at a time: the product of two small norms might underflow.
     return gramian / greatest / greatest / relative[:, None] / relative[None, :], relative
 
@@ -91,22 +91,22 @@ def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.A
         rounding = 10.0 * eps * (jnp.dot(jnp.abs(matrix), jnp.abs(x)) + jnp.abs(target))
         return x, jnp.where(free, x < -10.0 * eps * jnp.max(jnp.abs(x)), slack < -rounding)
 
-    def step(now: _Pivots) -> _Pivots:
-        number = jnp.sum(now.wrong, dtype=jnp.int32)
-        progress = number < now.fewest
-        last = jnp.arange(count) == jnp.max(jnp.where(now.wrong, jnp.arange(count), -1))
-        exchanged = jnp.where(progress | (now.patience > 0), now.wrong, last)
-        patience = jnp.where(progress, _PATIENCE, jnp.maximum(now.patience - 1, 0))
-        free = now.free ^ exchanged
-        return _Pivots(free, *solve(free), jnp.minimum(number, now.fewest), patience, now.steps + 1)
+    def step(state: _Pivots) -> _Pivots:
+        number = jnp.sum(state.wrong, dtype=jnp.int32)
+        progress = number < state.fewest
+        last = jnp.arange(count) == jnp.max(jnp.where(state.wrong, jnp.arange(count), -1))
+        exchanged = jnp.where(progress | (state.patience > 0), state.wrong, last)
+        patience = jnp.where(progress, _PATIENCE, jnp.maximum(state.patience - 1, 0))
+        free = state.free ^ exchanged
+        return _Pivots(free, *solve(free), jnp.minimum(number, state.fewest), patience, state.steps + 1)
 
     first = _Pivots(free, *solve(free), jnp.int32(count + 1), jnp.int32(_PATIENCE), jnp.int32(0))
-    last = jax.lax.while_loop(lambda now: jnp.any(now.wrong) & (now.steps < _PIVOTS), step, first)
+    last = jax.lax.while_loop(lambda state: jnp.any(state.wrong) & (state.steps < _PIVOTS), step, first)
     return jnp.maximum(last.solution, 0.0), last.free
 
 
 def min_norm(
-    gramian: jax.Array, free: jax.Array | None = None, passes: int = 3, least: float | None = None
+    gramian: jax.Array, free: jax.Array | None = None, passes: int = 3, min_length: float | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Compute the weights w >= 0, of sum 1, that minimise w^T G w.
 
@@ -116,12 +116,12 @@ def min_norm(
     Args:
         gramian: [K, K] float, positive semidefinite.
         free, passes: See `nonnegative`.
-        least: See `unit_gramian`.
+        min_length: See `unit_gramian`.
 
     Returns:
         [K] float, w; [K] bool, as in `nonnegative`.
     """
-    unit, lengths = unit_gramian(gramian, least)
+    unit, lengths = unit_gramian(gramian, min_length)
     per_length = jnp.min(lengths) / lengths
     x, free = nonnegative(unit + per_length[:, None] * per_length[None, :], per_length, free, passes)
     weights = per_length * x
@@ -151,7 +151,7 @@ class _Bracket(NamedTuple):
     high: jax.Array  # [] t with |g_w(t)| <= t
     at_low: jax.Array  # [] |g_w(t)| - t at low, halved if this end was kept twice
     at_high: jax.Array  # [] likewise at high
-    kept: jax.Array  # [] int32, end kept by the last step: -1 low, 1 high
+    kept_end: jax.Array  # [] int32, end kept by the last step: -1 low, 1 high
     free: jax.Array  # [K] bool
     error: jax.Array  # [] |g_w(t)| - t at the latest t
     steps: jax.Array
@@ -179,27 +179,27 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     ball = jnp.maximum(radius * jnp.sqrt(squared), eps)
 
     def evaluate(t: jax.Array, free: jax.Array, passes: int = 1) -> tuple[jax.Array, jax.Array, jax.Array]:
-        share = t / ball
-        shifted = scaled + share * (to_mean[:, None] + to_mean[None, :]) + share**2 * squared
+        fraction = t / ball
+        shifted = scaled + fraction * (to_mean[:, None] + to_mean[None, :]) + fraction**2 * squared
         # Only the rounding errors of these sums would be left of a gradient that is shifted close to 0. This minimum norm
         # keeps them below the ridge that `nonnegative` adds.
-        weights, free = min_norm(shifted, free, passes, least=float(eps) ** (1 / 6))
+        weights, free = min_norm(shifted, free, passes, min_length=float(eps) ** (1 / 6))
         return weights, jnp.sqrt(jnp.maximum(quadratic(scaled, weights), 0.0)), free
 
-    def step(now: _Bracket) -> _Bracket:
-        t = (now.low * now.at_high - now.high * now.at_low) / (now.at_high - now.at_low)
-        t = jnp.where((t > now.low) & (t < now.high), t, 0.5 * (now.low + now.high))
-        _, length, free = evaluate(t, now.free)
+    def step(state: _Bracket) -> _Bracket:
+        t = (state.low * state.at_high - state.high * state.at_low) / (state.at_high - state.at_low)
+        t = jnp.where((t > state.low) & (t < state.high), t, 0.5 * (state.low + state.high))
+        _, length, free = evaluate(t, state.free)
         above = length > t
         error = length - t
-        at_low = jnp.where(above, error, jnp.where(now.kept == -1, 0.5 * now.at_low, now.at_low))
-        at_high = jnp.where(above, jnp.where(now.kept == 1, 0.5 * now.at_high, now.at_high), error)
-        low, high = jnp.where(above, t, now.low), jnp.where(above, now.high, t)
-        return _Bracket(low, high, at_low, at_high, jnp.where(above, 1, -1).astype(jnp.int32), free, error, now.steps + 1)
+        at_low = jnp.where(above, error, jnp.where(state.kept_end == -1, 0.5 * state.at_low, state.at_low))
+        at_high = jnp.where(above, jnp.where(state.kept_end == 1, 0.5 * state.at_high, state.at_high), error)
+        low, high = jnp.where(above, t, state.low), jnp.where(above, state.high, t)
+        return _Bracket(low, high, at_low, at_high, jnp.where(above, 1, -1).astype(jnp.int32), free, error, state.steps + 1)
 
-    def is_open(now: _Bracket) -> jax.Array:
-        wide = now.high - now.low > 4.0 * eps * now.high
-        return wide & (jnp.abs(now.error) > 4.0 * eps * now.high) & (now.steps < _ROOT_STEPS)
+    def is_open(state: _Bracket) -> jax.Array:
+        wide = state.high - state.low > 4.0 * eps * state.high
+        return wide & (jnp.abs(state.error) > 4.0 * eps * state.high) & (state.steps < _ROOT_STEPS)
 
     zero, one = jnp.zeros((), scaled.dtype), jnp.ones((), scaled.dtype)
     _, at_one, free = evaluate(one, jnp.zeros(len(gramian), bool))
@@ -207,7 +207,7 @@ def conflict_averse(gramian: jax.Array, radius: float) -> tuple[jax.Array, jax.A
     first = _Bracket(zero, one, one, jnp.minimum(at_one - one, -eps), jnp.int32(0), free, one, jnp.int32(0))
     last = jax.lax.while_loop(is_open, step, first)
     # The last error is that of the end that moved last.
-    weights, length, _ = evaluate(jnp.where(last.kept == 1, last.low, last.high), last.free, passes=3)
+    weights, length, _ = evaluate(jnp.where(last.kept_end == 1, last.low, last.high), last.free, passes=3)
     return weights, length
 
 
@@ -235,34 +235,34 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
     unit = unit + len(unit) * eps * jnp.eye(len(unit), dtype=unit.dtype)  # keeps the solution finite
     greatest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(gramian)), 0.0))
     lengths = relative * jnp.where(greatest > 0.0, greatest, 1.0)
-    # With a = x scale / lengths, the equation is unit x = shares x^(-power), where the maximum of shares is 1.
+    # With a = x scale / lengths, the equation is unit x = ratios x^(-power), where the maximum of ratios is 1.
     wanted = preferences * lengths ** (power - 1.0)
     scale = jnp.max(wanted) ** (1.0 / (1.0 + power))
-    shares = wanted / jnp.max(wanted)
+    ratios = wanted / jnp.max(wanted)
 
     def objective(x: jax.Array) -> jax.Array:
         utility = jnp.log(x) if power == 1.0 else x ** (1.0 - power) / (1.0 - power)
-        return 0.5 * quadratic(unit, x) - jnp.sum(shares * utility)
+        return 0.5 * quadratic(unit, x) - jnp.sum(ratios * utility)
 
-    def step(now: _Newton) -> _Newton:
-        pull = shares * now.x**-power
-        slope = jnp.dot(unit, now.x, precision=jax.lax.Precision.HIGHEST) - pull
-        hessian = unit + jnp.diag(power * pull / now.x)
+    def step(state: _Newton) -> _Newton:
+        pull = ratios * state.x**-power
+        slope = jnp.dot(unit, state.x, precision=jax.lax.Precision.HIGHEST) - pull
+        hessian = unit + jnp.diag(power * pull / state.x)
         change = -jnp.linalg.solve(hessian, slope)
         decrement = -jnp.dot(slope, change)
         # Up to 0.99 of the way to the nearest x_i = 0.
-        farthest = jnp.minimum(1.0, 0.99 / jnp.maximum(jnp.max(-change / now.x), eps))
-        lengths = farthest * 0.5 ** jnp.arange(_HALVINGS, dtype=now.x.dtype)
-        values = jax.vmap(lambda length: objective(now.x + length * change))(lengths)
+        farthest = jnp.minimum(1.0, 0.99 / jnp.maximum(jnp.max(-change / state.x), eps))
+        lengths = farthest * 0.5 ** jnp.arange(_HALVINGS, dtype=state.x.dtype)
+        values = jax.vmap(lambda length: objective(state.x + length * change))(lengths)
         # Close to the minimum, the objective no longer distinguishes steps, and full ones converge quadratically.
         length = jnp.where(decrement < 1e-2, farthest, lengths[jnp.argmin(values)])
-        x = now.x + length * change
-        pull = shares * x**-power
+        x = state.x + length * change
+        pull = ratios * x**-power
         slope = jnp.dot(unit, x, precision=jax.lax.Precision.HIGHEST) - pull
-        return _Newton(x, jnp.max(jnp.abs(slope) / pull), now.steps + 1)
+        return _Newton(x, jnp.max(jnp.abs(slope) / pull), state.steps + 1)
 
-    first = _Newton(shares ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
-    last = jax.lax.while_loop(lambda now: (now.residual > 20.0 * eps) & (now.steps < _NEWTON_STEPS), step, first)
+    first = _Newton(ratios ** (1.0 / (1.0 + power)), jnp.full((), jnp.inf, unit.dtype), jnp.int32(0))
+    last = jax.lax.while_loop(lambda state: (state.residual > 20.0 * eps) & (state.steps < _NEWTON_STEPS), step, first)
     return last.x * scale / lengths
 
 

@@ -25,7 +25,7 @@ def pcgrad(seed: int = 0, **options: Unpack[Options]) -> Weighting:
     """
 
     def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, None]:
-        return pcgrad_weights(gramian, _orders(state, len(gramian))), None
+        return pcgrad_weights(gramian, _random_orders(state, len(gramian))), None
 
     return of_gramian("pcgrad", solve, seed=seed, **options)
 
@@ -39,8 +39,8 @@ def pcgrad_weights(gramian: jax.Array, orders: jax.Array) -> jax.Array:
     """
     rows, squares = jnp.arange(len(gramian)), jnp.diagonal(gramian)
     changed = jnp.eye(len(gramian), dtype=gramian.dtype)  # row i: modified g_i as a combination of the gradients
-    for place in range(len(gramian)):
-        others = orders[:, place]
+    for index in range(len(gramian)):
+        others = orders[:, index]
         dots = jnp.sum(gramian[others] * changed, axis=1)
         opposes = (dots < 0.0) & (others != rows) & (squares[others] > 0.0)
         removed = jnp.where(opposes, dots / jnp.where(opposes, squares[others], 1.0), 0.0)
@@ -67,24 +67,26 @@ def gradvac(beta: float = 0.01, seed: int = 0, **options: Unpack[Options]) -> We
         raise RequestError(f"beta of weighting gradvac must be between 0 and 1, not {beta}")
 
     def solve(gramian: jax.Array, state: WeightingState) -> tuple[jax.Array, jax.Array]:
-        return gradvac_weights(gramian, state.memory, _orders(state, len(gramian)), beta)
+        return gradvac_weights(gramian, state.memory, _random_orders(state, len(gramian)), beta)
 
     return of_gramian("gradvac", solve, memory=lambda count, dtype: jnp.zeros((count, count), dtype), seed=seed, **options)
 
 
-def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, beta: float) -> tuple[jax.Array, jax.Array]:
+def gradvac_weights(
+    gramian: jax.Array, target_cosines: jax.Array, orders: jax.Array, beta: float
+) -> tuple[jax.Array, jax.Array]:
     """Compute the weights of `gradvac`, [K], and the updated running means of cosines, [K, K].
 
     Args:
         gramian: [K, K] float.
-        usual: [K, K] float, running means of the cosines between modified gradients (rows) and original ones (columns).
+        target_cosines: [K, K] float, running means of the cosines of modified gradients (rows) and original ones (columns).
         orders: See `pcgrad_weights`.
         beta: See `gradvac`.
     """
     rows, lengths = jnp.arange(len(gramian)), jnp.sqrt(jnp.maximum(jnp.diagonal(gramian), 0.0))
     changed = jnp.eye(len(gramian), dtype=gramian.dtype)
-    for place in range(len(gramian)):
-        others = orders[:, place]
+    for index in range(len(gramian)):
+        others = orders[:, index]
         dots = jnp.matmul(changed, gramian, precision=jax.lax.Precision.HIGHEST)
         length = jnp.sqrt(jnp.maximum(jnp.sum(dots * changed, axis=1), 0.0))
         other = lengths[others]
@@ -93,16 +95,16 @@ def gradvac_weights(gramian: jax.Array, usual: jax.Array, orders: jax.Array, bet
         is_pair = (others != rows) & is_some & (other > 0.0)
         safe = jnp.where(is_pair, other, 1.0)
         cosine = jnp.clip(jnp.where(is_pair, dots[rows, others] / (jnp.where(is_pair, length, 1.0) * safe), 0.0), -1.0, 1.0)
-        wanted = usual[rows, others]
+        wanted = target_cosines[rows, others]
         sine, wanted_sine = jnp.sqrt(1.0 - cosine**2), jnp.sqrt(1.0 - jnp.minimum(wanted**2, 1.0))
         gains = is_pair & (cosine < wanted) & (wanted_sine > 0.0)
         gain = length * (wanted * sine - cosine * wanted_sine) / (safe * jnp.where(gains, wanted_sine, 1.0))
         changed = changed.at[rows, others].add(jnp.where(gains, gain, 0.0))
-        usual = usual.at[rows, others].add(jnp.where(others != rows, beta * (cosine - wanted), 0.0))
-    return jnp.sum(changed, axis=0), usual
+        target_cosines = target_cosines.at[rows, others].add(jnp.where(others != rows, beta * (cosine - wanted), 0.0))
+    return jnp.sum(changed, axis=0), target_cosines
 
 
-def _orders(state: WeightingState, count: int) -> jax.Array:
+def _random_orders(state: WeightingState, count: int) -> jax.Array:
     """Sample a random order of the losses for each loss: [K, K] int."""
     keys = jax.random.split(jax.random.fold_in(state.key, state.updates), count)
     return jax.vmap(lambda key: jax.random.permutation(key, count))(keys)

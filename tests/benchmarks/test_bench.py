@@ -266,7 +266,7 @@ def dots(monkeypatch: pytest.MonkeyPatch) -> None:
 
     What is timed is not repeated until the clock can tell it from noise: no test looks at how large a figure is.
     """
-    monkeypatch.setattr(timing, "_LEAST_SECONDS", 0.01)
+    monkeypatch.setattr(timing, "_MIN_SECONDS", 0.01)
     for name, moves in (("Dot", True), ("StillDot", False)):
         make = functools.partial(Dot, moves=moves)
         monkeypatch.setitem(registry._ENTRIES, name, registry._Entry(make, PixelsConfig))

@@ -83,9 +83,9 @@ def test_an_edited_sentence_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_fresh_seeds_are_preferred_for_claims_only():
     stem = "VisualFetchReach-none-paper"
     assert study("ol_aux", stem).seeds == [0, 1, 2, 3, 4]
-    fresh = study("ol_aux", stem, fresh=True, budget=240_000)
+    fresh = study("ol_aux", stem, is_fresh=True, budget=240_000)
     assert fresh.seeds[0] >= 100 and len(fresh.seeds) % 5 == 0
-    assert study("ol_aux", stem, fresh=True, budget=10_000_000).seeds == [0, 1, 2, 3, 4]
+    assert study("ol_aux", stem, is_fresh=True, budget=10_000_000).seeds == [0, 1, 2, 3, 4]
     assert np.isfinite(fresh.means(240_000)).all()
     with pytest.raises(LookupError):
         study("ol_aux", "NoSuchTask")

@@ -157,7 +157,7 @@ def test_every_kept_record_has_a_list_of_files() -> None:
 @pytest.mark.parametrize("page", pages.PAGES)
 def test_a_page_says_what_the_records_say(page: str) -> None:
     text = (records.CHECKOUT / page).read_text()
-    assert pages.filled(text, pages.PAGES[page]) == text, "make tables"
+    assert pages.fill_page(text, pages.PAGES[page]) == text, "make tables"
 
 
 def test_every_table_between_markers_has_a_writer() -> None:
@@ -202,7 +202,7 @@ def test_a_figure_takes_the_best_record_or_the_hardest() -> None:
     ]
     best = Figure("disc/speed", {}, "{value} of {discs:,} in {pixels}")
     assert tables.speed_cell((best,), device, records) == "2.00 k of 8 in RGB-D"
-    hardest = dataclasses.replace(best, text="{ratio} times", least="ratio")
+    hardest = dataclasses.replace(best, text="{ratio} times", minimum_of="ratio")
     assert tables.speed_cell((hardest, dataclasses.replace(best, config={"discs": 4})), device, records) == (
         "2.0 times; 1.00 k of 4 in RGB-D"
     )
@@ -309,7 +309,7 @@ def test_a_value_is_reached_when_the_next_two_evaluations_confirm_it() -> None:
     assert curves.steps_to(points, 0.95) is None
     # Of the last two evaluations nobody knows what comes after.
     assert curves.steps_to(points[:4], 0.9) is None
-    assert curves.steps_to([(steps, -value) for steps, value in points], -0.9, least=True) == 3
+    assert curves.steps_to([(steps, -value) for steps, value in points], -0.9, lower_is_better=True) == 3
 
 
 def test_curves_are_medians_over_all_seeds() -> None:

@@ -24,7 +24,7 @@ from brax.training.agents.sac import train as sac
 from gymnasium.utils.env_checker import check_env
 
 from jaxrl_vis_envs import goals, registry
-from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
+from jaxrl_vis_envs.adapters.brax import BraxEnv, share_jax_with_brax
 from jaxrl_vis_envs.adapters.gymnasium import GymnasiumEnv, GymnasiumVectorEnv, register_all
 from jaxrl_vis_envs.pixels import image_observer
 from jaxrl_vis_envs.randomization import Randomization
@@ -306,12 +306,12 @@ def test_misuse_is_refused_in_one_line():
         ("gymnasium", "gymnasium", "pip install 'jaxrl-vis[gymnasium]'"),
     ],
 )
-def test_missing_library_error_says_how_to_install_it(monkeypatch, adapter, library, mend):
+def test_missing_library_error_says_how_to_install_it(monkeypatch, adapter, library, hint):
     for name in [name for name in sys.modules if name.split(".")[0] == library]:
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setitem(sys.modules, library, None)
     monkeypatch.delitem(sys.modules, f"jaxrl_vis_envs.adapters.{adapter}", raising=False)
-    with pytest.raises(ImportError, match=re.escape(mend)):
+    with pytest.raises(ImportError, match=re.escape(hint)):
         importlib.import_module(f"jaxrl_vis_envs.adapters.{adapter}")
 
 
@@ -354,7 +354,7 @@ def test_typed_and_untyped_brax_keys_start_the_same_episode():
 
 
 def test_replicated_trees_have_the_sharding_of_brax_pmap():
-    with lend_jax():
+    with share_jax_with_brax():
         lent = jax.device_put_replicated({"weight": np.ones(3, np.float32)}, jax.local_devices())
     returned = jax.pmap(lambda tree: tree, axis_name="i")(lent)  # as brax trains: another sharding compiles it anew
     assert returned["weight"].sharding == lent["weight"].sharding
@@ -367,7 +367,7 @@ BRAX_LEARNING = {"batch_size": 64, "discounting": 0.5}
 def test_brax_ppo_learns():
     env = BraxEnv(told(), reward="dense")
     sizes = {"policy_hidden_layer_sizes": (16,), "value_hidden_layer_sizes": (16,)}
-    with lend_jax():
+    with share_jax_with_brax():
         make_policy, params, _ = ppo.train(
             env,
             num_timesteps=40_000,
@@ -390,7 +390,7 @@ def test_brax_ppo_learns():
 @pytest.mark.slow
 def test_brax_sac_trains():
     env, rewards = BraxEnv(told(), reward="dense"), []
-    with lend_jax():
+    with share_jax_with_brax():
         sac.train(
             env,
             num_timesteps=2_000,

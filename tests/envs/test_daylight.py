@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from jaxrl_vis_envs import plants
-from jaxrl_vis_envs.plants import SHIFTED, TRAINING, backdrop
-from jaxrl_vis_envs.plants.degrading import degrade
+from jaxrl_vis_envs.plants import SHIFTED, TRAINING
 from jaxrl_vis_envs.plants.field import generator
 from jaxrl_vis_envs.plants.pairs import Sequence, daylight
+from jaxrl_vis_envs.plants.rendering import backdrop
+from jaxrl_vis_envs.plants.rendering.degrading import degrade
+from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, OBJECT, build
 from jaxrl_vis_envs.plants.scene import Scene
 from jaxrl_vis_envs.plants.settling import settle
-from jaxrl_vis_envs.plants.surfaces import NOTHING, OBJECT, build
 from jaxrl_vis_envs.plants.truth import stalks_in_view
 
 FAMILIES = Path(__file__).parents[2] / "benchmarks" / "stalks" / "families"

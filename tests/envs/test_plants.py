@@ -11,9 +11,10 @@ from jaxrl_vis import cli
 from jaxrl_vis.stalks.phenotyping.measure.stalk import measure
 from jaxrl_vis.stalks.phenotyping.measure.stereo import grey
 from jaxrl_vis_envs import plants
-from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING, drawing, tables
+from jaxrl_vis_envs.plants import SHIFTED, SHIFTS, TRAINING
 from jaxrl_vis_envs.plants.family import INCH, Family, Layout, Rig, Stalks
 from jaxrl_vis_envs.plants.pairs import Pair, Sequence
+from jaxrl_vis_envs.plants.rendering import drawing, shading, tables
 from jaxrl_vis_envs.plants.truth import HEIGHTS, outline, stalks_in_view
 
 WIDTH = 211  # a sixteenth of the real cameras'
@@ -373,7 +374,7 @@ def test_batched_and_sequential_tiles_agree(sequence):
     true, pose = sequence.drive.true, sequence.drive.poses[16]
     view = tables.build_view(sequence.surfaces, pose, true)
     numbers = (true.focal, true.centre, (0.0, 0.0), pose.rotation, pose.position, (0.05, -0.1, 0.0), (1.0, 0.01, 0.8))
-    shot = drawing.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
+    shot = shading.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
     one, many = (drawing.draw(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
     for left, right in zip(one, many):
         assert np.isclose(np.asarray(left), np.asarray(right), atol=1e-4).mean() > 0.999

@@ -138,7 +138,7 @@ def test_what_a_run_says_of_the_cache_is_true(
 ) -> None:
     from jax.experimental.compilation_cache import compilation_cache
 
-    said = make_fake_trainer(small_config(), None).programs.says_of_cache
+    said = make_fake_trainer(small_config(), None).programs.cache_message
     home, elsewhere, file = tmp_path / "home", tmp_path / "elsewhere", tmp_path / "a file"
     file.touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(home))

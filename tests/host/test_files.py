@@ -29,7 +29,7 @@ def test_json_that_cannot_be_used_is_one_line(tmp_path, contents, part):
     path = tmp_path / "config.json"
     path.write_bytes(contents)
     with pytest.raises(RequestError, match=part) as refused:
-        read_json(path, mend="put it back")
+        read_json(path, hint="put it back")
     assert str(path) in str(refused.value) and str(refused.value).endswith(": put it back")
     assert "\n" not in str(refused.value) and len(str(refused.value)) < 400
 

@@ -214,7 +214,7 @@ def test_what_is_no_fault_of_the_disk_is_not_told_as_one(tmp_path, monkeypatch):
     ("number", "mend", "is_moved"),
     [(errno.ENOSPC, "make room", False), (errno.EACCES, "fix that", False), (errno.ENOENT, "", True)],
 )
-def test_advice_after_a_fault_of_the_disk_can_be_followed(tmp_path, monkeypatch, number, mend, is_moved):
+def test_advice_after_a_fault_of_the_disk_can_be_followed(tmp_path, monkeypatch, number, hint, is_moved):
     if is_moved and not Path("/proc/self/fd").exists():
         pytest.skip("other systems do not say where a folder went")
     path = there = tmp_path / "my run"
@@ -230,7 +230,7 @@ def test_advice_after_a_fault_of_the_disk_can_be_followed(tmp_path, monkeypatch,
         list(make_fake_trainer(small_config(checkpoint_interval=1), path).run())
     text = str(stopped.value)
     assert (f"{path} was moved to {there}" if is_moved else os.strerror(number)) in text and "\n" not in text
-    assert text.endswith(f"{': ' if is_moved else f'{mend}, then '}go on with --run-dir '{there}' --resume")
+    assert text.endswith(f"{': ' if is_moved else f'{hint}, then '}go on with --run-dir '{there}' --resume")
     monkeypatch.undo()
     assert list(make_fake_trainer(small_config(), there, resume=True).run())[-1].iteration == 8
 

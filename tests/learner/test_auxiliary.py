@@ -75,12 +75,12 @@ def fresh(tasks, encoders, target_encoder, filters):
 
 
 @functools.cache
-def learner(way=None, **overrides):
+def learner(mode=None, **overrides):
     """The learner, one update as a compiled function, and its state and batch at the beginning."""
     chosen = config(**overrides)
     networks = Networks(chosen, SPEC, ACTIONS, 0.0)
     auxiliary = make_auxiliary(chosen, SPEC, ACTIONS, 1, networks.dtype)
-    auxiliary = auxiliary if way is None else dataclasses.replace(auxiliary, way=way)
+    auxiliary = auxiliary if mode is None else dataclasses.replace(auxiliary, gradient_mode=mode)
     resolved = resolve(chosen, HORIZON)
     algorithm = make_ddpg(networks, chosen, resolved, auxiliary)
     replay = Replay(1, EPISODES, HORIZON)
@@ -182,10 +182,10 @@ def test_weights_move_every_so_many_updates():
     assert len(set(seen[5:10])) == 1 and seen[10] != seen[5]
 
 
-@pytest.mark.parametrize("way", ["per_loss", "latents"])
-def test_heads_of_both_networks_learn_while_their_losses_are_kept_out_of_the_encoders(way):
+@pytest.mark.parametrize("mode", ["per_loss", "latents"])
+def test_heads_of_both_networks_learn_while_their_losses_are_kept_out_of_the_encoders(mode):
     tasks = {"aux_tasks": ("inverse_dynamics",)}
-    _, update, working, batch = learner(way, **tasks, weighting="ol_aux", weighting_heads="always")
+    _, update, working, batch = learner(mode, **tasks, weighting="ol_aux", weighting_heads="always")
     weights = {**working.agent.weighting.weights, "inverse_dynamics": jnp.zeros(())}
     state = working.agent.weighting.replace(weights=weights)
     working = working._replace(agent=working.agent.replace(weighting=state))
@@ -196,7 +196,7 @@ def test_heads_of_both_networks_learn_while_their_losses_are_kept_out_of_the_enc
         for left, right in zip(jax.tree.leaves(found["heads"]), jax.tree.leaves(one["heads"]), strict=True):
             np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-6)
         assert sizes(found["heads"])["inverse_dynamics"] > 0
-    _, update, start, _ = learner(way, **tasks, weighting="ol_aux")
+    _, update, start, _ = learner(mode, **tasks, weighting="ol_aux")
     _, weighted, _ = update(start._replace(agent=start.agent.replace(weighting=state)), batch)
     for found, one in ((always.critic, weighted.critic), (always.actor, weighted.actor)):
         for left, right in zip(jax.tree.leaves(found["encoder"]), jax.tree.leaves(one["encoder"]), strict=True):
@@ -285,8 +285,8 @@ def test_a_weighting_of_any_kind_trains_both_networks(weighting):
 
 def test_both_ways_to_a_gramian_train_alike():
     found = []
-    for way in ("per_loss", "latents"):
-        _, update, working, batch = learner(way=way, aux_tasks=TWO, weighting="upgrad")
+    for mode in ("per_loss", "latents"):
+        _, update, working, batch = learner(mode=mode, aux_tasks=TWO, weighting="upgrad")
         found.append(update(working, batch)[1])
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-5), *found)
 

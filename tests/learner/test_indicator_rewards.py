@@ -177,7 +177,7 @@ def test_diagnostics_of_a_batch_that_can_be_counted():
     reward = jnp.array([1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, -1.0])
     success = jnp.array([1.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     keep = jnp.array([1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0])
-    found = diagnostics.of_rewards(reward, keep, 1.0, -1.0, success)
+    found = diagnostics.fractions(diagnostics.count_rewards(reward, keep, 1.0, -1.0, success))
     assert {name: round(float(value), 6) for name, value in found.items()} == {
         "positive_share": 0.25,
         "filtered_share": 0.5,  # 3 of 6 negatives
@@ -191,15 +191,14 @@ def test_diagnostics_of_a_batch_that_can_be_counted():
 
 
 def test_diagnostics_of_graded_rewards_count_what_is_paid():
-    found = diagnostics.of_rewards(
-        jnp.array([1.0, 0.5, 0.25, 0.0]), jnp.ones(4), 1.0, 0.0, jnp.array([1.0, 0.0, 0.0, 1.0]), graded=True
-    )
+    paid, success = jnp.array([1.0, 0.5, 0.25, 0.0]), jnp.array([1.0, 0.0, 0.0, 1.0])
+    found = diagnostics.fractions(diagnostics.count_rewards(paid, jnp.ones(4), 1.0, 0.0, success, graded=True))
     assert found["positive_share"] == 0.4375 and found["false_positive_share"] == 0.375
     assert found["false_negative_share"] == pytest.approx(1 / 2.25)
 
 
 def test_diagnostics_without_the_truth_say_nothing_of_it():
-    found = diagnostics.of_rewards(jnp.array([0.0, -1.0]), jnp.ones(2), 0.0, -1.0)
+    found = diagnostics.fractions(diagnostics.count_rewards(jnp.array([0.0, -1.0]), jnp.ones(2), 0.0, -1.0))
     assert set(found) == {"positive_share", "filtered_share"}
 
 

@@ -100,9 +100,9 @@ def test_rollouts_are_the_same_and_explore(program: TrainStep, programs: Program
 def test_a_gpu_plays_all_at_once(program: TrainStep, programs: Programs, whole: Programs) -> None:
     """And evaluates with a program of its own."""
     assert (program.part_size, program.plays_any) == (5, True)
-    assert set(programs.names) == {"play", "learn", "init", "broken_leaves", "keys"}
+    assert set(programs.names) == {"play", "learn", "init", "nonfinite_leaves", "keys"}
     assert (whole.program.part_size, whole.program.plays_any) == (CONFIG.run.num_envs, False)
-    assert set(whole.names) == {"play", "learn", "evaluate", "init", "broken_leaves", "keys"}
+    assert set(whole.names) == {"play", "learn", "evaluate", "init", "nonfinite_leaves", "keys"}
     assert set(programs.of_training()) == set(whole.of_training()) == {"play", "learn", "keys"}
 
 

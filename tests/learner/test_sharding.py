@@ -262,4 +262,4 @@ def test_one_device_is_as_it_was() -> None:
     layout = make_layout(preset("debug"))
     assert layout.mesh is None and layout.num_devices == 1
     state = ReplayState(Episodes(jnp.zeros((1, 4, 3)), jnp.zeros((1, 4, 3)), jnp.zeros((1, 4, 3))), jnp.int32(4))
-    assert layout.folded(state, 2) is state and layout.unfolded(state) is state
+    assert layout.fold_replay(state, 2) is state and layout.unfold_replay(state) is state

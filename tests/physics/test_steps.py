@@ -311,7 +311,7 @@ def test_the_kernel_of_runge_kutta_takes_the_steps_of_mjx():
     assert env.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     matrices = functools.partial(mjx_model.take_steps, env._model, count=REACHER_SUBSTEPS)
     take = functools.partial(steps_kernel.simulate, interpret=True)
-    kernel = functools.partial(scalar._simulate_by, take, env._model, count=REACHER_SUBSTEPS, exact=None)
+    kernel = functools.partial(scalar._simulate_with, take, env._model, count=REACHER_SUBSTEPS, exact=None)
     after, ours = (jaxrl_vis_envs.jit(jax.vmap(steps))(data) for steps in (matrices, kernel))
     assert 0.1 < (np.abs(after.qfrc_constraint[:, 1]) > 0).mean() < 0.9
     for name in ("qpos", "qvel", "time"):
@@ -339,7 +339,7 @@ def test_joints_without_constraints_beside_others(integrator):
     data = jax.vmap(lambda qpos: still.replace(qpos=qpos))(jnp.array([[0.0, 0.3], [0.2, -0.2]]))
     after = jaxrl_vis_envs.jit(jax.vmap(functools.partial(mjx_model.take_steps, model, count=3)))(data)
     for take in (steps.simulate_arrays, functools.partial(steps_kernel.simulate, interpret=True)):
-        ours = jax.jit(jax.vmap(functools.partial(scalar._simulate_by, take, model, count=3, exact=None)))(data)
+        ours = jax.jit(jax.vmap(functools.partial(scalar._simulate_with, take, model, count=3, exact=None)))(data)
         np.testing.assert_allclose(ours.qpos, after.qpos, atol=1e-6)
         np.testing.assert_allclose(ours.qfrc_constraint, after.qfrc_constraint, atol=1e-3)
 
@@ -410,7 +410,7 @@ def test_the_kernel_takes_the_same_steps():
     after = many_steps(data)
     in_two_axes = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), data)
     take = functools.partial(steps_kernel.simulate, interpret=True)
-    kernel = functools.partial(scalar._simulate_by, take, env._model, count=3, exact=True)
+    kernel = functools.partial(scalar._simulate_with, take, env._model, count=3, exact=True)
     run = jax.jit(jax.vmap(jax.vmap(kernel)))
     ours = run(in_two_axes)
     for name in ("qpos", "qvel", "qacc", "qacc_warmstart", "qfrc_constraint", "time"):

@@ -172,7 +172,7 @@ def test_the_kernel_takes_the_same_steps():
     after = step(data, 3)
     in_two_axes = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), data)
     take = functools.partial(steps_kernel.simulate, interpret=True)
-    kernel = functools.partial(scalar._simulate_by, take, env._model, count=3, exact=None)
+    kernel = functools.partial(scalar._simulate_with, take, env._model, count=3, exact=None)
     run = jax.jit(jax.vmap(jax.vmap(kernel)))
     ours = run(in_two_axes)
     for name in ("qpos", "qvel", "qacc", "qacc_warmstart", "qfrc_constraint", "time"):

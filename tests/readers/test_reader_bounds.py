@@ -287,7 +287,7 @@ def test_outlines_of_many_corners_are_filled_part_by_part(monkeypatch):
     angle = np.linspace(0.0, 6.28, 1000)
     corners = np.stack([32 + 20 * np.cos(angle), 24 + 15 * np.sin(7 * angle)], axis=1).ravel().tolist()
     whole = masks.outlined_mask([corners], (48, 64))
-    monkeypatch.setattr(masks, "_AT_ONCE", 500)
+    monkeypatch.setattr(masks, "_CHUNK_SIZE", 500)
     assert whole.any() and (masks.outlined_mask([corners], (48, 64)) == whole).all()
 
 

@@ -200,12 +200,12 @@ VOC = {
 
 def test_annotations_of_pascal_voc(worker):
     text = xml_text(VOC, "annotation")
-    declared = st.sampled_from(("", '<?xml version="1.0" encoding="{}"?>')).flatmap(
+    declare_shapes = st.sampled_from(("", '<?xml version="1.0" encoding="{}"?>')).flatmap(
         lambda head: st.sampled_from(("utf-8", "utf-8", "UTF-8", "latin-1", "latin-1", "utf-16", "cp037", "klingon")).map(
             head.format
         )
     )
-    spoilt = st.tuples(declared, trees(VOC).map(lambda tree: xml_text(tree, "annotation"))).map("".join)
+    spoilt = st.tuples(declare_shapes, trees(VOC).map(lambda tree: xml_text(tree, "annotation"))).map("".join)
     hold(worker, "voc", named("a.xml", also_as_text(spoilt, text)))
 
 
@@ -225,8 +225,8 @@ def test_annotations_of_labelme(worker):
     hold(worker, "labelme", named("a.json", also_as_text(trees(LABELME).map(json_text), json_text(LABELME))))
 
 
-_SHARE = {"x": 20.0, "y": 10.0, "width": 30.0, "height": 50.0, "rotation": 0.0, "rectanglelabels": ["stalk"]}
-_SHAPE = {"value": _SHARE, "original_width": ANNOTATED[1], "original_height": ANNOTATED[0]}
+_FRACTION = {"x": 20.0, "y": 10.0, "width": 30.0, "height": 50.0, "rotation": 0.0, "rectanglelabels": ["stalk"]}
+_SHAPE = {"value": _FRACTION, "original_width": ANNOTATED[1], "original_height": ANNOTATED[0]}
 _OUTLINE = {"points": [[10, 10], [40, 10], [40, 80]], "polygonlabels": ["stalk"]}
 LABEL_STUDIO = [{"data": {"image": "/data/a.png"}, "annotations": [{"result": [_SHAPE, {**_SHAPE, "value": _OUTLINE}]}]}]
 _MASK = base64.b64encode(cv2.imencode(".png", np.full((30, 6), 255, np.uint8))[1].tobytes()).decode()
@@ -403,10 +403,10 @@ def safetensors(draw: st.DrawFn, arrays: dict[str, np.ndarray], about: dict) -> 
     return len(header).to_bytes(8, "little") + header + valid[8 + length :]
 
 
-def _shapes(declared) -> dict[str, np.ndarray]:
+def _shapes(declare_shapes) -> dict[str, np.ndarray]:
     import jax
 
-    leaves = jax.tree_util.tree_flatten_with_path(declared)[0]
+    leaves = jax.tree_util.tree_flatten_with_path(declare_shapes)[0]
     return {"/".join(part.key for part in path): np.zeros(leaf.shape, np.float16) for path, leaf in leaves}
 
 
@@ -415,18 +415,18 @@ def test_weights_of_the_detector(worker):
 
     from tiny_detector import TINY
 
-    from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, declared
+    from jaxrl_vis.stalks.phenotyping.detector.weights import SCHEMA, declare_shapes
 
     about = {"schema": SCHEMA, "settings": json.loads(json.dumps(dataclasses.asdict(TINY))), "origin": "nothing"}
-    hold(worker, "detector", named("w.safetensors", safetensors(_shapes(declared(TINY)), about)))
+    hold(worker, "detector", named("w.safetensors", safetensors(_shapes(declare_shapes(TINY)), about)))
 
 
 def test_weights_of_the_painter(worker):
-    from jaxrl_vis.stalks.grasping.masks.painter import SCHEMA, Settings, declared
+    from jaxrl_vis.stalks.grasping.masks.painter import SCHEMA, Settings, declare_shapes
 
     settings = Settings("segmentation", (8, 8))
     about = {"schema": SCHEMA, "generator": {"loss": "segmentation", "channels": [8, 8]}, "origin": "nothing"}
-    hold(worker, "painter", named("w.safetensors", safetensors(_shapes(declared(settings)), about)))
+    hold(worker, "painter", named("w.safetensors", safetensors(_shapes(declare_shapes(settings)), about)))
 
 
 # --- families and records ---

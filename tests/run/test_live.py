@@ -22,7 +22,8 @@ import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report import live_scene, videos
-from jaxrl_vis.run.storage.checkpoint import LIGHT, Restored
+from jaxrl_vis.run.storage.checkpoint import LIGHT
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.run.trained import live
 from jaxrl_vis.run.trained.policy import Policy, make_policy
 from jaxrl_vis_envs import registry

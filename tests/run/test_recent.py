@@ -153,7 +153,7 @@ def left_after(config, path, iteration: int, **options) -> None:
 @pytest.fixture
 def always(monkeypatch):
     """A state after every iteration."""
-    monkeypatch.setattr(recent, "_SHARE", np.inf)
+    monkeypatch.setattr(recent, "_FRACTION", np.inf)
 
 
 @pytest.mark.parametrize("after", [1, 3, 4, 7])
@@ -205,7 +205,7 @@ def test_a_damaged_one_is_kept_and_the_one_before_is_used(straight, tmp_path, al
 
 
 def test_a_light_checkpoint_is_never_newer(tmp_path, monkeypatch):
-    monkeypatch.setattr(recent, "_SHARE", 1e-9)  # next to never by the clock
+    monkeypatch.setattr(recent, "_FRACTION", 1e-9)  # next to never by the clock
     path, config = tmp_path / "run", small_config(full_checkpoint_interval=0)
     left_after(config, path, 5)
     checkpoints = Checkpoints(path / "checkpoints")

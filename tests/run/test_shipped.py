@@ -14,7 +14,7 @@ from safetensors.numpy import save
 from test_policy import SETTINGS, register
 
 import jaxrl_vis
-from benchmarks.ship import FRESH_KEY, MOST_BYTES, ship
+from benchmarks.ship import FRESH_KEY, MAX_BYTES, ship
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.command import training_command
@@ -23,7 +23,7 @@ from jaxrl_vis.run.trained import shipped
 from jaxrl_vis.run.trained.restored_run import evaluate_run
 from jaxrl_vis.types import NormalizerState
 
-LEAST_SUCCESS = {
+MIN_SUCCESS = {
     "fetch": 0.97,
     "sawyer": 0.9,
     "hand": 0.85,
@@ -127,7 +127,7 @@ def test_what_is_too_large_is_not_shipped(made: tuple[Path, Path], package: Path
 @pytest.mark.parametrize("name", shipped.names())
 def test_policies_of_the_package_are_small_and_their_cards_true(name: str) -> None:
     folder = shipped.FOLDER / name
-    assert (folder / "policy.safetensors").stat().st_size <= MOST_BYTES
+    assert (folder / "policy.safetensors").stat().st_size <= MAX_BYTES
     config, text = read_config(folder), (folder / "README.md").read_text()
     assert training_command(config) in text and f'load_policy("{name}")' in text
     (result,) = yaml.safe_load(text.split("---\n", 2)[1])["model-index"][0]["results"]
@@ -137,7 +137,7 @@ def test_policies_of_the_package_are_small_and_their_cards_true(name: str) -> No
     )
     assert row and float(row[2]) == pytest.approx(success, abs=1e-3) and int(row[3]) >= 256
     assert result["dataset"]["name"] == config.environment.env and f"key {FRESH_KEY}" in text
-    assert success >= LEAST_SUCCESS[name]
+    assert success >= MIN_SUCCESS[name]
     page = Path(__file__).parents[2] / "docs" / "play.md"
     (described,) = re.findall(rf"^\| `{name}` \|.*$", page.read_text(), re.MULTILINE)
     low, high = row.string[row.start() : row.end()].split("|")[3].split(" to ")

@@ -125,7 +125,7 @@ def test_the_oldest_programs_make_room(folder, program, monkeypatch):
         path = folder / f"init-{age}.stablehlo"
         path.write_bytes(b"old")
         os.utime(path, (1000 - age, 1000 - age))
-    monkeypatch.setattr(trace_cache, "MOST_FILES", 5)
+    monkeypatch.setattr(trace_cache, "MAX_FILES", 5)
     Programs(CONFIG, program, keep=True).compile()
     assert names_in(folder) == ["init", "init", "init", "learn", "play"]
     assert {"init-0.stablehlo", "init-1.stablehlo"} <= {path.name for path in folder.iterdir()}
@@ -204,7 +204,7 @@ def test_commands_find_what_training_has_traced(command, tmp_path, monkeypatch, 
     assert asked == [True] and "enough" in capsys.readouterr().err
 
 
-def test_commands_keep_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys):
+def test_commands_cache_programs_and_scripts_do_not(tmp_path, monkeypatch, capsys):
     asked = []
 
     def remember(config, program, keep=False):
@@ -225,7 +225,7 @@ def kept(folder) -> trace_cache.TraceCache:
     made = trace_cache.TraceCache(folder, "0" * 64)
     made._fresh["play"] = b"a program"
     made.write()
-    trace_cache._say_once.cache_clear()
+    trace_cache._print_once.cache_clear()
     return made
 
 

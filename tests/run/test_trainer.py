@@ -19,7 +19,7 @@ from jaxrl_vis.learner.environment import make_env
 from jaxrl_vis.run import loop as run_loop
 from jaxrl_vis.run import trainer
 from jaxrl_vis.run.compiled import memory
-from jaxrl_vis.run.compiled.nonfinite import dump, made_by_simulation
+from jaxrl_vis.run.compiled.nonfinite import dump, nonfinite_simulation
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.checkpoint import Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, default_folder, read_config
@@ -76,8 +76,8 @@ def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path,
     assert largest < all_of_them
     for there, fits in ((largest, False), (all_of_them - 1, False), (all_of_them, True)):
         monkeypatch.setattr(memory, "available_bytes", lambda there=there: there)
-        memory.check_compiled(compiled, already_there=False)
-        assert memory.fit_together(compiled, already_there=False) is fits
+        memory.check_compiled(compiled, is_allocated=False)
+        assert memory.fit_together(compiled, is_allocated=False) is fits
     monkeypatch.undo()
     monkeypatch.setattr(run_loop, "fit_together", lambda *_: False)
     list(make_fake_trainer(read_config(run_dir), tmp_path / "later").run())
@@ -87,11 +87,11 @@ def test_an_evaluation_begins_early_only_where_there_is_room(straight, tmp_path,
 def test_the_compilers_own_figures_count_on_a_cpu_too(straight, tmp_path, monkeypatch):
     """Scratch memory of the evaluation, which depends on --eval-episodes, is asked for before anything is allocated."""
     compiled = straight[1].programs.compile()
-    memory.check_compiled(compiled, already_there=False)
+    memory.check_compiled(compiled, is_allocated=False)
     state = compiled["learn"].memory_analysis().argument_size_in_bytes
     monkeypatch.setattr(memory, "available_bytes", lambda: state + 100)
-    with pytest.raises(RequestError, match="(evaluate|learn|play|broken_leaves) needs .* --eval-episodes") as refused:
-        memory.check_compiled(compiled, already_there=False)
+    with pytest.raises(RequestError, match="(evaluate|learn|play|nonfinite_leaves) needs .* --eval-episodes") as refused:
+        memory.check_compiled(compiled, is_allocated=False)
     assert "\n" not in str(refused.value)
     monkeypatch.setattr(restored_run, "make_trainer", lambda config, **_: trainer.Trainer(config, FakeProgram(config)))
     monkeypatch.setattr(memory, "available_bytes", lambda: 100)
@@ -152,7 +152,7 @@ def test_where_a_simulation_went_wrong(name, place, said):
     broken = getattr(episodes, name).at[place].set(np.inf)
     after = episodes.states.at[place[0], place[1], 4:6].set(np.nan) if name == "actions" else episodes.states
     episodes = episodes.replace(**({"states": after} | {name: broken}))
-    evidence = made_by_simulation(loop.replace(replay=loop.replay.replace(episodes=episodes)), 2)
+    evidence = nonfinite_simulation(loop.replace(replay=loop.replay.replace(episodes=episodes)), 2)
     assert evidence == (said and f"{said}, and all actions before it are")
 
 
@@ -161,8 +161,8 @@ def test_bad_episodes_of_a_replay_that_devices_share_are_dumped(tmp_path):
     made = make_fake_trainer(small_config(), None)
     loop = made.init(made.run_keys)
     states, actions = loop.replay.episodes.states, loop.replay.episodes.actions
-    folded = [array.reshape(2, -1, 2, *array.shape[2:]) for array in (states.at[1, 3].set(np.nan), actions)]
-    episodes = loop.replay.episodes.replace(states=folded[0], actions=folded[1])
+    fold_replay = [array.reshape(2, -1, 2, *array.shape[2:]) for array in (states.at[1, 3].set(np.nan), actions)]
+    episodes = loop.replay.episodes.replace(states=fold_replay[0], actions=fold_replay[1])
     dump(tmp_path / "dump.npz", loop.replace(replay=loop.replay.replace(episodes=episodes)), {}, [])
     dumped = np.load(tmp_path / "dump.npz")
     assert dumped["episodes.seed_index"].tolist() == [1] and dumped["episodes.slot"].tolist() == [3]

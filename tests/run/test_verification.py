@@ -47,10 +47,10 @@ def run_trainer(straight) -> Callable[..., Trainer]:
 def verified(run_trainer) -> Callable[..., Verification]:
     """Verifies a folder."""
 
-    def function(path: Path, iterations: int | None = None, say: Callable[[str], None] = lambda line: None) -> Verification:
+    def function(path: Path, iterations: int | None = None, echo: Callable[[str], None] = lambda line: None) -> Verification:
         record, config, report = read_record(path), read_config(path), Verification()
         check_record(record, config, report)
-        return verify(run_trainer(config), path, record, iterations, report, say)
+        return verify(run_trainer(config), path, record, iterations, report, echo)
 
     return function
 
@@ -169,7 +169,7 @@ def test_rows_that_do_not_fit_are_found(straight, tmp_path, change, problem):
     write_rows(tmp_path, change(rows_in(straight[0])))
     findings, expected = Findings(), expected_in(straight[0])
     rows = read_file(tmp_path / "metrics.jsonl", expected, False, findings)
-    missing = missing_rows(rows, expected, reached=8, total=8, without=(), is_written=False)
+    missing = missing_rows(rows, expected, last_written=8, total=8, without=(), is_written=False)
     assert problem in "; ".join(findings.problems + missing)
 
 
@@ -224,7 +224,7 @@ def test_what_is_missing_contradicts_or_is_foreign_is_said(copy, verified):
 @pytest.fixture
 def killed(run_trainer, tmp_path, monkeypatch) -> Path:
     """A run that kept a recent state after each iteration, and nothing else, and was killed after the sixth."""
-    monkeypatch.setattr(recent, "_SHARE", math.inf)
+    monkeypatch.setattr(recent, "_FRACTION", math.inf)
     path = tmp_path / "killed"
     reports = run_trainer(small_config(checkpoint_interval=0, full_checkpoint_interval=0), path).run()
     for report in reports:
@@ -310,7 +310,7 @@ def test_an_exactly_resumed_run_is_equal_whatever_its_interval_was(verified, run
 
 def test_the_command_says_what_it_found(copy, verified, monkeypatch, capsys):
     monkeypatch.setattr(
-        verification, "verify_run", lambda path, iterations, keep_programs, say, trust: verified(path, iterations, say)
+        verification, "verify_run", lambda path, iterations, cache_programs, echo, trust: verified(path, iterations, echo)
     )
     assert cli.main(["verify", str(copy)]) == 0
     out = capsys.readouterr().out

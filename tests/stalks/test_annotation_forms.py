@@ -327,7 +327,7 @@ def test_regions_of_many_stalks_are_neither_stalks_nor_background(tmp_path):
     put(tmp_path, {"annotations.json": json.dumps({**data, "annotations": [*data["annotations"], crowd]})}, "r.png")
     assert settings_for(tmp_path, TINY).anchor_widths[-1] < 12 * TINY.width / WIDTH
     (example,) = annotated_examples(tmp_path, TINY)
-    assert (example.kinds == STALK).sum() == 2 and len(example.snips) == 2
+    assert (example.kinds == STALK).sum() == 2 and len(example.crops) == 2
     strips = example.stalks[example.kinds == UNCLEAR] * WIDTH / example.image.shape[1]
     # Each strip is about as wide as a stalk, and all of the region lies in one.
     assert np.all(strips[:, 2] - strips[:, 0] < 14) and strips[:, 0].min() == 60 and strips[:, 2].max() == 90

@@ -1,4 +1,4 @@
-"""The networks that find and outline stalks: operators against torchvision's, codes, snips, training and files of weights."""
+"""The networks that find and outline stalks: operators against torchvision's, codes, crops, training and files of weights."""
 
 import dataclasses
 from pathlib import Path
@@ -14,15 +14,15 @@ from jaxrl_vis.host.weights_file import write_parameters
 from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap, roi_align, suppress
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals
-from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
+from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, put_back, snip_shape
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.images import rgb8
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_counts
-from jaxrl_vis.stalks.phenotyping.training.augment import move, vary_snips
+from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, move
 from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, _Pool, train
 from jaxrl_vis.stalks.phenotyping.training.examples import (
     MAX_STALKS,
@@ -36,7 +36,7 @@ from jaxrl_vis_envs.plants import family
 
 # One program each, in place of one for every operation in them.
 band_overlap, overlap = jax.jit(band_overlap), jax.jit(overlap)
-encode, decode, vary_snips = jax.jit(encode), jax.jit(decode), jax.jit(vary_snips)
+encode, decode, augment_crops = jax.jit(encode), jax.jit(decode), jax.jit(augment_crops)
 roi_align, best_proposals = jax.jit(roi_align, static_argnums=(2, 3, 4, 5)), jax.jit(best_proposals, static_argnums=(3, 4))
 assign, suppress, move = jax.jit(assign), jax.jit(suppress), jax.jit(move)
 
@@ -112,14 +112,14 @@ def test_a_stalk_that_two_finds_outline_is_one():
     half = np.where(np.arange(120)[:, None] < 55, crossing, upright)  # the first of one and the rest of the other
     pieces = [piece(0, 0, upright), piece(0, 0, crossing), piece(20, 30, part), piece(0, 0, half), piece(0, 0, image[:0, :0])]
     scores = np.array([0.8, 0.9, 0.7, 0.5, 0.4])
-    assert without_duplicates(pieces, scores).tolist() == [True, True, False, True, True]
-    assert without_duplicates(pieces, scores[[0, 2, 1, 3, 4]]).tolist() == [True, False, True, True, True]
-    assert without_duplicates(pieces, scores, most_shared=0.4).tolist() == [True, True, False, False, True]
+    assert suppress_duplicates(pieces, scores).tolist() == [True, True, False, True, True]
+    assert suppress_duplicates(pieces, scores[[0, 2, 1, 3, 4]]).tolist() == [True, False, True, True, True]
+    assert suppress_duplicates(pieces, scores, max_shared=0.4).tolist() == [True, True, False, False, True]
     # Of three in a row that each share most of their neighbour's mask, the first and the last are two.
     chain = [piece(0, left, np.ones((50, 20), bool)) for left in (0, 7, 14)]
-    assert without_duplicates(chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
-    assert without_duplicates(chain, np.array([0.8, 0.9, 0.7])).tolist() == [False, True, False]
-    assert without_duplicates([], np.zeros(0)).tolist() == []
+    assert suppress_duplicates(chain, np.array([0.9, 0.8, 0.7])).tolist() == [True, False, True]
+    assert suppress_duplicates(chain, np.array([0.8, 0.9, 0.7])).tolist() == [False, True, False]
+    assert suppress_duplicates([], np.zeros(0)).tolist() == []
 
 
 def test_codes_are_inverted():
@@ -164,37 +164,37 @@ def test_boxes_on_unclear_stalks_are_neither_right_nor_wrong():
     assert which[0] == 0 and shows.tolist() == [True, False, False] and none.tolist() == [False, False, True]
 
 
-# --- snips ---
+# --- crops ---
 
 
-def test_a_snip_is_put_back_where_it_was():
+def test_a_crop_is_put_back_where_it_was():
     rng = np.random.default_rng(1)
     image = rng.uniform(0.1, 1, (60, 50)).astype(np.float32)
     stalk = np.array([18.0, 5, 40, 55, 36, 20], np.float32)
-    snip = np.asarray(cut(jnp.asarray(image), stalk[None], (48, 16)))[0]
-    back, (line, column) = put_back(snip, stalk, image.shape)
+    crop = np.asarray(cut(jnp.asarray(image), stalk[None], (48, 16)))[0]
+    back, (line, column) = paste(crop, stalk, image.shape)
     there = image[line : line + back.shape[0], column : column + back.shape[1]]
     assert (back > 0).sum() == 48 * 16
     np.testing.assert_array_equal(back[back > 0], there[back > 0])
-    # The stalk stands upright in the middle: its axis is the snip's middle column.
+    # The stalk stands upright in the middle: its axis is the crop's middle column.
     middle = 36 + (20 - 36) * (line + 0.5 - 5) / 50
     assert np.flatnonzero(back[0])[[0, -1]].mean() + column + 0.5 == pytest.approx(middle, abs=0.6)
 
 
-def test_snips_at_the_images_edge_are_black_beyond_it():
+def test_crops_at_the_images_edge_are_black_beyond_it():
     image = np.ones((40, 30), np.float32)
     stalk = np.array([-4.0, 10, 6, 40, 1, 1], np.float32)
-    snip = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))[0]
-    assert snip[:, :7].max() == 0 and snip[:31, 7:].min() == 1
-    back, corner = put_back(snip, stalk, image.shape)
+    crop = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))[0]
+    assert crop[:, :7].max() == 0 and crop[:31, 7:].min() == 1
+    back, corner = paste(crop, stalk, image.shape)
     assert corner == (9, 0) and back.min() == 1
-    nowhere, _ = put_back(snip, stalk + 100, image.shape)
+    nowhere, _ = paste(crop, stalk + 100, image.shape)
     assert nowhere.size == 0
 
 
-def test_smaller_images_have_smaller_snips():
-    assert snip_shape((640, 128), 1.0) == (640, 128)
-    assert snip_shape((640, 128), 0.5) == (320, 64)
+def test_smaller_images_have_smaller_crops():
+    assert crop_shape((640, 128), 1.0) == (640, 128)
+    assert crop_shape((640, 128), 0.5) == (320, 64)
 
 
 # --- learning ---
@@ -214,9 +214,9 @@ def drawing(seed: int) -> Example:
     stalk = np.array([min(top, bottom) - 3, 15, max(top, bottom) + 3, 45, top, bottom], np.float32)
     stalks, kinds = np.zeros((MAX_STALKS, 6), np.float32), np.zeros(MAX_STALKS, np.int32)
     stalks[0], kinds[0] = stalk, STALK
-    snips = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))
+    crops = np.asarray(cut(jnp.asarray(image), stalk[None], (32, 16)))
     masks = np.asarray(cut(jnp.asarray(mask), stalk[None], (32, 16)))
-    return Example(image, stalks, kinds, snips, masks)
+    return Example(image, stalks, kinds, crops, masks)
 
 
 def test_stalks_move_with_their_images():
@@ -246,11 +246,11 @@ def test_stalks_move_with_their_images():
 
 
 def test_images_of_several_sizes_are_batched_together():
-    """A larger image that comes late makes batches larger; snips of a batch are of one size."""
-    plan = Plan(images=26, first=24, batch=16, snips=4)
+    """A larger image that comes late makes batches larger; crops of a batch are of one size."""
+    plan = Plan(images=26, first=24, batch=16, crops=4)
     small, large = drawing(0), drawing(1)
     large = dataclasses.replace(
-        large, image=np.pad(large.image, ((0, 40), (0, 70), (0, 0))), snips=large.snips[:, :24], masks=large.masks[:, :24]
+        large, image=np.pad(large.image, ((0, 40), (0, 70), (0, 0))), crops=large.crops[:, :24], masks=large.masks[:, :24]
     )
     pool = _Pool([iter([small] * 24), iter([large, large])], plan)
     try:
@@ -272,8 +272,8 @@ def test_images_of_several_sizes_are_batched_together():
 def trained():
     said = []
     sources = [iter([drawing(seed) for seed in range(24)])]
-    plan = Plan(steps=160, images=24, first=24, batch=4, snips=4, rate=4e-3, average=0.9)
-    params, steps = train(sources, TINY, plan, lambda step, *rest: said.append((step, rest[2])), every=0.0)
+    plan = Plan(steps=160, images=24, first=24, batch=4, crops=4, rate=4e-3, average=0.9)
+    params, steps = train(sources, TINY, plan, lambda step, *rest: said.append((step, rest[2])), report_interval=0.0)
     return params, steps, said
 
 
@@ -303,18 +303,18 @@ def test_networks_learn_to_find_and_outline(trained, tmp_path):
 
 
 def test_a_loss_that_is_not_finite_stops_the_training():
-    plan = Plan(steps=40, images=2, first=2, batch=4, snips=4, rate=float("nan"))
+    plan = Plan(steps=40, images=2, first=2, batch=4, crops=4, rate=float("nan"))
     with pytest.raises(NonFiniteError, match="not finite at step"):
-        train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None, every=0.0)
+        train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None, report_interval=0.0)
 
 
 def test_a_training_without_time_for_an_update_is_told():
-    plan = Plan(minutes=1e-9, images=2, first=2, batch=4, snips=4)
+    plan = Plan(minutes=1e-9, images=2, first=2, batch=4, crops=4)
     with pytest.raises(RequestError, match="before the first update: allow more with --minutes"):
         train([iter([drawing(0), drawing(1)])], TINY, plan, lambda *rest: None)
 
 
-def test_masks_of_snips_are_cut_out_of_what_each_pixel_shows():
+def test_masks_of_crops_are_cut_out_of_what_each_pixel_shows():
     """Also of the stalk with index 0, and at the image's edge, beyond which there is nothing."""
     instance = jnp.asarray(np.repeat(np.arange(32) // 8 - 1, 40).reshape(32, 40).T, jnp.int32)  # [40, 32], -1 to 2
     places = np.array([[8.0, 4, 16, 36, 10, 14], [16, 4, 24, 36, 20, 20], [24, -10, 32, 30, 30, 30]])
@@ -324,24 +324,24 @@ def test_masks_of_snips_are_cut_out_of_what_each_pixel_shows():
         assert mask.any()
 
 
-def test_synthetic_examples_hold_snips_around_both_heights():
+def test_synthetic_examples_hold_crops_around_both_heights():
     layout = family.Layout(rows_behind=0, stalks_mean=12, stalks_sd=0, tillers=0.0, plot_length=0.8)
     stalks = family.Stalks(diameter_mean=0.03, lean_sd=(0.0, 0.0))
     few = dataclasses.replace(family.TRAINING, layout=layout, stalks=stalks).at_width(211)
     (example,) = synthetic_examples(few, Settings(), 3, frames=1)
     clear = int((example.kinds == STALK).sum())
-    assert clear < len(example.snips) <= 2 * clear and example.snips.shape[1:] == (40, 16, 3)
-    assert example.masks.shape == example.snips.shape[:3]
-    # The stalk stands in the middle of its snip, at the upper height, too.
+    assert clear < len(example.crops) <= 2 * clear and example.crops.shape[1:] == (40, 16, 3)
+    assert example.masks.shape == example.crops.shape[:3]
+    # The stalk stands in the middle of its crop, at the upper height, too.
     middle = example.masks[:, 10:30, 7:9].mean(axis=(1, 2))
     assert np.median(middle[:clear]) > 0.6 and np.median(middle[clear:]) > 0.6
 
 
-def test_snips_are_varied_and_their_masks_stay_with_them():
+def test_crops_are_varied_and_their_masks_stay_with_them():
     """A bright strip on black ground: whatever is done to it, it is where its mask is, and the ground stays dark."""
-    snips, masks = np.zeros((24, 64, 48, 3), np.uint8), np.zeros((24, 64, 48), bool)
-    snips[:, :, 14:30], masks[:, :, 14:30] = 150, True
-    varied, moved = map(np.asarray, vary_snips(jnp.asarray(snips), jnp.asarray(masks), jax.random.key(0)))
+    crops, masks = np.zeros((24, 64, 48, 3), np.uint8), np.zeros((24, 64, 48), bool)
+    crops[:, :, 14:30], masks[:, :, 14:30] = 150, True
+    varied, moved = map(np.asarray, augment_crops(jnp.asarray(crops), jnp.asarray(masks), jax.random.key(0)))
     assert moved.shape == masks.shape and varied.dtype == np.uint8
     inside = np.array([image[mask].mean() for image, mask in zip(varied, moved)])
     outside = np.array([image[~mask].mean() for image, mask in zip(varied, moved)])
@@ -392,10 +392,10 @@ def test_annotations_of_ones_own(tmp_path):
         ],
     }
     (tmp_path / "annotations.json").write_text(json.dumps(data))
-    settings = settings_for(tmp_path, dataclasses.replace(TINY, band_lines=40.0))  # as tall as the boxes: nothing is resized
-    assert settings.band_lines == 40.0 and 8.0 <= settings.anchor_widths[0] < settings.anchor_widths[-1] <= 16.0
+    settings = settings_for(tmp_path, dataclasses.replace(TINY, band_height=40.0))  # as tall as the boxes: nothing is resized
+    assert settings.band_height == 40.0 and 8.0 <= settings.anchor_widths[0] < settings.anchor_widths[-1] <= 16.0
     (example,) = annotated_examples(tmp_path, settings)
-    assert (example.kinds == STALK).sum() == 2 and example.snips.shape == (2, 32, 24, 3)  # twice as wide as the boxes
+    assert (example.kinds == STALK).sum() == 2 and example.crops.shape == (2, 32, 24, 3)  # twice as wide as the boxes
     np.testing.assert_allclose(example.stalks[0], [10, 10, 26, 50, 23, 13], atol=1.5)
     np.testing.assert_allclose(example.stalks[1], [40, 10, 48, 50, 44, 44], atol=0.01)
     (tmp_path / "row.png").unlink()

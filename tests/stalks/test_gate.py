@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.stalks.phenotyping.detector.gate import fit_gate, gate_path, read_gate, write_gate
-from jaxrl_vis.stalks.phenotyping.pipeline import Request, _strange
+from jaxrl_vis.stalks.phenotyping.pipeline import Request, _unfamiliar_note
 
 SURE, UNSURE = np.array([0.97, 0.95, 0.02]), np.array([0.6, 0.45, 0.3])
 
@@ -24,7 +24,7 @@ def images() -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
 @pytest.fixture(scope="module")
 def gate(images):
     pooled, scores, wrong = images
-    return fit_gate(pooled, scores, wrong, np.arange(260), axes=3, most_flagged=0.05)
+    return fit_gate(pooled, scores, wrong, np.arange(260), axes=3, max_flagged=0.05)
 
 
 def test_a_gate_flags_what_lies_elsewhere_and_what_is_unsure(images, gate):
@@ -42,7 +42,7 @@ def test_a_gate_flags_what_lies_elsewhere_and_what_is_unsure(images, gate):
 def test_a_gate_needs_images_of_both_kinds(images):
     pooled, scores, wrong = images
     with pytest.raises(ValueError, match="needs 9 images that are read rightly, and one that is not"):
-        fit_gate(pooled[:200], scores[:200], wrong[:200], np.arange(200), axes=3, most_flagged=0.05)
+        fit_gate(pooled[:200], scores[:200], wrong[:200], np.arange(200), axes=3, max_flagged=0.05)
 
 
 def test_a_gate_is_for_its_weights_alone(gate, images, tmp_path):
@@ -59,9 +59,9 @@ def test_a_gate_is_for_its_weights_alone(gate, images, tmp_path):
 
 
 def test_a_plot_is_flagged_where_most_of_its_pairs_are(tmp_path):
-    request = Request(tmp_path, "strip", "networks", {}, most_doubt=0.5)
-    told = _strange(request, [{"doubt": 0.9}, {"doubt": 0.7}, {"doubt": 0.1}])
+    request = Request(tmp_path, "strip", "networks", {}, max_doubt=0.5)
+    told = _unfamiliar_note(request, [{"doubt": 0.9}, {"doubt": 0.7}, {"doubt": 0.1}])
     assert told.startswith("2 of 3 pairs are unlike") and "0.70, the limit 0.50" in told
-    assert not _strange(request, [{"doubt": 0.9}, {"doubt": 0.1}])
-    assert not _strange(request, [{"doubt": None}, {}])
-    assert not _strange(Request(tmp_path, "strip", "truth", {}), [{"doubt": 0.9}])
+    assert not _unfamiliar_note(request, [{"doubt": 0.9}, {"doubt": 0.1}])
+    assert not _unfamiliar_note(request, [{"doubt": None}, {}])
+    assert not _unfamiliar_note(Request(tmp_path, "strip", "truth", {}), [{"doubt": 0.9}])

@@ -9,7 +9,14 @@ import pytest
 from PIL import Image, ImageOps
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, _is_shown, _moved, _without_border, resize, usual_lines
+from jaxrl_vis.stalks.phenotyping.detector.finder import (
+    Detection,
+    _clear_border_rows,
+    _in_whole_image,
+    _is_inside_frame,
+    pad_to_training_height,
+    resize,
+)
 from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.io.calibration import read_calibration
@@ -39,14 +46,14 @@ def sample() -> tuple[np.ndarray, np.ndarray, Calibration]:
 def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
     settings = Settings()
     whole = np.zeros((845, 1055, 3), np.uint8)
-    density = 677.5 / 0.8
-    assert resize(whole, settings, density)[0].shape[:2] == resize(whole, settings, None)[0].shape[:2] == (676, 844)
-    assert resize(whole[:, 600:900], settings, density)[0].shape[:2] == (676, 240)
-    assert resize(np.pad(whole, ((0, 0), (500, 555), (0, 0))), settings, density)[0].shape[:2] == (676, 1688)
-    assert resize(whole, settings, 0.6 * density)[0].shape[:2] == (1127, 1407)  # a wider lens: enlarged
-    assert resize(whole, settings, 1.66 * density)[0].shape[:2] == (407, 508)
-    # Networks that learned from images of unknown cameras know no density.
-    assert resize(whole[:, :900], dataclasses.replace(settings, density=0.0), density)[0].shape[1] == 844
+    pixels_per_metre = 677.5 / 0.8
+    assert resize(whole, settings, pixels_per_metre)[0].shape[:2] == resize(whole, settings, None)[0].shape[:2] == (676, 844)
+    assert resize(whole[:, 600:900], settings, pixels_per_metre)[0].shape[:2] == (676, 240)
+    assert resize(np.pad(whole, ((0, 0), (500, 555), (0, 0))), settings, pixels_per_metre)[0].shape[:2] == (676, 1688)
+    assert resize(whole, settings, 0.6 * pixels_per_metre)[0].shape[:2] == (1127, 1407)  # a wider lens: enlarged
+    assert resize(whole, settings, 1.66 * pixels_per_metre)[0].shape[:2] == (407, 508)
+    # Networks that learned from images of unknown cameras have no resolution.
+    assert resize(whole[:, :900], dataclasses.replace(settings, pixels_per_metre=0.0), pixels_per_metre)[0].shape[1] == 844
 
 
 @pytest.mark.parametrize(
@@ -55,7 +62,7 @@ def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
 def test_images_of_other_views_get_the_lines_that_networks_know(lines, kept, added):
     """The middle of a wide lens's image; a long lens's image between black lines."""
     image = np.repeat(np.arange(1, lines + 1)[:, None, None], 40, axis=1) * np.ones(3, int)
-    usual, above = usual_lines(image, Settings())
+    usual, above = pad_to_training_height(image, Settings())
     assert usual.shape == (kept, 40, 3) and above == added
     middle = usual[kept // 2, 0, 0]
     assert abs(middle - (lines // 2 + 1)) <= 1
@@ -87,7 +94,7 @@ def test_lenses_that_were_not_tried_are_told(focal, size, distance, told):
         assert fault is None
     else:
         assert fault is not None and told in fault and "that were tried: use" in fault and "\n" not in fault
-        assert f"{TRIED.density:.0f}" in fault or f"{TRIED.view:.2f} m" in fault
+        assert f"{TRIED.pixels_per_metre:.0f}" in fault or f"{TRIED.view:.2f} m" in fault
 
 
 def test_widths_do_not_depend_on_crops_borders_and_lenses():
@@ -144,9 +151,9 @@ def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, 
     left, right, finds = stalks_at(disparity)
     asked = []
 
-    def find(image: np.ndarray, density: float | None) -> list[Detection]:
-        assert density is not None
-        asked.append(CAMERA.focal / density)
+    def find(image: np.ndarray, pixels_per_metre: float | None) -> list[Detection]:
+        assert pixels_per_metre is not None
+        asked.append(CAMERA.focal / pixels_per_metre)
         return finds if abs(asked[-1] * disparity / 54.2 - 1.0) < 0.12 else []
 
     view = view_pair(find, left, right, CAMERA)
@@ -232,12 +239,14 @@ def test_finds_on_borders_are_none_and_masks_end_before_them():
     shown = np.ones((100, 80), bool)
     shown[:, :30] = False
     frame = Frame((0, 100), (0, 80), shown)
-    assert not _is_shown(np.array([10, 10, 30, 90, 20, 20]), frame) and _is_shown(np.array([40, 10, 60, 90, 50, 50]), frame)
+    assert not _is_inside_frame(np.array([10, 10, 30, 90, 20, 20]), frame) and _is_inside_frame(
+        np.array([40, 10, 60, 90, 50, 50]), frame
+    )
     mask = np.ones((4, 20), np.float32)
     mask[2:, :5] = 0.0
-    np.testing.assert_array_equal(_without_border(mask, (10, 25), frame).any(axis=1), [False, False, True, True])
+    np.testing.assert_array_equal(_clear_border_rows(mask, (10, 25), frame).any(axis=1), [False, False, True, True])
     find = Detection((1.0, 2.0, 3.0, 4.0), (1.5, 2.5), 1.0, mask, (2, 1), (mask, (0, 1)))
-    moved = _moved(find, Frame((7, 100), (30, 80)))
+    moved = _in_whole_image(find, Frame((7, 100), (30, 80)))
     assert moved.box == (31.0, 9.0, 33.0, 11.0) and moved.axis == (31.5, 32.5) and moved.corner == (9, 31)
     assert moved.upper is not None and moved.upper[1] == (7, 31)
 

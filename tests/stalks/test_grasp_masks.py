@@ -60,7 +60,7 @@ def test_generators_learn_to_paint_stripes(loss, tmp_path):
     settings = Settings(loss, (8, 16))
     reports = []
     plan = Plan(steps=100, images=4, first=4, batch=4, crop=32, rate=2e-2, average=0.9)
-    params, steps = train([map(striped, range(4))], settings, plan, lambda *parts: reports.append(parts), every=0.0)
+    params, steps = train([map(striped, range(4))], settings, plan, lambda *parts: reports.append(parts), report_interval=0.0)
     assert steps == 100 and reports and all(np.isfinite(list(report[3].values())).all() for report in reports)
     path = tmp_path / "w.safetensors"
     write_weights(path, params, settings, {"origin": "stripes"})
@@ -83,7 +83,7 @@ def test_training_tells_what_goes_wrong():
     settings = Settings("segmentation", (8, 16))
     plan = Plan(steps=8, images=1, first=1, batch=4, crop=32, rate=float("nan"))
     with pytest.raises(NonFiniteError, match="not finite at step 8"):
-        train([iter([striped(0)])], settings, plan, lambda *parts: None, every=0.0)
+        train([iter([striped(0)])], settings, plan, lambda *parts: None, report_interval=0.0)
     with pytest.raises(RequestError, match="before the first update"):
         train([iter([striped(0)])], settings, dataclasses.replace(plan, minutes=1e-9), lambda *parts: None)
 

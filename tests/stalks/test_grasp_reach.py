@@ -119,7 +119,7 @@ def test_what_can_be_reached_is_what_the_geometry_allows(place: tuple[float, flo
 def test_the_way_is_a_straight_line_out_of_the_shoulder():
     timing, target = control.Timing(), jnp.array([0.2, 0.05, 0.9])
     times = jnp.linspace(timing.turn, timing.reach, 30)
-    way = np.asarray(jax.vmap(lambda time: control.planned(target, jnp.asarray(control.HOME), time, timing))(times))
+    way = np.asarray(jax.vmap(lambda time: control.plan_movement(target, jnp.asarray(control.HOME), time, timing))(times))
     np.testing.assert_allclose(way[-1], target, atol=1e-5)
     away, line = way[:, :2] - stalk_arm.SHOULDER, np.asarray(target)[:2] - stalk_arm.SHOULDER
     assert np.abs(away[:, 0] * line[1] - away[:, 1] * line[0]).max() < 1e-5
@@ -189,7 +189,7 @@ def test_a_stand_of_nothing_is_refused_in_one_line():
     with pytest.raises(ValueError, match="finite"):
         stands_at(row(), np.zeros(1), np.full((1, 3), np.nan))
     empty = stands_at(Plot(TRAINING, 0, (), ()), np.zeros(1), np.zeros((1, 3)))
-    assert not empty.present.any()
+    assert not empty.is_present.any()
 
 
 def test_a_stalk_gives_way_like_a_beam():
@@ -281,12 +281,12 @@ def test_wind_moves_stalks_away_from_blind_jaws_and_looking_helps():
         times.append(sight.time)
         return sight.stalks[:, slot]
 
-    seeing = reach(scenes, targets, key, wind, look=look)
+    seeing = reach(scenes, targets, key, wind, observer=look)
     assert times == pytest.approx([LOOK * count for count in range(1, 24)])
     assert seeing.held[:, slot].sum() > blind.held[:, slot].sum()
     assert not blind.held[:, slot].all()
     # Nothing seen, nothing changed.
-    idle = reach(scenes, targets, key, wind, look=lambda sight: np.full((8, 3), np.nan))
+    idle = reach(scenes, targets, key, wind, observer=lambda sight: np.full((8, 3), np.nan))
     np.testing.assert_array_equal(idle.taken, blind.taken)
 
 

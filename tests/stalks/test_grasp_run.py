@@ -1,6 +1,5 @@
 """Grasping: the command, on good and on bad input."""
 
-import csv
 import dataclasses
 import json
 import shutil
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from phenotype_plots import table
 from PIL import Image
 
 from jaxrl_vis import cli
@@ -48,11 +48,6 @@ def runs(spec) -> Path:
     folder = spec.parent / "runs"
     assert cli.main(["grasp", "synth", str(folder), "--spec", str(spec), *WIDTH, "--runs", "2"]) == 0
     return folder
-
-
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def grasp(folder: Path, out: Path, *words: str) -> int:

@@ -155,5 +155,5 @@ def test_what_does_not_belong_together_is_refused():
 def test_an_empty_row_says_none():
     found = score([], [])
     assert str(found.of_sent) == "attempts: exactly the target held: none" and found.runs == 0
-    assert "50.0% (1 of 2; " in str(grasp_score.Share("x", 1, 2))
-    assert len({each.name for each in found.shares}) == len(found.shares)
+    assert "50.0% (1 of 2; " in str(grasp_score.Proportion("x", 1, 2))
+    assert len({each.name for each in found.proportions}) == len(found.proportions)

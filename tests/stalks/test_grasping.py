@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from jaxrl_vis.stalks.grasping.evaluation.scoring import RunScore, match_stalks, stitch_error, summary, true_motion
-from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organised, redness, thinned
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organise, redness, subsample
 from jaxrl_vis.stalks.grasping.perception.lines import grasp_points
 from jaxrl_vis.stalks.grasping.perception.perceive import View, perceive
 from jaxrl_vis.stalks.grasping.perception.slices import slice_at, slice_points
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import joined, stalk_segments
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import join_segments, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Thinned, rigid, stitch
 from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration, Pose, draw, drive
@@ -83,7 +83,7 @@ def test_a_plane_is_matched_and_put_where_it_is(depth):
     found = match(left, right, CAMERA, MOUNT)
     assert np.isfinite(found[:, disparity + 8 :]).mean() > 0.98
     np.testing.assert_allclose(np.nanmedian(found), disparity, atol=0.1)
-    cloud = organised(found, np.zeros(found.shape, bool), CAMERA, MOUNT)
+    cloud = organise(found, np.zeros(found.shape, bool), CAMERA, MOUNT)
     assert cloud.points.shape == (320, 320, 3) and len(cloud.red_points()) == 0
     depth = CAMERA.focal * CAMERA.baseline / disparity
     # The middle of the image is that far away along a ray that points down by 15 degrees.
@@ -93,8 +93,8 @@ def test_a_plane_is_matched_and_put_where_it_is(depth):
 
 def test_thinning_takes_the_mean_of_each_cube():
     points = np.array([[0.001, 0.001, 0.001], [0.003, 0.003, 0.003], [0.5, 0.5, 0.5]])
-    np.testing.assert_allclose(thinned(points, 0.01), [[0.002] * 3, [0.5] * 3])
-    assert len(thinned(np.zeros((0, 3)), 0.01)) == 0
+    np.testing.assert_allclose(subsample(points, 0.01), [[0.002] * 3, [0.5] * 3])
+    assert len(subsample(np.zeros((0, 3)), 0.01)) == 0
 
 
 # --- stitching ---
@@ -178,7 +178,7 @@ def seen(
             depth[line[inside], column[inside]] = camera[inside, 2]
     red = np.isfinite(depth)
     background = np.where(red, depth, np.float32(0.9))
-    return organised(CAMERA.disparity(background).astype(np.float32), red, CAMERA, MOUNT)
+    return organise(CAMERA.disparity(background).astype(np.float32), red, CAMERA, MOUNT)
 
 
 STALKS = [(-0.25, 0.55, 0.05), (-0.13, 0.6, -0.08), (-0.05, 0.52, 0.0), (0.1, 0.57, 0.1)]
@@ -187,7 +187,7 @@ STALKS = [(-0.25, 0.55, 0.05), (-0.13, 0.6, -0.08), (-0.05, 0.52, 0.0), (0.1, 0.
 def found_in(clouds: list[Cloud], motions: list[Motion]):
     parts = [stalk_segments(cloud, CAMERA, MOUNT, frame) for frame, cloud in enumerate(clouds)]
     parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(motions, parts)]
-    return grasp_points(joined(parts), Visibility(tuple(clouds), tuple(motions), CAMERA, MOUNT))
+    return grasp_points(join_segments(parts), Visibility(tuple(clouds), tuple(motions), CAMERA, MOUNT))
 
 
 def test_a_line_per_stalk_in_spite_of_what_hides_it():
@@ -225,7 +225,7 @@ def both(one: Cloud, other: Cloud) -> Cloud:
     """What a pair sees of what is in two clouds."""
     depth = np.fmin(*(np.where(cloud.red, cloud.depth, np.float32(np.nan)) for cloud in (one, other)))
     red = np.isfinite(depth)
-    return organised(CAMERA.disparity(np.where(red, depth, np.float32(0.9))).astype(np.float32), red, CAMERA, MOUNT)
+    return organise(CAMERA.disparity(np.where(red, depth, np.float32(0.9))).astype(np.float32), red, CAMERA, MOUNT)
 
 
 def test_stalks_beside_each_other_in_one_pair_are_two():

@@ -9,7 +9,7 @@ import pytest
 from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
-from jaxrl_vis.stalks.phenotyping.detector.detect import initial
+from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
@@ -22,7 +22,7 @@ SIZE = (120, 100)
 
 @pytest.fixture
 def leaning() -> tuple[Detection, np.ndarray]:
-    """A find of a leaning strip of 9 pixels, whose snip goes on beyond its box, and its mask within the box."""
+    """A find of a leaning strip of 9 pixels, whose crop goes on beyond its box, and its mask within the box."""
     mask = np.zeros(SIZE, bool)
     for line in range(SIZE[0]):
         mask[line, 40 + line // 5 : 49 + line // 5] = True
@@ -65,11 +65,11 @@ def test_proposals_are_read_as_annotations(leaning, tmp_path):
 def test_label_writes_beside_the_images_and_keeps_what_is_there(tmp_path, capsys):
     detector, segmenter = jax.random.split(jax.random.key(3))
     blank = np.zeros((1, 32, 32, 3), np.float32)
-    params = {"detector": initial(TINY, detector), "segmenter": Segmenter(TINY.segmenter).init(segmenter, blank)}
+    params = {"detector": init_detector(TINY, detector), "segmenter": Segmenter(TINY.segmenter).init(segmenter, blank)}
     weights, images = tmp_path / "tiny.safetensors", tmp_path / "images"
     write_weights(weights, params, TINY, {"origin": "nothing"})
     images.mkdir()
-    words = ["phenotype", "label", str(images), "--weights", str(weights), "--least-score", "0"]
+    words = ["phenotype", "label", str(images), "--weights", str(weights), "--min-score", "0"]
     assert cli.main(words) == 2
     assert "there are no images in" in capsys.readouterr().err
     for name in ("a.png", "b.png"):

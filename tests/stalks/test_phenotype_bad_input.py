@@ -288,12 +288,12 @@ def test_a_lens_that_was_not_tried_gives_no_numbers(plots, tmp_path):
 
     def count(tried: LensRange | None) -> str:
         request = Request(tmp_path / "out", "strip", "truth", calibration, tried=tried)
-        (row,), _ = pipeline_run([plot], find_truth, request, say=said.__setitem__)
+        (row,), _ = pipeline_run([plot], find_truth, request, echo=said.__setitem__)
         assert (row["width_mean_mm"] == "") == (row["stalks"] == "") and (row["stalks"] == "") == (row["flag"] != "ok")
         return row["flag"]
 
-    assert count(LensRange(density=300.0, view=0.9)) == "ok" and not said
-    assert count(LensRange(density=400.0, view=0.9)) == "untried lens"
+    assert count(LensRange(pixels_per_metre=300.0, view=0.9)) == "ok" and not said
+    assert count(LensRange(pixels_per_metre=400.0, view=0.9)) == "untried lens"
     assert said[plot.name].startswith("untried lens (339 pixels per metre of a row 0.8") and "400" in said[plot.name]
     assert "No count: 339 pixels per metre" in (tmp_path / "out" / "qc.html").read_text()
     assert len((tmp_path / "out" / "stalks.csv").read_text().splitlines()) == 1

@@ -47,7 +47,7 @@ def test_several_processes_write_the_same(plots, results, tmp_path):
     ("words", "part"),
     [
         (["--workers", "0"], "--workers must be at least 1"),
-        (["--least-score", "2"], "--least-score must be from 0 to 1"),
+        (["--min-score", "2"], "--min-score must be from 0 to 1"),
         (["--speed", "0"], "--speed must be more than 0"),
         (["--calibration", "missing.yaml"], "there is no calibration"),
         (["--masks", "network", "--weights", "missing.safetensors"], "cannot read the weights"),
@@ -114,7 +114,7 @@ def test_eval_in_two_processes_and_after_a_stop_is_the_same(plots, tmp_path, cap
         (["train", "weights.safetensors", "--batch", "0"], "--batch"),
         (["eval", "--seed", "-1"], "--seed must be at least 0"),
         (["eval", "--workers", "0"], "--workers"),
-        (["eval", "--least-score", "2"], "--least-score must be from 0 to 1"),
+        (["eval", "--min-score", "2"], "--min-score must be from 0 to 1"),
         (["eval", "--weights", "missing.safetensors"], "cannot read the weights"),
         (["eval", "--masks", "truth", "--weights", "w.safetensors"], "leave out --weights"),
         (["eval", "--spec", "missing.toml"], "missing.toml"),

@@ -13,7 +13,7 @@ from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.detector.detect import initial
+from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
@@ -45,7 +45,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
     detector, segmenter = jax.random.split(jax.random.key(3))
     params = {
-        "detector": initial(TINY, detector),
+        "detector": init_detector(TINY, detector),
         "segmenter": Segmenter(TINY.segmenter).init(segmenter, np.zeros((1, 32, 32, 3), np.float32)),
     }
     write_weights(path, params, dataclasses.replace(TINY, candidates=7), {"origin": "nothing"})
@@ -60,7 +60,7 @@ def differences(one: Path, other: Path) -> dict[str, float]:
 
 
 def train(out: Path, folder: Path, *words: str) -> int:
-    return cli.main(["phenotype", "train", str(out), "--data", str(folder), "--batch", "4", "--snips", "4", *words])
+    return cli.main(["phenotype", "train", str(out), "--data", str(folder), "--batch", "4", "--crops", "4", *words])
 
 
 def test_training_goes_on_from_weights_and_boxes_leave_masks_alone(folder, weights, tmp_path, capsys):
@@ -72,7 +72,7 @@ def test_training_goes_on_from_weights_and_boxes_leave_masks_alone(folder, weigh
     assert "3 photographs, fewer than 5: none is held out" in said and not (tmp_path / "more.html").exists()
     _, settings, about = read_weights(tmp_path / "more.safetensors")
     # All the candidates of a new training; images are not resized, as boxes are as tall as the band.
-    assert settings == dataclasses.replace(TINY, density=0.0)
+    assert settings == dataclasses.replace(TINY, pixels_per_metre=0.0)
     assert about["origin"] == f"annotated images, from {weights}"
     changes = differences(tmp_path / "more.safetensors", weights)
     assert changes["detector"] > 1e-3 and changes["segmenter"] == 0.0
@@ -104,8 +104,10 @@ def test_boxes_of_another_size_start_from_random_weights_or_are_refused(folder, 
     # A calibration says how large the stalks are: 30 lines, where the weights that ship know 135.
     calibrated = tmp_path / "calibrated"
     shutil.copytree(folder, calibrated)
-    density = read_weights(SHIPPED)[1].density
-    write_calibration(calibrated / "calibration.yaml", Calibration(IMAGE[1], IMAGE[0], 0.8 * density, (31.5, 29.5), 0.1))
+    pixels_per_metre = read_weights(SHIPPED)[1].pixels_per_metre
+    write_calibration(
+        calibrated / "calibration.yaml", Calibration(IMAGE[1], IMAGE[0], 0.8 * pixels_per_metre, (31.5, 29.5), 0.1)
+    )
     assert train(tmp_path / "out.safetensors", calibrated, "--start", "shipped", "--steps", "1") == 2
     refusal = capsys.readouterr().err
     assert "30 pixels tall" in refusal and "135" in refusal and "--start random" in refusal
@@ -224,17 +226,17 @@ def test_a_box_that_is_not_there_is_the_one_around_the_mask(tmp_path, segmentati
         (found,) = read_annotations(coco_folder(tmp_path, {"segmentation": segmentation, **annotation}))["annotations"]
         assert found["bbox"] == BOX
     settings = settings_for(tmp_path, TINY)
-    assert settings.band_lines == 30.0 and settings.width == 48  # the image is reduced so that the box is as tall
+    assert settings.band_height == 30.0 and settings.width == 48  # the image is reduced so that the box is as tall
 
 
 def test_a_calibration_gives_the_scale_of_annotated_images(tmp_path):
     """Without one, images are reduced to one width, and so are those that the networks are used on."""
     coco_folder(tmp_path, {"bbox": BOX})
-    assert settings_for(tmp_path, TINY).density == 0.0
-    usual = TINY.density * 0.8
+    assert settings_for(tmp_path, TINY).pixels_per_metre == 0.0
+    usual = TINY.pixels_per_metre * 0.8
     write_calibration(tmp_path / "calibration.yaml", Calibration(IMAGE[1], IMAGE[0], 0.5 * usual, (31.5, 29.5), 0.1))
     settings = settings_for(tmp_path, TINY)
-    assert settings.density == TINY.density and settings.band_lines == 80.0
+    assert settings.pixels_per_metre == TINY.pixels_per_metre and settings.band_height == 80.0
     (example,) = annotated_examples(tmp_path, settings)
     assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 88.0
     without = [line for line in (tmp_path / "calibration.yaml").read_text().splitlines() if not line.startswith("image_")]
@@ -269,10 +271,10 @@ def test_masks_of_outlines_agree_with_boxes_and_runs(tmp_path):
     shapes = [{"label": "stalk", "points": [[30, 20], [44, 190]], "shape_type": "rectangle"}]
     about = {"shapes": shapes, "imagePath": "row.png", "imageWidth": 100, "imageHeight": 200}
     (tmp_path / "row.json").write_text(json.dumps(about))
-    settings = dataclasses.replace(TINY, width=100, full_width=100, snip_lines=192, snip_columns=32)
+    settings = dataclasses.replace(TINY, width=100, full_width=100, crop_height=192, crop_width=32)
     (of_rectangle,) = annotated_examples(tmp_path, settings)
     mask = of_rectangle.masks[0]
-    assert mask.any(axis=1).sum() == 170 and set(mask.sum(axis=1)) == {0, 14}  # lines of a snip may be shifted
+    assert mask.any(axis=1).sum() == 170 and set(mask.sum(axis=1)) == {0, 14}  # lines of a crop may be shifted
     data = {"images": [{"id": 1, "file_name": "row.png", "width": 100, "height": 200}]}
     for segmentation in (None, encode_mask(np.ones((170, 14), bool), (20, 30), size)):
         data["annotations"] = [{"image_id": 1, "bbox": [30, 20, 14, 170], "segmentation": segmentation}]

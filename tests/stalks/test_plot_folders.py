@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, Patterns, PlotFolder, find_plots
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
 from jaxrl_vis.stalks.phenotyping.io.naming.stamps import nearest, seconds_in
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometry, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometry
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -247,7 +247,7 @@ def test_odometry_in_every_form(tmp_path, table):
     driven = read_odometry(plot(tmp_path))
     assert driven is not None and driven.keys() == {Path(name).stem for name in NAMES}
     np.testing.assert_allclose(list(driven.values()), [0.0, 0.2, 0.4], atol=2e-4)
-    assert why_no_odometry(plot(tmp_path), driven, plot(tmp_path).pairs) is None
+    assert odometry_fault(plot(tmp_path), driven, plot(tmp_path).pairs) is None
 
 
 def test_odometry_of_a_spreadsheet_in_utf16(tmp_path):
@@ -261,7 +261,7 @@ def test_images_are_placed_between_rows_by_their_times(tmp_path):
     driven = read_odometry(plot(tmp_path, names))
     assert driven is not None and set(driven) == {Path(name).stem for name in names[:2]}
     np.testing.assert_allclose(list(driven.values()), [0.25, 0.875], atol=1e-6)
-    said = why_no_odometry(plot(tmp_path, names), driven, plot(tmp_path, names).pairs)
+    said = odometry_fault(plot(tmp_path, names), driven, plot(tmp_path, names).pairs)
     assert said is not None and names[2] in said
 
 

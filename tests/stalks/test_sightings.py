@@ -12,12 +12,12 @@ from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import PlotScore, average_precision, match, summary
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths
 from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries, read_odometry, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries, read_odometry
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement
 from jaxrl_vis.stalks.phenotyping.track.direction import follow_either_way
 from jaxrl_vis.stalks.phenotyping.track.follow import Track, follow
 from jaxrl_vis.stalks.phenotyping.track.heights import USUAL_TAPER, robust_width, stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _hidden_edges
+from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting, _occluded_edges
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import StalkInView
 
@@ -82,12 +82,12 @@ def test_odometry_by_distance_time_and_name(tmp_path):
     table.write_text("left,distance_m\nleft_9.png,0.5\nleft_0.png,0.25\n")
     driven = read_odometry(plot)
     assert driven == {"0": 0.25}
-    assert "has no row for left_1.png:" in str(why_no_odometry(plot, driven, plot.pairs))
-    assert why_no_odometry(plot, driven, plot.pairs[:1]) is None
+    assert "has no row for left_1.png:" in str(odometry_fault(plot, driven, plot.pairs))
+    assert odometry_fault(plot, driven, plot.pairs[:1]) is None
     with pytest.raises(RequestError, match="leave it out"):
         read_odometries([plot], speed=0.05)
     table.write_text("time_s\n1\n3\n")
-    assert "--speed" in str(why_no_odometry(plot, None, plot.pairs))
+    assert "--speed" in str(odometry_fault(plot, None, plot.pairs))
     assert read_odometries([plot], speed=0.05)[plot.name] is not None
     assert read_odometry(plot) is None
     assert read_odometry(plot, speed=0.05) == {"0": 0.05, "1": pytest.approx(0.15)}
@@ -273,7 +273,7 @@ def test_errors_of_widths_hold_what_pairs_share():
     assert error() == pytest.approx(0.07)
     assert error(width_px=14.0) == pytest.approx(math.hypot(0.7, 0.07))
     assert error(width_px=140.0) < 0.15 * error(width_px=14.0) + 0.07
-    assert error(hidden=True) == pytest.approx(math.hypot(0.8, 0.07))
+    assert error(occluded=True) == pytest.approx(math.hypot(0.8, 0.07))
 
 
 def test_widths_are_those_at_12_and_24_inches():
@@ -286,11 +286,11 @@ def test_widths_are_those_at_12_and_24_inches():
         return sighting(0.0, **{**values, "upper_deviation_mm": 0.1, "upper_confidence": 0.8, **parts})
 
     stalks = [[seen(2.0), seen(2.0), seen(2.2)] for _ in range(6)]
-    hidden = dict(upper_mm=None, upper_height_m=None)
+    occluded = dict(upper_mm=None, upper_height_m=None)
     stalks += [
-        [seen(-2.0, **hidden)] * 3,
-        [seen(0.0, height_m=None, **hidden)] * 3,
-        [seen(0.0, diameter_mm=None, **hidden)] * 3,
+        [seen(-2.0, **occluded)] * 3,
+        [seen(0.0, height_m=None, **occluded)] * 3,
+        [seen(0.0, diameter_mm=None, **occluded)] * 3,
     ]
     tracks = [Track(tuple((stalk, place) for place in range(3)), 0.0, 0.8, True, "") for stalk in range(len(stalks))]
     found = stalk_widths(stalks, tracks)
@@ -317,18 +317,20 @@ def test_an_edge_that_another_stalk_hides_is_not_its_own():
 
     # The second stands before the right edge of the first; the third touches nothing, nor does the one that was not measured.
     found = [stalk(100.0, 0.80), stalk(130.0, 0.77), stalk(300.0, 0.80), Measurement(line=600.0)]
-    assert _hidden_edges(found) == [True, False, False, False]
+    assert _occluded_edges(found) == [True, False, False, False]
     # Of two that stand equally far away, either may hide the other's edge.
-    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [True, True]
-    assert _hidden_edges([found[0], dataclasses.replace(found[1], depth=0.83)]) == [False, True]
+    assert _occluded_edges([found[0], dataclasses.replace(found[1], depth=0.799)]) == [True, True]
+    assert _occluded_edges([found[0], dataclasses.replace(found[1], depth=0.83)]) == [False, True]
 
 
 def test_a_stalk_that_is_partly_hidden_is_at_least_as_thick_as_it_looks():
-    hidden = [sighting(0.0, diameter_mm=each, hidden=True) for each in (8.0, 10.0, 12.0, 13.0, 13.8, 14.0)]
+    occluded = [sighting(0.0, diameter_mm=each, occluded=True) for each in (8.0, 10.0, 12.0, 13.0, 13.8, 14.0)]
     clear = [sighting(0.0, diameter_mm=14.0 + each) for each in (-0.1, 0.0, 0.1)]
-    assert robust_width([*hidden, *clear]).mm == pytest.approx(14.0, abs=0.01)  # pyright: ignore[reportOptionalMemberAccess]
-    assert robust_width(hidden).mm == pytest.approx(13.7, abs=0.31)  # pyright: ignore[reportOptionalMemberAccess]
-    above = [dataclasses.replace(each, upper_mm=each.diameter_mm, upper_hidden=each.hidden, hidden=False) for each in hidden]
+    assert robust_width([*occluded, *clear]).mm == pytest.approx(14.0, abs=0.01)  # pyright: ignore[reportOptionalMemberAccess]
+    assert robust_width(occluded).mm == pytest.approx(13.7, abs=0.31)  # pyright: ignore[reportOptionalMemberAccess]
+    above = [
+        dataclasses.replace(each, upper_mm=each.diameter_mm, upper_occluded=each.occluded, occluded=False) for each in occluded
+    ]
     heights = [dataclasses.replace(each, height_m=12 * 0.0254, upper_height_m=24 * 0.0254) for each in above]
     (found,) = stalk_widths([heights], [Track(tuple((0, place) for place in range(6)), 0.0, 0.8, True, "")])
     assert found.lower.mm < 13.0 < found.upper.mm  # pyright: ignore[reportOptionalMemberAccess]
@@ -338,14 +340,14 @@ def test_a_stalk_that_is_partly_hidden_is_at_least_as_thick_as_it_looks():
 
 
 def test_finds_are_matched_as_coco_matches_them():
-    clear, hidden = (StalkInView(name, (0, 0, 1, 1), None, share, 9, box, share) for name, share, box in (
+    clear, occluded = (StalkInView(name, (0, 0, 1, 1), None, share, 9, box, share) for name, share, box in (
         (4, 0.9, (0.0, 0.0, 40.0, 500.0)), (5, 0.1, (100.0, 0.0, 140.0, 500.0))))  # fmt: skip
 
     def find(left: float, score: float) -> Detection:
         return Detection((left, 0.0, left + 40.0, 500.0), (left, left), score, np.zeros((1, 1)), (0, 0))
 
     finds = [find(2.0, 0.6), find(1.0, 0.9), find(101.0, 0.8), find(300.0, 0.7)]
-    owners, scored = match(finds, [clear, hidden])
+    owners, scored = match(finds, [clear, occluded])
     assert owners == [None, 4, 5, None]
     assert sorted(scored) == [(0.6, 0.0), (0.7, 0.0), (0.9, 1.0)]
 

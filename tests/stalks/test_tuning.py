@@ -12,17 +12,17 @@ import pytest
 from tiny_detector import IMAGE, TINY
 
 from jaxrl_vis import cli
-from jaxrl_vis.stalks.phenotyping.detector.detect import initial, padded_shape
+from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector, padded_shape
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.training.detector_training import beginning, image_batch, update_networks
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, cut_out, resized_snips, settings_for
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, cut_out, resize_crops, settings_for
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, match_finds, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import photographs_of, split
 from jaxrl_vis.stalks.phenotyping.training.tuning import FROZEN, Tuning, tune
 
-SETTINGS = dataclasses.replace(TINY, density=0.0)
+SETTINGS = dataclasses.replace(TINY, pixels_per_metre=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def params() -> dict:
     detector, segmenter = jax.random.split(jax.random.key(3))
     blank = np.zeros((1, 32, 32, 3), np.float32)
-    return {"detector": initial(SETTINGS, detector), "segmenter": Segmenter(SETTINGS.segmenter).init(segmenter, blank)}
+    return {"detector": init_detector(SETTINGS, detector), "segmenter": Segmenter(SETTINGS.segmenter).init(segmenter, blank)}
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def tuned(folder, params):
     names = [f"{number}.png" for number in range(8)]
     parts = split(photographs_of(names, [example.image for example in examples]), 0)
     lines: list[str] = []
-    plan = Tuning(steps=50, minutes=None, batch=4, snips=4, rate=0.0, look=1, patience=3)
+    plan = Tuning(steps=50, minutes=None, batch=4, crops=4, rate=0.0, look=1, patience=3)
     return parts, lines, tune(examples, parts, settings, plan, params, lines.append)
 
 
@@ -121,7 +121,7 @@ def test_training_ends_where_held_out_images_do_not_become_better(tuned):
 def test_first_layers_stay_and_a_report_shows_held_out_images(folder, params, tmp_path, capsys):
     start, out = tmp_path / "start.safetensors", tmp_path / "mine.safetensors"
     write_weights(start, params, SETTINGS, {"origin": "nothing"}, bits=32)
-    words = ["--start", str(start), "--minutes", "0.001", "--batch", "4", "--snips", "4", "--rate", "0.3"]
+    words = ["--start", str(start), "--minutes", "0.001", "--batch", "4", "--crops", "4", "--rate", "0.3"]
     assert cli.main(["phenotype", "train", str(out), "--data", str(folder), *words]) == 0
     said = capsys.readouterr().out
     assert said.splitlines()[0].endswith(f"reading the annotations in {folder} ...")
@@ -160,8 +160,8 @@ def differences(before: dict, after: dict) -> dict[str, float]:
 
 
 def test_images_are_resized_so_that_boxes_are_as_tall_as_the_band(folder):
-    settings = settings_for(folder, dataclasses.replace(SETTINGS, band_lines=60.0))
-    assert settings.width == 2 * IMAGE[1] and settings.band_lines == 60.0 and settings.full_width == 2 * IMAGE[1]
+    settings = settings_for(folder, dataclasses.replace(SETTINGS, band_height=60.0))
+    assert settings.width == 2 * IMAGE[1] and settings.band_height == 60.0 and settings.full_width == 2 * IMAGE[1]
     example = next(iter(annotated_examples(folder, settings)))
     assert example.image.shape == (2 * IMAGE[0], 2 * IMAGE[1], 3) and example.stalks[0, 3] == 90.0
 
@@ -181,5 +181,5 @@ def test_cut_examples_keep_the_stalks_that_show():
         for box, kind, whole in zip(cut.stalks, cut.kinds, stalks):
             if kind == STALK and left <= whole[0] and whole[2] <= left + 60:
                 np.testing.assert_allclose(box, whole - [left, 0, left, 0, left, left])
-    resized = resized_snips(example, (80, 24))
-    assert resized.snips.shape == (2, 80, 24, 3) and resized.masks.shape == (2, 80, 24) and resized.masks.all()
+    resized = resize_crops(example, (80, 24))
+    assert resized.crops.shape == (2, 80, 24, 3) and resized.masks.shape == (2, 80, 24) and resized.masks.all()

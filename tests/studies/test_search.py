@@ -46,7 +46,7 @@ class Script:
     def __init__(self, **behaviour: str):
         self.behaviour, self.calls = behaviour, []
 
-    def __call__(self, cell: Cell, folder: Path, goes_on: bool) -> Sequence[str]:
+    def __call__(self, cell: Cell, folder: Path, is_resumed: bool) -> Sequence[str]:
         self.calls.append((cell.family, cell.config.run.batch_size))
         words = [str(folder), saved(cell), str(cell.config.run.env_steps), str(cell.config.run.batch_size)]
         return [sys.executable, "-c", SCRIPT, *words, self.behaviour.get(cell.family, "")]

@@ -73,10 +73,10 @@ class Script:
     def __init__(self, **behaviour: str):
         self.behaviour, self.calls = behaviour, []
 
-    def __call__(self, cell: Cell, folder: Path, goes_on: bool) -> Sequence[str]:
-        self.calls.append((cell.family, goes_on))
+    def __call__(self, cell: Cell, folder: Path, is_resumed: bool) -> Sequence[str]:
+        self.calls.append((cell.family, is_resumed))
         words = [str(folder), str(cell.config.run.env_steps), str(cell.config.run.seeds), saved(cell)]
-        return [sys.executable, "-c", SCRIPT, *words, self.behaviour.get(cell.family, ""), *["--resume"] * goes_on]
+        return [sys.executable, "-c", SCRIPT, *words, self.behaviour.get(cell.family, ""), *["--resume"] * is_resumed]
 
 
 def seen(runs: Path, cell: Cell) -> list[list]:
@@ -117,10 +117,10 @@ def test_a_cell_that_trained_with_other_settings_says_which(tmp_path: Path) -> N
     cell = make_cell("a")
     script = Script()
 
-    def trains_another(_: Cell, folder: Path, goes_on: bool) -> Sequence[str]:
-        return script(dataclasses.replace(cell, config=cell.config.replace(discount=0.5)), folder, goes_on)
+    def trains_another(_: Cell, folder: Path, is_resumed: bool) -> Sequence[str]:
+        return script(dataclasses.replace(cell, config=cell.config.replace(discount=0.5)), folder, is_resumed)
 
-    (failure,) = run_cells([cell], tmp_path, lambda: CPU, command=trains_another, say=lambda _: None)
+    (failure,) = run_cells([cell], tmp_path, lambda: CPU, command=trains_another, echo=lambda _: None)
     assert "ended before it was finished" in failure and "discount (saved 0.5, asked" in failure
 
 
@@ -214,7 +214,7 @@ def test_a_second_signal_does_not_wait(tmp_path: Path, monkeypatch: pytest.Monke
     real_sleep = time.sleep
     monkeypatch.setattr("jaxrl_vis.studies.engine.grid.time.sleep", sleep)
     with pytest.raises(KeyboardInterrupt):
-        run_cells([cell], tmp_path, lambda: CPU, command=deaf, say=lambda _: None)
+        run_cells([cell], tmp_path, lambda: CPU, command=deaf, echo=lambda _: None)
     with pytest.raises(ProcessLookupError):
         os.kill(pids[0], 0)
 
@@ -310,7 +310,7 @@ def test_real_runs_are_trained_and_a_wrong_one_says_why(tmp_path: Path) -> None:
     own = {"env": "point_mass:PointMass", "env_folder": str(Path(__file__).parents[1]), "env_steps": 80, "seeds": 1}
     own |= {"image_size": 8, "encoder_filters": (4,), "eval_episodes": 2}  # as in test_own_tasks: it is compiled once for both
     cells = [make_cell("wrong", **own, batch_size=0), make_cell("right", **own)]
-    failures = run_cells(cells, tmp_path, lambda: CPU, say=lambda _: None)
+    failures = run_cells(cells, tmp_path, lambda: CPU, echo=lambda _: None)
     assert len(failures) == 1 and "wrong-80: failed with exit status 2" in failures[0]
     assert "batch_size must be at least 1, not 0" in failures[0]
     assert not (tmp_path / cells[0].name).exists()

@@ -40,7 +40,7 @@ def test_every_task_is_trained_with_every_method_and_seed(tmp_path: Path) -> Non
 
 def test_a_finished_sweep_trains_nothing_and_shows_what_was_reached(tmp_path: Path) -> None:
     request = make_request(tmp_path, tasks=("Reacher",))
-    assert run_cells(make_cells(request), tmp_path, lambda: CPU, command=Script(), say=lambda line: None) == []
+    assert run_cells(make_cells(request), tmp_path, lambda: CPU, command=Script(), echo=lambda line: None) == []
     said: list[str] = []
     assert run_sweep(request, said.append)
     head, *lines = said

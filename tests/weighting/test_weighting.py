@@ -13,9 +13,9 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 from weighting_problem import (
+    MODES,
     NAMES,
     OPTIONS,
-    WAYS,
     assert_close,
     begin,
     encode,
@@ -269,8 +269,8 @@ def test_parts_of_a_batch_on_several_devices_are_one_batch() -> None:
     @jax.jit
     def on_both() -> Any:
         found = []
-        for way in WAYS:
-            gradient = gradient_by(way, weighting, reduce=lambda tree: jax.lax.pmean(tree, "devices"))
+        for mode in MODES:
+            gradient = gradient_by(mode, weighting, reduce=lambda tree: jax.lax.pmean(tree, "devices"))
             found.append(jax.vmap(gradient, in_axes=(None, None, 0), axis_name="devices")(params, state, parts))
         return weighted_grad(losses_of, weighting, encoder_of)(params, state, batch), found
 
@@ -298,7 +298,7 @@ assert_close(gradient(params, state, spread), gradient(params, state, batch))
 upgrad = make_weighting("upgrad")
 options = {"shared": encoder_of, "encode": encode}
 of_part = weighted_grad(
-    losses_of_latents, upgrad, way="latents", reduce=lambda tree: jax.lax.pmean(tree, "data"), **options
+    losses_of_latents, upgrad, mode="latents", reduce=lambda tree: jax.lax.pmean(tree, "data"), **options
 )
 specs = (PartitionSpec(), PartitionSpec(), PartitionSpec("data"))
 of_parts = jax.jit(jax.shard_map(of_part, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(), check_vma=False))
@@ -320,8 +320,8 @@ def test_what_comes_beside_the_losses() -> None:
     def with_more(params: Any, latent: Any, batch: Any) -> Any:
         return losses_of_latents(params, latent, batch), {"size": jnp.sum(batch["x"])}
 
-    for way in WAYS:
-        gradient = weighted_grad(with_more, weighting, encoder_of, way, has_aux=True, encode=encode)
+    for mode in MODES:
+        gradient = weighted_grad(with_more, weighting, encoder_of, mode, has_aux=True, encode=encode)
         found = jax.eval_shape(gradient, params, state, batch)
         assert jax.tree.map(lambda leaf: leaf.shape, found.extra) == {"size": ()}
 
@@ -351,8 +351,8 @@ def test_what_comes_beside_the_losses() -> None:
         (lambda: make_weighting("ol_aux").init((MAIN,)), ["no auxiliary loss", "none_log"]),
         (lambda: make_weighting("balance").init(("near", "far")), ["no loss is called 'main'"]),
         (lambda: make_weighting("sum").init((MAIN, "near", "near")), ["two losses are called 'near'"]),
-        (lambda: weighted_grad(losses_of, make_weighting("sum"), way="per_los"), ["'per_los'", "did you mean per_loss"]),
-        (lambda: weighted_grad(losses_of, make_weighting("sum"), way="latents"), ["give encode"]),
+        (lambda: weighted_grad(losses_of, make_weighting("sum"), mode="per_los"), ["'per_los'", "did you mean per_loss"]),
+        (lambda: weighted_grad(losses_of, make_weighting("sum"), mode="latents"), ["give encode"]),
         (
             lambda: jax.jit(weighted_grad(losses_of, make_weighting("sum")))(
                 *in_float32(problem(0))[:1], WRONG, in_float32(problem(0)[1])
@@ -372,8 +372,8 @@ def test_bad_requests_get_one_line(make: Any, parts: list[str]) -> None:
 WRONG = make_weighting("sum").init((MAIN, "other"))
 
 
-@pytest.mark.parametrize("way", [way for way in WAYS if way != "latents"])
-def test_losses_of_another_form_get_one_line(way: Any) -> None:
+@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "latents"])
+def test_losses_of_another_form_get_one_line(mode: Any) -> None:
     weighting = make_weighting("sum")
     for losses_fn, has_aux, wrong in (
         (lambda point: {MAIN: point**2, "near": jnp.sum(point)}, False, "loss 'main' has shape (2,) and must be one number"),
@@ -382,7 +382,7 @@ def test_losses_of_another_form_get_one_line(way: Any) -> None:
         (lambda point: {MAIN: jnp.sum(point), "near": jnp.sum(point)}, True, "losses by name, and what is beside them"),
     ):
         with pytest.raises(RequestError) as caught:
-            weighted_grad(losses_fn, weighting, way=way, has_aux=has_aux)(jnp.ones(2), weighting.init((MAIN, "near")))
+            weighted_grad(losses_fn, weighting, mode=mode, has_aux=has_aux)(jnp.ones(2), weighting.init((MAIN, "near")))
         assert wrong in str(caught.value)
 
 

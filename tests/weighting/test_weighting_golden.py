@@ -307,7 +307,7 @@ def test_auxinash_bargains_with_learned_preferences() -> None:
         """Of loss b, per unit of step size."""
         return float(gramian[1] @ np.asarray(solvers.bargain(jnp.asarray(gramian), jnp.asarray(shares))))
 
-    slopes = np.array([(decrease(shares + 1e-5 * way) - decrease(shares - 1e-5 * way)) / 2e-5 for way in np.eye(3)])
+    slopes = np.array([(decrease(shares + 1e-5 * mode) - decrease(shares - 1e-5 * mode)) / 2e-5 for mode in np.eye(3)])
     found = learned.preference_slope(jnp.asarray(gramian), jnp.asarray(shares), jnp.asarray(weights), 1)
     np.testing.assert_allclose(found, -slopes * weights[1], rtol=1e-5)
     # A loss that opposes the main one loses its say, and one that helps gains.
@@ -371,10 +371,10 @@ def spying(seen: list[Any]) -> Iterator[jw.Weighting]:
 def test_both_ways_find_the_explicit_gramian() -> None:
     params, batch = problem(0)
     expected = explicit_gramian(params, batch)
-    for way in ("per_loss", "latents"):
+    for mode in ("per_loss", "latents"):
         seen: list[Any] = []
         with spying(seen) as weighting:
-            gradient = jw.weighted_grad(losses_of_latents, weighting, encoder_of, way, encode=encode)
+            gradient = jw.weighted_grad(losses_of_latents, weighting, encoder_of, mode, encode=encode)
             result = gradient(params, weighting.init(tuple(params["heads"])), batch)
         assert seen[0].dtype == jnp.float64
         np.testing.assert_allclose(seen[0], expected, rtol=1e-10)

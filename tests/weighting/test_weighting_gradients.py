@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from weighting_problem import (
+    MODES,
     NAMES,
-    WAYS,
     assert_close,
     encode,
     encoder_gradients,
@@ -17,8 +17,8 @@ from weighting_problem import (
     gradient_by,
     in_float32,
     losses_of,
+    modes_of,
     problem,
-    ways_of,
     weighting_of,
 )
 
@@ -34,7 +34,7 @@ def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -
 
     @jax.jit
     def all_ways(params: Any, state: Any) -> Any:
-        found = [gradient_by(way, weighting)(params, state, batch) for way in ways_of(weighting)]
+        found = [gradient_by(mode, weighting)(params, state, batch) for mode in modes_of(weighting)]
         in_encoder, in_heads = found[0].weights, weighting.head_weights(found[0].weights)
         expected = {
             part: jax.grad(lambda params, weights=weights: weighting.objective(weights, losses_of(params, batch)))(params)[part]
@@ -59,9 +59,9 @@ def test_ways_agree_and_find_the_gradient_of_the_weighted_objective(case: str) -
         assert (moved >= 0).all() and (np.abs(moved - 1) > 0.001).all() and moved[0] != moved[1]
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("case", ["cosine", "cosine of logarithms", "ol_aux"])
-def test_heads_learn_while_their_loss_is_kept_out_of_the_encoder(case: str, way: Any) -> None:
+def test_heads_learn_while_their_loss_is_kept_out_of_the_encoder(case: str, mode: Any) -> None:
     params, batch = in_float32(problem(0))
     for name in NAMES[1:]:  # opposed to the main loss: the same head and targets with the other sign of the latents' error
         params["heads"][name], batch[name] = (
@@ -72,7 +72,7 @@ def test_heads_learn_while_their_loss_is_kept_out_of_the_encoder(case: str, way:
     weighting = weighting_of(case)._replace(heads="always")
     state = weighting.init(NAMES)
     state = state.replace(weights={MAIN: jnp.ones(()), "near": jnp.zeros(()), "far": jnp.zeros(())})
-    found = gradient_by(way, weighting)(params, state, batch)
+    found = gradient_by(mode, weighting)(params, state, batch)
     gradients = jax.jacrev(losses_of)(params, batch)
     slopes = weighting.slopes(losses_of(params, batch))
     assert [float(found.weights[name]) for name in NAMES] == [1, 0, 0]
@@ -81,18 +81,18 @@ def test_heads_learn_while_their_loss_is_kept_out_of_the_encoder(case: str, way:
         expected = slopes[name] * gradients[name]["heads"][name]
         assert_close(found.gradient["heads"][name], expected)
         assert np.abs(expected).max() > 0.01
-    still = gradient_by(way, weighting._replace(heads="weighted"))(params, state, batch)
+    still = gradient_by(mode, weighting._replace(heads="weighted"))(params, state, batch)
     assert not np.any(still.gradient["heads"]["near"])
 
 
-def passes_through_the_encoder(way: Any, losses: int) -> int:
+def passes_through_the_encoder(mode: Any, losses: int) -> int:
     """How often a step multiplies by the encoder's inputs: once a forward pass, a backward pass or a tangent."""
     params, batch = in_float32(problem(0))
     names = [MAIN, *(f"other{number}" for number in range(losses - 1))]
     params["heads"] = {name: params["heads"][MAIN] for name in names}
     batch = {"x": batch["x"], **{name: batch[MAIN] for name in names}}
     weighting = make_weighting("ol_aux")
-    gradient = gradient_by(way, weighting)
+    gradient = gradient_by(mode, weighting)
     equations = jax.make_jaxpr(gradient)(params, weighting.init(names), batch).eqns
     products = [each for each in equations if each.primitive.name == "dot_general"]
     return sum(batch["x"].shape in [operand.aval.shape for operand in each.invars] for each in products)
@@ -128,11 +128,11 @@ def losses_of_halves(params: Any, latents: Any, batch: Any) -> dict[str, Any]:
 def test_latents_in_groups(case: str) -> None:
     weighting = weighting_of(case)
     params, batch = in_float32(problem(0))
-    ways = WAYS
+    ways = MODES
 
     @jax.jit
     def all_ways(params: Any, state: Any) -> Any:
-        gradients = [weighted_grad(losses_of_halves, weighting, encoder_of, way, encode=halves()) for way in ways]
+        gradients = [weighted_grad(losses_of_halves, weighting, encoder_of, mode, encode=halves()) for mode in ways]
         return [gradient(params, state, batch) for gradient in gradients]
 
     state = weighting.init(NAMES)
@@ -174,7 +174,7 @@ def test_dots_are_those_of_finite_differences() -> None:
 
     @jax.jit
     def both_ways(params: Any, batch: Any) -> list[dict[str, jax.Array]]:
-        found = [gradient_by(way, weighting) for way in WAYS]
+        found = [gradient_by(mode, weighting) for mode in MODES]
         return [gradient(params, weighting.init(NAMES), batch).metrics for gradient in found]
 
     for seed in range(3):
@@ -205,7 +205,7 @@ def test_bfloat16() -> None:
 
     @jax.jit
     def all_ways(params: Any) -> Any:
-        return [gradient_by(way, weighting)(params, weighting.init(NAMES), batch) for way in WAYS]
+        return [gradient_by(mode, weighting)(params, weighting.init(NAMES), batch) for mode in MODES]
 
     exact = all_ways(params)[0]
     for coarse in all_ways(jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), params)):

@@ -355,9 +355,9 @@ class Compiled:
                     follow()
 
             call()
-            self._calls[with_actor, with_targets] = self._captured(call) if on_gpu else call
+            self._calls[with_actor, with_targets] = self._capture_graph(call) if on_gpu else call
 
-    def _captured(self, call: Callable[[], None]) -> Callable[[], None]:
+    def _capture_graph(self, call: Callable[[], None]) -> Callable[[], None]:
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):

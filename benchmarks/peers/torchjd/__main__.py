@@ -42,13 +42,13 @@ def equality(python: Path, jacobians: int, results: Path) -> int:
     from benchmarks.peers.torchjd import ours
 
     arrays = draw(jacobians // len(COUNTS))
-    with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(1) as beside:
-        given, found = Path(folder) / "jacobians.npz", Path(folder) / "results.npz"
-        np.savez(given, **arrays)  # pyright: ignore[reportArgumentType]
-        peer = beside.submit(run_peer, python, "peer.py", str(given), str(found))
+    with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(1) as pool:
+        inputs, outputs = Path(folder) / "jacobians.npz", Path(folder) / "results.npz"
+        np.savez(inputs, **arrays)  # pyright: ignore[reportArgumentType]
+        peer = pool.submit(run_peer, python, "peer.py", str(inputs), str(outputs))
         mine = ours.results(arrays)
         peer.result()
-        theirs = dict(np.load(found))
+        theirs = dict(np.load(outputs))
     return keep(arrays, mine, theirs, results)
 
 
@@ -84,9 +84,9 @@ def main() -> int:
     cost_options.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args()
     if options.action == "equality":
-        least = len(COUNTS) * max(COUNTS)
-        if options.jacobians < least:
-            parser.error(f"--jacobians must be at least {least}, for some of every rank")
+        minimum = len(COUNTS) * max(COUNTS)
+        if options.jacobians < minimum:
+            parser.error(f"--jacobians must be at least {minimum}, for some of every rank")
         return equality(options.python, options.jacobians, options.results)
     from benchmarks.peers.torchjd import cost
 

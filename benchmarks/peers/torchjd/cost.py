@@ -52,7 +52,7 @@ class Size:
 
 def names_of(count: int) -> tuple[str, ...]:
     """Return the names of K losses, the main one first."""
-    return (jw.MAIN, *(f"other_{place}" for place in range(count - 1)))
+    return (jw.MAIN, *(f"other_{index}" for index in range(count - 1)))
 
 
 def problem(size: Size, count: int) -> tuple[dict[str, Any], dict[str, jax.Array]]:
@@ -103,22 +103,22 @@ def time_method(name: str, size: Size, count: int) -> list[dict[str, Any]]:
     """Time one weighting for K losses: a row for the weighting alone, and one for a step by each method that it allows."""
     weighting, (params, batch) = jw.make_weighting(name), problem(size, count)
     state = weighting.init(names_of(count), params["trunk"])
-    losses = {each: jnp.float32(1.0) for each in names_of(count)}
+    losses = {loss: jnp.float32(1.0) for loss in names_of(count)}
     gradients = {
-        each: [jax.random.normal(jax.random.key(place), layer.shape) for layer in params["trunk"]]
-        for place, each in enumerate(names_of(count))
+        loss: [jax.random.normal(jax.random.key(index), layer.shape) for layer in params["trunk"]]
+        for index, loss in enumerate(names_of(count))
     }
     statistics_of = jax.jit(lambda gradients: jw.measure(weighting, losses, gradients))(gradients)
     base = {"method": name, "losses": count}
     rows = [base | {"what": "alone", "seconds": time_call(weighting.update, (losses, statistics_of, state), size.repeats)}]
-    for way in ("per_loss", "latents") if weighting.needs != "gradients" else ("per_loss",):
-        gradient = jw.weighted_grad(losses_of, weighting, lambda params: params["trunk"], way, encode=encode)
+    for mode in ("per_loss", "latents") if weighting.needs != "gradients" else ("per_loss",):
+        gradient = jw.weighted_grad(losses_of, weighting, lambda params: params["trunk"], mode, encode=encode)
 
         def step(params: Any, state: Any, batch: Any, gradient: Any = gradient) -> Any:
             result = gradient(params, state, batch)
             return result.gradient, result.state, result.weights
 
-        rows.append(base | {"what": f"step, {way}", "seconds": time_call(step, (params, state, batch), size.repeats)})
+        rows.append(base | {"what": f"step, {mode}", "seconds": time_call(step, (params, state, batch), size.repeats)})
     return rows
 
 

@@ -14,11 +14,11 @@ _ROUNDING = 1e-6
 """Norm of a step, relative to the largest gradient norm, below which it counts as 0."""
 
 
-def relative(one: np.ndarray, other: np.ndarray, least: np.ndarray | float = _TINY) -> np.ndarray:
-    """Return the distance between rows [n], relative to the norm of the second one, or to ``least`` if the norm is smaller."""
+def relative(one: np.ndarray, other: np.ndarray, floor: np.ndarray | float = _TINY) -> np.ndarray:
+    """Return the distance between rows [n], relative to the norm of the second one, or to ``floor`` if the norm is smaller."""
     axes = tuple(range(1, one.ndim))
     length = np.sqrt((other**2).sum(axis=axes))
-    return np.sqrt(((one - other) ** 2).sum(axis=axes)) / np.maximum(length, least)
+    return np.sqrt(((one - other) ** 2).sum(axis=axes)) / np.maximum(length, floor)
 
 
 def gap(jacobian: np.ndarray, weights: np.ndarray) -> float:
@@ -101,7 +101,7 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
             jacobians, ranks = arrays[f"{count}/jacobians"], arrays[f"{count}/ranks"]
             chosen = ranks > (count - 1 if method in _FULL_RANK else 1 if method in _NO_LINE else 0)
             jacobians, one, other = (
-                each[chosen] for each in (jacobians, ours[f"{count}/{method}"], theirs[f"{count}/{method}"])
+                part[chosen] for part in (jacobians, ours[f"{count}/{method}"], theirs[f"{count}/{method}"])
             )
             if method in SOLVED:
                 for side, weights in (("ours", one), ("theirs", other)):
@@ -114,9 +114,9 @@ def compare(arrays: dict[str, np.ndarray], ours: dict[str, np.ndarray], theirs: 
                 length = np.maximum(np.linalg.norm(other, axis=1), 1e-2 * scale)
                 differences += list(np.linalg.norm(one - other, axis=1) / length)
             elif one.shape[1:] == jacobians.shape[2:]:
-                least = _ROUNDING * np.linalg.norm(jacobians, axis=2).max(axis=1)
-                one, other = (np.where(np.linalg.norm(step, axis=1) < least, 0.0, step.T).T for step in (one, other))
-                differences += list(relative(one, other, least))
+                floor = _ROUNDING * np.linalg.norm(jacobians, axis=2).max(axis=1)
+                one, other = (np.where(np.linalg.norm(step, axis=1) < floor, 0.0, step.T).T for step in (one, other))
+                differences += list(relative(one, other, floor))
             else:
                 differences += list(relative(one, other))
         row = {"method": method, "kind": "solver" if method in SOLVED else "closed form", "cases": len(differences)}

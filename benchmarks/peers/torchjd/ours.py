@@ -36,7 +36,7 @@ READERS: dict[str, jw.Weighting] = {
 
 def names_of(count: int) -> tuple[str, ...]:
     """Return the names of K losses, in the order of the arrays' loss axis."""
-    return tuple(f"loss_{place}" for place in range(count))
+    return tuple(f"loss_{index}" for index in range(count))
 
 
 def weights_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], jax.Array]:
@@ -68,7 +68,7 @@ def path_function(weighting: jw.Weighting, count: int) -> Callable[[jax.Array], 
     return path
 
 
-def vaccinated(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
+def gradvac_with_state(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
     """Compute the direction of GradVac's second step."""
     gramian, usual, weights = jacobian @ jacobian.T, jnp.zeros(2 * (len(jacobian),)), jnp.zeros(len(jacobian))
     for _ in range(2):
@@ -78,27 +78,27 @@ def vaccinated(jacobian: jax.Array, orders: jax.Array) -> jax.Array:
 
 def results(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute all results, by ``K/NAME``; needs 64-bit JAX."""
-    found: dict[str, Any] = {}
+    directions: dict[str, Any] = {}
     for count in sorted({int(name.split("/")[0]) for name in arrays}):
         jacobians, orders = (jnp.asarray(arrays[f"{count}/{name}"]) for name in ("jacobians", "orders"))
         for name in DIRECTIONS:
             one = weights_function(jw.make_weighting(name), count)
-            found[f"{count}/{name}"] = jax.jit(jax.vmap(lambda jacobian, one=one: one(jacobian) @ jacobian))(jacobians)
+            directions[f"{count}/{name}"] = jax.jit(jax.vmap(lambda jacobian, one=one: one(jacobian) @ jacobian))(jacobians)
         for name, weighting in SOLVED.items():
-            found[f"{count}/{name}"] = jax.jit(jax.vmap(weights_function(weighting, count)))(jacobians)
+            directions[f"{count}/{name}"] = jax.jit(jax.vmap(weights_function(weighting, count)))(jacobians)
         for name, weighting in READERS.items():
             path = jax.jit(jax.vmap(path_function(weighting, count)))
-            found[f"{count}/{name}"] = path(jnp.asarray(arrays[f"{count}/losses"]))
+            directions[f"{count}/{name}"] = path(jnp.asarray(arrays[f"{count}/losses"]))
         drawn: dict[str, Any] = {
             "pcgrad": lambda jacobian, order: surgery.pcgrad_weights(jacobian @ jacobian.T, order) @ jacobian,
-            "gradvac": vaccinated,
+            "gradvac": gradvac_with_state,
             "graddrop": lambda jacobian, uniform: graddrop_direction(
                 dict(zip(names_of(len(jacobian)), jacobian, strict=True)), uniform
             ),
             "random": lambda jacobian, normal: loss_values.random_weights(normal) @ jacobian,
         }
-        given = {"graddrop": "uniform", "random": "normal"}
+        noise = {"graddrop": "uniform", "random": "normal"}
         for name, function in drawn.items():
-            inputs = jnp.asarray(arrays[f"{count}/{given[name]}"]) if name in given else orders
-            found[f"{count}/{name}"] = jax.jit(jax.vmap(function))(jacobians, inputs)
-    return {name: np.asarray(value) for name, value in found.items()}
+            inputs = jnp.asarray(arrays[f"{count}/{noise[name]}"]) if name in noise else orders
+            directions[f"{count}/{name}"] = jax.jit(jax.vmap(function))(jacobians, inputs)
+    return {name: np.asarray(value) for name, value in directions.items()}

@@ -56,8 +56,8 @@ def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """Compute the results of random methods, with the file's random numbers instead of PyTorch's."""
     jacobians = torch.from_numpy(arrays[f"{prefix}/jacobians"])
     results: dict[str, list[np.ndarray]] = {name: [] for name in ("pcgrad", "gradvac", "graddrop", "random")}
-    for place, jacobian in enumerate(jacobians):
-        orders = [torch.from_numpy(row) for row in arrays[f"{prefix}/orders"][place]]
+    for index, jacobian in enumerate(jacobians):
+        orders = [torch.from_numpy(row) for row in arrays[f"{prefix}/orders"][index]]
         with mock.patch.object(torch, "randperm", side_effect=orders):
             results["pcgrad"].append(aggregation.PCGrad()(jacobian).numpy())
         # GradVac draws an order of the other losses: their positions among the remaining ones.
@@ -67,9 +67,9 @@ def drawn(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
             with mock.patch.object(torch, "randperm", side_effect=list(others)):
                 total = vaccine(jacobian)
         results["gradvac"].append(total.numpy())
-        with mock.patch.object(torch, "rand", return_value=torch.from_numpy(arrays[f"{prefix}/uniform"][place])):
+        with mock.patch.object(torch, "rand", return_value=torch.from_numpy(arrays[f"{prefix}/uniform"][index])):
             results["graddrop"].append(aggregation.GradDrop()(jacobian).numpy())
-        with mock.patch.object(torch, "randn", return_value=torch.from_numpy(arrays[f"{prefix}/normal"][place])):
+        with mock.patch.object(torch, "randn", return_value=torch.from_numpy(arrays[f"{prefix}/normal"][index])):
             results["random"].append(aggregation.Random()(jacobian).numpy())
     return {name: np.stack(rows) for name, rows in results.items()}
 
@@ -96,14 +96,14 @@ def paths(losses: torch.Tensor) -> Iterator[tuple[str, np.ndarray]]:
             optimizer.step()
         yield name, np.stack(steps)
     average, steps = scalarization.DWA(), []
-    for place, values in enumerate(losses):
+    for index, values in enumerate(losses):
         steps.append(derivative(average, values))
-        if place % 2 == 1:
+        if index % 2 == 1:
             average.step()
     yield "dwa", np.stack(steps)
     fast, steps = scalarization.FAMO(count).double(), []
-    for place, values in enumerate(losses):
-        if place:
+    for index, values in enumerate(losses):
+        if index:
             fast.update(values)
         steps.append(derivative(fast, values))
     yield "famo", np.stack(steps)
@@ -119,13 +119,13 @@ def compute(prefix: str, path: str) -> dict[str, np.ndarray]:
     for name, method in METHODS.items():
         # Takes seconds each, and linearly dependent gradients may have no solution: full rank only.
         chosen = is_full if name == "nash_mtl" else np.ones(len(jacobians), bool)
-        found = [method(jacobian) for jacobian in jacobians[torch.from_numpy(chosen)]]
-        results[f"{prefix}/{name}"] = np.full((len(jacobians), len(found[0])), np.nan)
-        results[f"{prefix}/{name}"][chosen] = np.stack(found)
+        directions = [method(jacobian) for jacobian in jacobians[torch.from_numpy(chosen)]]
+        results[f"{prefix}/{name}"] = np.full((len(jacobians), len(directions[0])), np.nan)
+        results[f"{prefix}/{name}"][chosen] = np.stack(directions)
         print(prefix, name, flush=True)
     results |= {f"{prefix}/{name}": value for name, value in drawn(arrays, prefix).items()}
     by_path = [dict(paths(losses)) for losses in torch.from_numpy(arrays[f"{prefix}/losses"])]
-    return results | {f"{prefix}/{name}": np.stack([each[name] for each in by_path]) for name in by_path[0]}
+    return results | {f"{prefix}/{name}": np.stack([outcome[name] for outcome in by_path]) for name in by_path[0]}
 
 
 def main() -> None:
@@ -133,8 +133,8 @@ def main() -> None:
     prefixes = sorted({name.split("/")[0] for name in np.load(sys.argv[1])})
     results: dict[str, Any] = {"versions": np.array([f"torchjd {version('torchjd')}", f"torch {torch.__version__}"])}
     with multiprocessing.get_context("spawn").Pool(len(prefixes)) as pool:
-        for found in pool.starmap(compute, [(prefix, sys.argv[1]) for prefix in prefixes]):
-            results |= found
+        for part in pool.starmap(compute, [(prefix, sys.argv[1]) for prefix in prefixes]):
+            results |= part
     np.savez(sys.argv[2], **results)
 
 

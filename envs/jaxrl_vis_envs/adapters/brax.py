@@ -1,10 +1,10 @@
 """Adapter to brax environments, for brax's own agents.
 
     from brax.training.agents.ppo import train as ppo
-    from jaxrl_vis_envs.adapters.brax import BraxEnv, lend_jax
+    from jaxrl_vis_envs.adapters.brax import BraxEnv, share_jax_with_brax
 
     env = BraxEnv("FetchReach", reward="dense")
-    with lend_jax():
+    with share_jax_with_brax():
         make_policy, params, metrics = ppo.train(env, episode_length=env.episode_length, num_envs=256, ...)
 
 `BraxEnv` never sets ``done``: brax's EpisodeWrapper, configured with ``episode_length``, ends episodes and marks them as
@@ -131,7 +131,7 @@ class BraxEnv(Env):
 
 
 @contextlib.contextmanager
-def lend_jax() -> Iterator[None]:
+def share_jax_with_brax() -> Iterator[None]:
     """Restore ``jax.device_put_replicated``, which brax's agents call and JAX 0.10 has removed, within the context.
 
     Does nothing if JAX still has it. PPO and SAC need it up to brax 0.14.2.

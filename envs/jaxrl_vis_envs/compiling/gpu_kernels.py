@@ -45,11 +45,11 @@ def kernel_call(kernel: Callable[..., None], *, interpret: bool = False, **optio
     if name is None:
         return call
 
-    def described(*arguments: Any) -> Any:
+    def describe_kernel(*arguments: Any) -> Any:
         with _lowering_as(name):
             return call(*arguments)
 
-    return described
+    return describe_kernel
 
 
 def _substitute_name() -> str | None:

@@ -33,7 +33,7 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     geoms = np.stack([model.pair_geom1, model.pair_geom2], axis=1)[order]
     first, second = geoms[::_CONTACTS].T
     position, rotation, half_size = data.geom_xpos, data.geom_xmat, model.geom_size
-    distance, point, normal = jax.vmap(_touch)(
+    distance, point, normal = jax.vmap(_contact_points)(
         position[first], rotation[first], half_size[first], position[second], rotation[second], half_size[second]
     )
     frame = jnp.repeat(jax.vmap(rotations.make_frame)(normal), _CONTACTS, axis=0)
@@ -53,7 +53,7 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return data.tree_replace({"_impl.contact": contact})  # type: ignore[dict-item] - a Contact is a tree of arrays
 
 
-def _touch(
+def _contact_points(
     position_1: jax.Array,
     rotation_1: jax.Array,
     size_1: jax.Array,
@@ -73,12 +73,12 @@ def _touch(
     apart_2 = jnp.abs(rotation_2.T @ offset) - size_2 - jnp.abs(turn.T) @ size_1
     face = jnp.argmax(jnp.concatenate([apart_1, apart_2]))
     is_first = face < 3
-    middle, rotation, size = _where(is_first, (position_1, rotation_1, size_1), (position_2, rotation_2, size_2))
-    other, other_rotation, other_size = _where(is_first, (position_2, rotation_2, size_2), (position_1, rotation_1, size_1))
+    middle, rotation, size = _select(is_first, (position_1, rotation_1, size_1), (position_2, rotation_2, size_2))
+    other, other_rotation, other_size = _select(is_first, (position_2, rotation_2, size_2), (position_1, rotation_1, size_1))
     # Axes are permuted: in the frame at the centre of each box, z becomes the normal of the reference or the nearest face.
-    rotation, size = _as_last(face % 3, rotation, size)
+    rotation, size = _move_axis_last(face % 3, rotation, size)
     offset, turn = rotation.T @ (other - middle), rotation.T @ other_rotation
-    turn, other_size = _as_last(jnp.argmax(jnp.abs(turn[2])), turn, other_size)
+    turn, other_size = _move_axis_last(jnp.argmax(jnp.abs(turn[2])), turn, other_size)
     side = jnp.where(offset[2] >= 0, 1.0, -1.0)
     centre = offset - side * jnp.sign(turn[2, 2]) * other_size[2] * turn[:, 2]
     along = turn[:, :2] * other_size[:2]  # columns: half edges of the other face
@@ -99,11 +99,11 @@ def _touch(
     return jnp.where(is_new & is_inside[chosen], distance, _FAR), middle + points @ rotation.T, normal
 
 
-def _where(condition: jax.Array, yes: tuple, no: tuple) -> tuple[jax.Array, ...]:
+def _select(condition: jax.Array, yes: tuple, no: tuple) -> tuple[jax.Array, ...]:
     return tuple(jnp.where(condition, one, other) for one, other in zip(yes, no, strict=True))
 
 
-def _as_last(axis: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _move_axis_last(axis: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Permute the axes of a box cyclically, so that ``axis`` is the last."""
     order = (axis + jnp.arange(1, 4)) % 3
     return rotation[:, order], size[order]

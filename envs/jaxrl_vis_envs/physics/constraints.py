@@ -61,7 +61,7 @@ def _polish(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Take a step of Euler's method, implicit in the joints' damping, with the accelerations and forces of `solve`."""
     if not _has_short_step(model, data):
-        return mjx.euler(model, _after_solving(data))
+        return mjx.euler(model, _add_dependency(data))
     timestep = model.opt.timestep
     velocity = data.qvel + timestep * _damped_accelerations(model, data)
     position = _integrate(model, data.qpos, velocity)
@@ -101,11 +101,11 @@ def _damped_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
     if newton.supports(model):
         return newton.damped_accelerations(model, data)
     mass = data._impl.M + jnp.diag(model.opt.timestep * model.dof_damping)
-    damped = _after_solving(data.tree_replace({"_impl.M": mass}))  # type: ignore[dict-item] - a tree of arrays
+    damped = _add_dependency(data.tree_replace({"_impl.M": mass}))  # type: ignore[dict-item] - a tree of arrays
     return smooth.solve_m(model, smooth.factor_m(model, damped), data.qfrc_smooth + data.qfrc_constraint)
 
 
-def _after_solving(data: mjx.Data) -> mjx.Data:
+def _add_dependency(data: mjx.Data) -> mjx.Data:
     """Make the mass matrix depend on the accelerations from XLA's point of view, to order the two factorizations.
 
     With damping, the mass matrix is factorized a second time, which XLA on a CPU would do concurrently with the first. In a

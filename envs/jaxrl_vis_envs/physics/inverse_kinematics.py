@@ -38,15 +38,15 @@ def reach(
         steps: Number of steps; the target is fixed during the last three.
     """
 
-    def improve(data: mjx.Data, share: jax.Array) -> tuple[mjx.Data, None]:
-        target = start.xpos[body] + share * (position - start.xpos[body])
+    def improve(data: mjx.Data, fraction: jax.Array) -> tuple[mjx.Data, None]:
+        target = start.xpos[body] + fraction * (position - start.xpos[body])
         return mjx_model.kinematics(
             model, data.replace(qpos=data.qpos + _step(mj_model, data, body, target, rotation, damping))
         ), None
 
     # The target moves to the goal, and is fixed there during the last steps.
-    shares = jnp.minimum(jnp.arange(1, steps + 1) / (steps - _SETTLING_STEPS), 1.0).astype(jnp.float32)
-    return jax.lax.scan(improve, start, shares)[0]
+    fractions = jnp.minimum(jnp.arange(1, steps + 1) / (steps - _SETTLING_STEPS), 1.0).astype(jnp.float32)
+    return jax.lax.scan(improve, start, fractions)[0]
 
 
 def _step(

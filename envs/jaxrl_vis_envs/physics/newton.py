@@ -24,7 +24,7 @@ _MAX_JOINTS = 12
 # gradient consists of rounding errors only, step lengths reach 1,000 and lead away from the solution.
 _MAX_STEP = 8.0
 # With more constraints, an iterative search replaces the exact line search, whose cost grows with the square of their number.
-_MOST_CORNERS = 64
+_MAX_CORNERS = 64
 _ROOT_STEPS = 8
 
 
@@ -94,7 +94,7 @@ def _product(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 def _weighted_square(matrix: jax.Array, weights: jax.Array) -> jax.Array:
     """Compute ``matrix.T @ diag(weights) @ matrix`` for ``matrix`` [M, N] and ``weights`` [M]: [N, N]."""
     weighted = weights[:, None] * matrix
-    if len(weights) > _MOST_CORNERS:  # above this size, a library call is faster
+    if len(weights) > _MAX_CORNERS:  # above this size, a library call is faster
         return jnp.matmul(matrix.T, weighted, precision="highest")
     return jnp.sum(weighted[:, :, None] * matrix[:, None, :], axis=0)
 
@@ -130,7 +130,7 @@ def _line_search(
         acting = jnp.where(is_equality | (moved < 0), stiffness, 0.0) * along
         return first + second * length + jnp.sum(acting * moved), second + jnp.sum(acting * along)
 
-    if len(residual) > _MOST_CORNERS:
+    if len(residual) > _MAX_CORNERS:
         return jnp.clip(_bracketed_root(slope_at), 0.0, _MAX_STEP)
     # The slope increases along the line and is linear between the corners where a constraint starts or stops acting.
     corners = jnp.where(is_equality | (along == 0), -1.0, -residual / jnp.where(along == 0, 1.0, along))
@@ -165,12 +165,12 @@ def _bracketed_root(slope_at: Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 
 
 @jax.custom_jvp
-def solve_positive(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Solve a small positive definite system, ``matrix`` [N, N] and ``right`` [N]: [N].
+def solve_positive(matrix: jax.Array, rhs: jax.Array) -> jax.Array:
+    """Solve a small positive definite system, ``matrix`` [N, N] and ``rhs`` [N]: [N].
 
     Forward and reverse derivatives are defined here, since JAX cannot derive them through a batching rule.
     """
-    return _eliminate(matrix[None], right[None])[0]
+    return _eliminate(matrix[None], rhs[None])[0]
 
 
 @solve_positive.defjvp

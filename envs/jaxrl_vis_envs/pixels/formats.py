@@ -55,7 +55,7 @@ class Format:
                 observation[_name(camera, output) + suffix] = self._encode(output, image)
         return observation
 
-    def joined(self, images: dict[str, jax.Array]) -> jax.Array:
+    def concatenate_images(self, images: dict[str, jax.Array]) -> jax.Array:
         """Concatenate the channels of images, in the format's dtype.
 
         Raises:

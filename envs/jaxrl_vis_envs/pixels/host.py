@@ -56,7 +56,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         self._drawn = mujoco.MjData(views.mj_model)
         self._goals: dict[str, np.ndarray] = {}
         self._draw = jax.jit(lambda arrays: self._form.images(views(_Drawn(arrays))))
-        self.observation_space = self._space()
+        self.observation_space = self._build_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and render the goal image, if there is one."""
@@ -76,7 +76,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         images = self._render() | {name: image.copy() for name, image in self._goals.items()}
         layout = self._form.layout
         if layout == "image":
-            return np.array(self._form.joined(images))  # type: ignore[arg-type]
+            return np.array(self._form.concatenate_images(images))  # type: ignore[arg-type]
         if layout == "images":
             return images
         return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
@@ -114,7 +114,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         finally:
             inner.data, model.site_pos[:] = own, sites
 
-    def _space(self) -> gymnasium.Space:
+    def _build_space(self) -> gymnasium.Space:
         """Return the observation space: a Box for the layout ``image``, else a Dict."""
         images = jax.eval_shape(self._draw, self._poses())
         spaces: dict[str, gymnasium.Space] = {}
@@ -123,14 +123,15 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         cameras = [name for name, outputs in self.views.outputs.items() for _ in outputs]
         for name, output, camera in zip(self._names, chosen, cameras, strict=True):
             image = images[name]
-            share = output == "rgb" or (output == "depth" and self._form.depth_range is not None)
-            low, high = (0, 255 if image.dtype == np.uint8 else 1) if share else _BOUNDS.get(output, (0.0, far[camera]))
+            is_scaled = output == "rgb" or (output == "depth" and self._form.depth_range is not None)
+            low, high = (0, 255 if image.dtype == np.uint8 else 1) if is_scaled else _BOUNDS.get(output, (0.0, far[camera]))
             spaces[name] = gymnasium.spaces.Box(low, high, image.shape, image.dtype.type)
         if self._goal_image is not None:
             spaces |= {name + formats.GOAL: space for name, space in spaces.items()}
         if self._form.layout == "image":
             low, high = (
-                self._form.joined({name: getattr(box, end) for name, box in spaces.items()}) for end in ("low", "high")
+                self._form.concatenate_images({name: getattr(box, end) for name, box in spaces.items()})
+                for end in ("low", "high")
             )
             return gymnasium.spaces.Box(np.asarray(low), np.asarray(high), dtype=np.dtype(self._form.dtype).type)
         if self._form.layout == "dict":

@@ -50,7 +50,7 @@ class PixelsConfig(checks.CheckedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole(self, "image_size", "frame_stack")
+        checks.integers(self, "image_size", "frame_stack")
         checks.choice(self, "pixels", CHANNELS)
         checks.choice(self, "depth_encoding", get_args(DepthEncoding))
         for field, minimum in (("depth_range", 0.0), ("clip_range", 1e-6)):
@@ -150,8 +150,8 @@ def object_mask(image: jax.Array) -> jax.Array:
 def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Array:
     """Encode depths ``[...]`` (m) as uint8: 0 up to the near end of ``depth_range`` (m), 255 from the far end on."""
     near, far = depth_range
-    share = jnp.clip((depth - near) / (far - near), 0.0, 1.0)
-    return jnp.round(255.0 * share).astype(jnp.uint8)
+    fraction = jnp.clip((depth - near) / (far - near), 0.0, 1.0)
+    return jnp.round(255.0 * fraction).astype(jnp.uint8)
 
 
 def encode_zbuffer(depth: jax.Array, clip_range: tuple[float, float]) -> jax.Array:

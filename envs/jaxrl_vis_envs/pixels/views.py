@@ -67,7 +67,7 @@ class Views:
         for name, camera in by_name.items():
             height, width = sizes[name] if isinstance(sizes[name], tuple | list) else (sizes[name], sizes[name])
             scene = Scene.from_mjmodel(mj_model, camera=camera, height=height, width=width, **scene_options)
-            scene = _clipped(scene, ranges[name])
+            scene = _clip_to_range(scene, ranges[name])
             self.scenes[name] = _share_leaves(scene, next(iter(self.scenes.values()), None))
         self.geom_names, self.body_names = labels.geom_names(mj_model), labels.body_names(mj_model)
         self._bodies = labels.object_bodies(mj_model)
@@ -153,7 +153,7 @@ def _check_outputs(outputs: Any) -> tuple[Output, ...]:
     return tuple(dict.fromkeys(listed))
 
 
-def _clipped(scene: Scene, clip_range: tuple[float, float] | None) -> Scene:
+def _clip_to_range(scene: Scene, clip_range: tuple[float, float] | None) -> Scene:
     if clip_range is None:
         return scene
     near, far = clip_range

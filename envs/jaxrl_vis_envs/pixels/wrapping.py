@@ -177,8 +177,8 @@ class PixelEnv:
         layout, own = self._form.layout, state.obs
         images: Any = self._form.images(self._render(state))
         if layout == "image":
-            images = self._form.joined(images)
-            goals = self._form.joined(goals) if isinstance(goals, dict) and goals else goals
+            images = self._form.concatenate_images(images)
+            goals = self._form.concatenate_images(goals) if isinstance(goals, dict) and goals else goals
         if self._frames > 1:
             images = jax.tree.map(self._first if earlier is None else _next, images, images if earlier is None else earlier)
         if layout == "image":

@@ -3,15 +3,13 @@
     family      parameters of the fields and their variation: TRAINING
     shifts      families with shifted factors: SHIFTED, `shift`     spec    a family from a file: `read`
     scene       factors of plots by day    settling   values of these factors sampled for one plot
-    clutter     objects around the plants  backdrop   distant background     degrading  effects of simple cameras on images
+    clutter     objects around the plants                   rendering  from a plot to the pixels of an image
     field       one plot: stalks and leaves in metres       cameras    trajectory of a camera pair past it
-    surfaces    the plot as cones and triangles             tables     surfaces visible to a camera, by tile
-    drawing     rays to radiance, in JAX                    imaging    radiance to pixel values
     pairs       stereo pairs of a plot                      truth      boxes, visibility and edges of its stalks
     stand       the few stalks around a robot's arm         bending    these as flexible bodies, and wind
 
-Everything is a function of a family and a seed. Importing this package does not import JAX; `pairs`, `drawing`, `imaging` and
-`bending` do.
+Everything is a function of a family and a seed. Importing this package does not import JAX; `pairs`, `rendering` and `bending`
+do.
 """
 
 from jaxrl_vis_envs.plants.cameras import Calibration, Drive, Pose, drive

@@ -139,7 +139,7 @@ def shapes(stands: Stands) -> Shape:
 
 
 def fit(model: Any, layout: Layout, shape: Shape) -> Any:
-    """Return an `mjx.Model` with these stalks; `placed` sets their positions."""
+    """Return an `mjx.Model` with these stalks; `place_stands` sets their positions."""
     lower_axis, up, upper_axis = _segments(shape)
     lengths = jnp.stack([jnp.linalg.norm(lower_axis, axis=-1), jnp.linalg.norm(upper_axis, axis=-1)], axis=-1)
     from_lower = jax.vmap(rotations.quat_inv)(_between(up, lower_axis))
@@ -169,7 +169,7 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
     return model.replace(**changes)
 
 
-def placed(data: Any, layout: Layout, shape: Shape) -> Any:
+def place_stands(data: Any, layout: Layout, shape: Shape) -> Any:
     """Return an `mjx.Data` with the stalks at their feet and the lower segments in their direction."""
     lower_axis, up, _ = _segments(shape)
     return data.replace(

@@ -117,7 +117,7 @@ def drive(family: Family, seed: int) -> Drive:
     poses = tuple(Pose(position, looking_along_y(angle)) for position, angle in zip(positions, pitch))
     if family.scene.share > 0:
         signs = generator(family, seed, "turn").choice([-1.0, 1.0], 2)
-        poses = tuple(_turned(pose, family.scene, signs, family.rig.distance) for pose in poses)
+        poses = tuple(_rotate_pose(pose, family.scene, signs, family.rig.distance) for pose in poses)
 
     scale = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(*rig.odometry_noise)
     reported = (along - along[0]) * scale + 0.0005 * rng.normal(size=rig.frames) * (np.arange(rig.frames) > 0)
@@ -129,7 +129,7 @@ def drive(family: Family, seed: int) -> Drive:
     return Drive(true, stated, poses, (along - begin) / rig.speed, reported, offset, slope)
 
 
-def _turned(pose: Pose, scene: Scene, signs: np.ndarray, distance: float) -> Pose:
+def _rotate_pose(pose: Pose, scene: Scene, signs: np.ndarray, distance: float) -> Pose:
     """Turn a camera about the vertical through the point of the row that it looks at, and roll it about its view."""
     yaw, roll = (math.radians(sign * angle) for sign, angle in zip(signs, (scene.yaw[0], scene.roll[0])))
     about = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])

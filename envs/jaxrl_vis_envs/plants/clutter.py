@@ -24,7 +24,7 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
     round_things: list[tuple[Stalk, list[float]]] = []
     flat_things: list[tuple[Leaf, list[float]]] = []
     for _ in range(rng.poisson(scene.objects[0] * length)):
-        foot = np.array([rng.uniform(-1.0, length - 1.0), _beside(rng, family), 0.0])
+        foot = np.array([rng.uniform(-1.0, length - 1.0), _offset_from_row(rng, family), 0.0])
         kind = rng.choice(["pole", "tube", "cable", "strip", "blade", "legs"], p=[0.3, 0.15, 0.1, 0.2, 0.2, 0.05])
         if kind in ("strip", "blade"):
             flat_things.append((_ribbon(rng, foot, kind), material(rng, green=kind == "blade")))
@@ -51,7 +51,7 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
     return round_things, flat_things
 
 
-def _beside(rng: np.random.Generator, family: Family) -> float:
+def _offset_from_row(rng: np.random.Generator, family: Family) -> float:
     """Sample the y coordinate of an object, m: behind the row, or with probability 0.25 in front of it."""
     return rng.uniform(-0.3 * family.rig.distance, 0.0) if rng.random() < 0.25 else rng.uniform(0.0, 1.5)
 

@@ -155,8 +155,8 @@ def draw(family: Family, seed: int) -> Plot:
 def _sample_positions(rng: np.random.Generator, layout: Layout, margin: float) -> list[tuple[float, float]]:
     """Sample positions (x, y) in m of the stalks of one row."""
     length = layout.plot_length + 2 * margin
-    share = length / layout.plot_length
-    count = max(round(share * rng.normal(layout.stalks_mean, layout.stalks_sd)), 0)
+    fraction = length / layout.plot_length
+    count = max(round(fraction * rng.normal(layout.stalks_mean, layout.stalks_sd)), 0)
     tillers = min(int(rng.binomial(count, layout.tillers)), max(count - 1, 0))  # tillers need a mother plant
     mothers = count - tillers
     if not mothers:
@@ -211,9 +211,9 @@ def _stalk(rng: np.random.Generator, shape: Stalks, row: int, position: np.ndarr
         over = np.maximum(over, inside * thick)
         sheath = np.maximum(sheath, inside)
     bump = np.zeros_like(arc)
-    for node, share in zip(nodes, swelling):
+    for node, thickening in zip(nodes, swelling):
         profile = np.clip(1.0 - np.abs(arc - node) / _NODE_HALF_LENGTH, 0.0, 1.0)
-        bump = np.maximum(bump, share * np.sin(0.5 * math.pi * profile) ** 2)
+        bump = np.maximum(bump, thickening * np.sin(0.5 * math.pi * profile) ** 2)
     points = _middle_line(rng, shape, arc, nodes, lean_sd)
     points[:, :2] += position
     return Stalk(

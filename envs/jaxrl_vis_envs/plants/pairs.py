@@ -8,20 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.plants import drawing, imaging, tables
-from jaxrl_vis_envs.plants.backdrop import draw_backdrop
 from jaxrl_vis_envs.plants.cameras import Drive, Pose, drive
-from jaxrl_vis_envs.plants.degrading import degrade
 from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Plot, generator
-from jaxrl_vis_envs.plants.surfaces import NOTHING, Surfaces, build
+from jaxrl_vis_envs.plants.rendering import drawing, imaging, shading, tables
+from jaxrl_vis_envs.plants.rendering.backdrop import draw_backdrop
+from jaxrl_vis_envs.plants.rendering.degrading import degrade
+from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, Surfaces, build
 
 _FLASH = np.array([0.05, -0.10, -0.02])
 """Position of the flash in the left camera's frame, m: above the middle of the pair."""
 
 
 @functools.lru_cache(maxsize=2)
-def daylight(family: Family, seed: int) -> drawing.Day | None:
+def daylight(family: Family, seed: int) -> shading.Day | None:
     """Sample the daylight and the backdrop of a plot from its settled family; None at night."""
     scene = family.scene
     if scene.share <= 0:
@@ -35,7 +35,7 @@ def daylight(family: Family, seed: int) -> drawing.Day | None:
     shadow = (scene.shadow[0], rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
     backdrop = draw_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
     values = (sun, strength * warm, scene.sky[0] * blue, np.array(shadow), backdrop)
-    return drawing.Day(*(jnp.asarray(value, jnp.float32) for value in values))
+    return shading.Day(*(jnp.asarray(value, jnp.float32) for value in values))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Sequence:
             _FLASH - offset,
             (flash, settings.ambient, family.rig.distance),
         )
-        shot = drawing.Shot(*(jnp.asarray(value, jnp.float32) for value in values), day=daylight(family, self.plot.seed))
+        shot = shading.Shot(*(jnp.asarray(value, jnp.float32) for value in values), day=daylight(family, self.plot.seed))
         radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, settings.samples)
         gain = 2.0 * gains[frame, side]
         if shot.day is not None:

@@ -35,7 +35,7 @@ def settle(family: Family, rng: np.random.Generator) -> Family:
         return family
     if rng.random() >= family.scene.share:
         return dataclasses.replace(family, scene=Scene())
-    scene = _settled(family.scene, rng)
+    scene = _sampled_values(family.scene, rng)
     layout, stalks, leaves, textures = family.layout, family.stalks, family.leaves, family.textures
     distance = scene.distance[0]
     if scene.maize:
@@ -82,7 +82,7 @@ def _ripeness(leaves: Leaves, textures: Textures, rng: np.random.Generator) -> t
     return dataclasses.replace(leaves, dry=dry), dataclasses.replace(textures, **changed)
 
 
-def _settled(scene: Scene, rng: np.random.Generator) -> Scene:
+def _sampled_values(scene: Scene, rng: np.random.Generator) -> Scene:
     """Sample one value from each range, and 0 or 1 for each fraction but ``borders``."""
     drawn = {}
     for field in dataclasses.fields(scene):

@@ -47,7 +47,7 @@ class Stands:
     origin: np.ndarray
 
     @property
-    def present(self) -> np.ndarray:
+    def is_present(self) -> np.ndarray:
         """[B, N] bool, True for existing stalks."""
         return self.stalk >= 0
 
@@ -123,7 +123,7 @@ def stand_of_lines(
     return Stands(stalk.astype(np.int32)[None], *arrays)
 
 
-def concatenated(parts: Sequence[Stands]) -> Stands:
+def concatenate_stands(parts: Sequence[Stands]) -> Stands:
     """Concatenate one or more batches of stands with the same number of stalks each."""
     names = [field.name for field in dataclasses.fields(Stands)]
     return Stands(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
@@ -169,5 +169,5 @@ def _distance_to_line(points: np.ndarray, end: np.ndarray) -> np.ndarray:
     start = np.array([0.0, -MAST_DISTANCE])
     along = end - start
     length = max(math.hypot(*along), 1e-9)
-    share = np.clip((points - start) @ along / length**2, 0.0, 1.0)
-    return np.linalg.norm(points - start - share[:, None] * along, axis=1)
+    fraction = np.clip((points - start) @ along / length**2, 0.0, 1.0)
+    return np.linalg.norm(points - start - fraction[:, None] * along, axis=1)

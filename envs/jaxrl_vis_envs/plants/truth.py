@@ -70,12 +70,12 @@ def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray |
     major = major - (axis @ major)[:, None] * axis
     major /= np.linalg.norm(major, axis=1, keepdims=True)
 
-    def scaled(vectors: np.ndarray, factor: float) -> np.ndarray:
+    def scale_along_major(vectors: np.ndarray, factor: float) -> np.ndarray:
         return vectors + (factor - 1.0) * (vectors * major).sum(axis=1, keepdims=True) * major
 
     # In space compressed until the stalk is round, its edges are where rays are tangent to a circle.
     radius = (np.interp(arcs, stalk.arc, stalk.radius) / np.sqrt(stalk.ovality))[:, None]
-    centre = scaled(pose.to_camera(middle), 1.0 / stalk.ovality)
+    centre = scale_along_major(pose.to_camera(middle), 1.0 / stalk.ovality)
     from_axis = centre - (centre * axis).sum(axis=1, keepdims=True) * axis
     distance = np.linalg.norm(from_axis, axis=1, keepdims=True)
     from_axis /= distance
@@ -84,7 +84,7 @@ def outline(stalk: Stalk, pose: Pose, camera: Calibration, heights: np.ndarray |
     sides = []
     for sign in (-1.0, 1.0):
         tangent_point = centre + radius * (sign * np.sqrt(1.0 - sine**2) * sideways - sine * from_axis)
-        point = scaled(tangent_point, stalk.ovality)
+        point = scale_along_major(tangent_point, stalk.ovality)
         sides.append(point[:, :2] / point[:, 2:] * camera.focal + np.array(camera.centre))
     left, right = sides
     swap = left[:, :1] > right[:, :1]
@@ -107,10 +107,10 @@ def stalks_in_view(
     stalks = []
     for index, stalk in enumerate(plot.measured):
         tall = stalk.points[:, 2].max()
-        whole = _area(outline(stalk, pose, camera, np.linspace(0.0, tall, 120)), camera)
-        if whole is None:
+        projection = _area(outline(stalk, pose, camera, np.linspace(0.0, tall, 120)), camera)
+        if projection is None:
             continue
-        box, area = _down_to_ground(whole[0], stalk, pose, camera), whole[1]
+        box, area = _extended_to_ground(projection[0], stalk, pose, camera), projection[1]
         rows, columns = _pixels(box, camera)
         line, column = np.nonzero(instance[rows, columns] == index)
         line, column = line + rows.start, column + columns.start
@@ -158,7 +158,7 @@ def _area(edges: np.ndarray, camera: Calibration) -> tuple[Box, float] | None:
     return tuple(map(float, box)), float(wide.sum())  # pyright: ignore[reportReturnType]
 
 
-def _down_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> Box:
+def _extended_to_ground(box: Box, stalk: Stalk, pose: Pose, camera: Calibration) -> Box:
     """Extend a box down to the front of the stalk's foot, which is nearer than its edges."""
     towards = (pose.position - stalk.points[0])[:2]
     foot = stalk.points[0].copy()

@@ -19,7 +19,7 @@ class TaskConfig(checks.CheckedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole(self, "horizon")
+        checks.integers(self, "horizon")
         checks.positive(self, "threshold")
         if not isinstance(self.randomization, Randomization):
             raise ValueError(f"randomization must be a Randomization, got {self.randomization!r}")

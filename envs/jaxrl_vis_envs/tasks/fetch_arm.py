@@ -51,8 +51,8 @@ class FetchArm(PulledArm):
         quaternion = data.xquat[self._hand] + jnp.asarray(_DOWN, jnp.float32)
         data = data.replace(mocap_pos=position[None], mocap_quat=quaternion[None])
         data = mjx_model.take_steps(self._model, data, self.config.substeps)
-        return mjx_model.kinematics(self._model, self._with_closed_fingers(data))
+        return mjx_model.kinematics(self._model, self._close_fingers(data))
 
-    def _with_closed_fingers(self, data: mjx.Data) -> mjx.Data:
+    def _close_fingers(self, data: mjx.Data) -> mjx.Data:
         """Reset the finger positions but not their velocities, as the original does after each control step."""
         return data.replace(qpos=data.qpos.at[self._fingers].set(0.0))

@@ -109,7 +109,7 @@ class FetchReach(FetchArm):
         """
         self._has_cross_hair = isinstance(config, VisualFetchReachConfig) and config.cross_hair
         self._is_their_view = self.select_camera(config) == _THEIR_CAMERA
-        change = _add_cross_hair if self._has_cross_hair else _add_their_camera if self._is_their_view else None
+        change = _add_cross_hair if self._has_cross_hair else _add_original_camera if self._is_their_view else None
         mj_model = mjx_model.load_model("fetch_reach.xml", change)
         if isinstance(config, VisualFetchReachConfig) and config.finger_colour == "grey":
             for name in ("left_finger", "right_finger"):
@@ -140,7 +140,7 @@ class FetchReach(FetchArm):
         if not self._has_cross_hair:
             return self._start
         # The release left its mocap body at the goal it had just rendered. It does not pull: each action sets a new target.
-        return self._with_cross_hair(self._start, self._link_at(self._goal_point(key)))
+        return self._place_cross_hair(self._start, self._place_link(self._goal_point(key)))
 
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         goal = self._goal_point(key)
@@ -164,13 +164,13 @@ class FetchReach(FetchArm):
         offset = jax.random.uniform(key, (3,), jnp.float32, -self.config.goal_range, self.config.goal_range)
         return self._start.site_xpos[self._grip] + offset
 
-    def _link_at(self, goal: jax.Array) -> jax.Array:
+    def _place_link(self, goal: jax.Array) -> jax.Array:
         """Return the position [3] (m, world) of the gripper's link, pointing down, for a ``goal`` [3]."""
         if self.config.goal_at == "link":
             return goal
         return goal - jnp.asarray(_DOWN_ROTATION @ self.mj_model.site_pos[self._grip], jnp.float32)
 
-    def _with_cross_hair(self, data: mjx.Data, position: jax.Array) -> mjx.Data:
+    def _place_cross_hair(self, data: mjx.Data, position: jax.Array) -> mjx.Data:
         """Return ``data`` with the mocap body at ``position`` [3] (m, world)."""
         return mjx_model.kinematics(self._model, data.replace(mocap_pos=position[None]))
 
@@ -184,11 +184,11 @@ class FetchReach(FetchArm):
         """
         fingertip = self.mj_model.geom("right_fingertip").id
         lowest = _TABLE_TOP + float(self.mj_model.geom_pos[fingertip, 0] + self.mj_model.geom_size[fingertip, 0])
-        goal_link = self._link_at(goal)
-        rest = self._with_closed_fingers(self._start.replace(qvel=jnp.zeros_like(self._start.qvel)))
+        goal_link = self._place_link(goal)
+        rest = self._close_fingers(self._start.replace(qvel=jnp.zeros_like(self._start.qvel)))
         reachable = goal_link.at[2].max(lowest)
         data = inverse_kinematics.reach(self.mj_model, self._model, rest, self._hand, reachable, _DOWN_ROTATION)
-        return self._with_cross_hair(data, goal_link) if self._has_cross_hair else data
+        return self._place_cross_hair(data, goal_link) if self._has_cross_hair else data
 
 
 def _add_cross_hair(spec: mujoco.MjSpec) -> None:
@@ -199,7 +199,7 @@ def _add_cross_hair(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_their_camera(spec: mujoco.MjSpec) -> None:
+def _add_original_camera(spec: mujoco.MjSpec) -> None:
     """Add the camera of contrastive RL's task, fixed in the world."""
     azimuth, elevation = np.deg2rad([_AZIMUTH, _ELEVATION])
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

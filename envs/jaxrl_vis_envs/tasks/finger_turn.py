@@ -46,7 +46,7 @@ class FingerTurnConfig(TaskConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole(self, "substeps", "solver_iterations", "line_search_iterations")
+        checks.integers(self, "substeps", "solver_iterations", "line_search_iterations")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -42,7 +42,7 @@ _PLAIN = (0.88, 0.88, 0.9, 1.0)  # colour of a finger's last link, if not the fi
 _MEETING_OFFSET = (0.0, -0.09, 0.05)
 _MEETING_SCATTER = 0.005
 _MEETING_DISTANCE = 0.005
-_RETURN_SHARE = 0.1
+_RETURN_FRACTION = 0.1
 _IK_STEPS = 30
 _IK_DAMPING = 1e-3  # m
 _IK_LARGEST_STEP = 0.2  # rad
@@ -74,7 +74,7 @@ class HandReachConfig(TaskConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.whole(self, "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations")
+        checks.integers(self, "goal_actions", "substeps", "goal_substeps", "solver_iterations", "line_search_iterations")
         checks.choice(self, "goal_rule", ("random_actions", "meet"))
         checks.not_negative(self, "goal_noise")
         checks.boolean(self, "contacts")
@@ -148,7 +148,7 @@ class HandReach(MjxGoalEnv):
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         if self.config.goal_rule == "meet":
             return self.configuration_at(self._meeting_tips(key))
-        return self._after_random_actions(key)
+        return self._take_random_actions(key)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
         data = data.replace(ctrl=self._targets(action))
@@ -187,7 +187,7 @@ class HandReach(MjxGoalEnv):
         low, high = jnp.asarray(self.mj_model.actuator_ctrlrange.T, jnp.float32)
         return 0.5 * (low + high) + 0.5 * (high - low) * action
 
-    def _after_random_actions(self, key: jax.Array) -> mjx.Data:
+    def _take_random_actions(self, key: jax.Array) -> mjx.Data:
         """Return the hand at rest in the configuration reached by random actions from the start."""
         uniform_key, noise_key = jax.random.split(key)
         shape = (self.config.goal_actions, self.action_size)
@@ -211,7 +211,7 @@ class HandReach(MjxGoalEnv):
         near_meeting = meeting - _MEETING_DISTANCE * away / jnp.linalg.norm(away, axis=-1, keepdims=True)
         finger = jax.random.randint(finger_key, (), 0, _THUMB)
         meets = (jnp.arange(len(_FINGERTIPS)) == finger) | (jnp.arange(len(_FINGERTIPS)) == _THUMB)
-        meets &= jax.random.uniform(return_key) >= _RETURN_SHARE
+        meets &= jax.random.uniform(return_key) >= _RETURN_FRACTION
         return jnp.where(meets[:, None], near_meeting, start)
 
 

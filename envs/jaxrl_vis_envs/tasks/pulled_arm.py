@@ -33,8 +33,8 @@ class PulledArmConfig(TaskConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.positive(self, "action_scale")
-        checks.whole(self, "solver_iterations")
-        checks.whole(self, "substeps", minimum=4)  # the weld's time constant is 20 ms
+        checks.integers(self, "solver_iterations")
+        checks.integers(self, "substeps", minimum=4)  # the weld's time constant is 20 ms
 
 
 class PulledArm(MjxGoalEnv):

@@ -50,7 +50,7 @@ class ReacherConfig(TaskConfig):
         checks.not_negative(self, "start_range")
         checks.positive(self, "velocity_scale")
         if self.substeps is not None:
-            checks.whole(self, "substeps")
+            checks.integers(self, "substeps")
 
 
 @dataclasses.dataclass(frozen=True)

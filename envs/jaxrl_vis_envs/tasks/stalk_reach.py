@@ -69,8 +69,8 @@ class StalkReachConfig(TaskConfig):
         super().__post_init__()
         checks.positive(self, "action_scale")
         checks.not_negative(self, "offset", "lean", "wind")
-        checks.whole(self, "stalks", "solver_iterations")
-        checks.whole(self, "substeps", minimum=8)
+        checks.integers(self, "stalks", "solver_iterations")
+        checks.integers(self, "substeps", minimum=8)
         if self.stalks > 4:
             raise ValueError(f"stalks must be from 1 to 4, got {self.stalks}")
         if self.lean > 20:
@@ -214,8 +214,8 @@ class StalkReach(MjxGoalEnv):
 
 def _turn(axis: int, angle: jax.Array) -> jax.Array:
     """Return quaternions [N, 4] of rotations by ``angle`` [N] (rad) about a coordinate axis."""
-    whole = jnp.zeros((*angle.shape, 4), jnp.float32)
-    return whole.at[:, 0].set(jnp.cos(0.5 * angle)).at[:, 1 + axis].set(jnp.sin(0.5 * angle))
+    quaternion = jnp.zeros((*angle.shape, 4), jnp.float32)
+    return quaternion.at[:, 0].set(jnp.cos(0.5 * angle)).at[:, 1 + axis].set(jnp.sin(0.5 * angle))
 
 
 def _along(foot: jax.Array, turn: jax.Array, height: jax.Array | float) -> jax.Array:

@@ -6,11 +6,12 @@ from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
 from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.cli.trained.options import TrustOption
 from jaxrl_vis.errors import RequestError
 
 
 @dataclasses.dataclass(frozen=True)
-class Dataset:
+class Dataset(TrustOption):
     """Record episodes of a run's policy, or convert recorded ones, as a LeRobot dataset or .npz file."""
 
     source: Annotated[Path, AlsoPositional()]
@@ -23,8 +24,6 @@ class Dataset:
     """Number of episodes; 50 for a run, all for a conversion, if not given."""
     seed: int = 0
     """Seed of the starts and goals of a run's episodes."""
-    trust: bool = False
-    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Dataset) -> int:

@@ -7,12 +7,13 @@ from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.cli.trained.options import CheckpointOption, TrustOption
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.report.outputs import check_writable
 
 
 @dataclasses.dataclass(frozen=True)
-class Eval:
+class Eval(TrustOption, CheckpointOption):
     """Evaluate a trained run: success and distance at the last step, without exploration."""
 
     run_dir: Annotated[Path, AlsoPositional()]
@@ -21,10 +22,6 @@ class Eval:
     """Number of episodes; that of the run if not given."""
     json: Path | None = None
     """Also write the results to this file."""
-    checkpoint: str | None = None
-    """Iteration of the checkpoint, or best for the best one by --best-by; the newest valid one if not given."""
-    trust: bool = False
-    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Eval) -> int:
@@ -37,7 +34,7 @@ def run(options: Eval) -> int:
         check_writable(options.json, "--json")
     from jaxrl_vis.run.trained.restored_run import evaluate_run
 
-    figures = evaluate_run(run_dir, episodes=options.episodes, keep_programs=True, trust=trust, checkpoint=checkpoint)
+    figures = evaluate_run(run_dir, episodes=options.episodes, cache_programs=True, trust=trust, checkpoint=checkpoint)
     for name, per_seed in figures.items():
         print(f"{name:28}" + "".join(f" {value:9.4f}" for value in per_seed))
     if options.json is not None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.cli.trained.options import CheckpointOption, TrustOption
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import check_path
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Export:
+class Export(TrustOption, CheckpointOption):
     """Export a trained policy to a file that runs without this project, with its contract and golden frames; or check one.
 
     The exit status is 1 if the file's actions differ from our own by more than 1e-4.
@@ -33,10 +34,6 @@ class Export:
     """Replace an exported policy in the folder."""
     check: Path | None = None
     """Export nothing: run this exported file on its golden frames, and print the maximum difference."""
-    checkpoint: str | None = None
-    """Iteration of the checkpoint, or best for the best one by --best-by; the newest valid one if not given."""
-    trust: bool = False
-    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Export) -> int:

@@ -6,12 +6,13 @@ from typing import Annotated, Literal
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code, read_checkpoint
 from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.cli.trained.options import CheckpointOption, TrustOption
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.trained.shipped import workplace
 
 
 @dataclasses.dataclass(frozen=True)
-class Play:
+class Play(TrustOption, CheckpointOption):
     """Make a video of a trained run, with each observation beside the goal."""
 
     run_dir: Annotated[Path, AlsoPositional()]
@@ -27,10 +28,6 @@ class Play:
     """Also show the predictions of auxiliary tasks: reconstruction, true and predicted optical flow, rotated image."""
     episodes: int = 6
     """Number of episodes to show."""
-    checkpoint: str | None = None
-    """Iteration of the checkpoint, or best for the best one by --best-by; the newest valid one if not given."""
-    trust: bool = False
-    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Play) -> int:
@@ -56,7 +53,7 @@ def run(options: Play) -> int:
             out,
             episodes=options.episodes,
             three_dimensional=options.html,
-            keep_programs=True,
+            cache_programs=True,
             trust=trust,
             checkpoint=checkpoint,
         )

@@ -6,10 +6,11 @@ from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_run, may_run_code
 from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.cli.trained.options import TrustOption
 
 
 @dataclasses.dataclass(frozen=True)
-class Push:
+class Push(TrustOption):
     """Push a trained policy to a folder or a hub: card, curve, video, configuration and weights; `load_policy` reads it."""
 
     run_dir: Annotated[Path, AlsoPositional()]
@@ -18,8 +19,6 @@ class Push:
     """A new folder, or hub:user/name for the Hugging Face hub (needs the extra hub, and `hf auth login` once)."""
     seed: int | None = None
     """Seed whose policy is pushed; the run's first if not given."""
-    trust: bool = False
-    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Push) -> int:

@@ -7,11 +7,12 @@ from typing import Annotated
 
 from jaxrl_vis.cli.checks import check_counts, check_run, may_run_code
 from jaxrl_vis.cli.parsing import AlsoPositional
+from jaxrl_vis.cli.trained.options import TrustOption
 from jaxrl_vis.errors import RequestError
 
 
 @dataclasses.dataclass(frozen=True)
-class Verify:
+class Verify(TrustOption):
     """Repeat the beginning of a run, and check that its files have the same numbers, bit for bit.
 
     Nothing in the folder is changed. Exit status 0: everything repeated is equal, and nothing is missing, damaged or another
@@ -22,8 +23,6 @@ class Verify:
     """The run folder; the run may still be in progress."""
     iterations: int | None = None
     """Number of iterations to repeat, from the seed and from each full checkpoint; up to the second evaluation if not given."""
-    trust: bool = False
-    """Execute the run's custom code without asking, if its task is module:Name and another user trained it (docs/runs.md)."""
 
 
 def run(options: Verify) -> int:
@@ -33,7 +32,7 @@ def run(options: Verify) -> int:
     check_counts(iterations=options.iterations)
     from jaxrl_vis.run.verifying.verification import verify_run
 
-    report = verify_run(run_dir, options.iterations, keep_programs=True, say=print, trust=trust)
+    report = verify_run(run_dir, options.iterations, cache_programs=True, echo=print, trust=trust)
     for title, lines in (("not verified", report.unverified), ("note", report.notes), ("elsewhere", report.elsewhere)):
         for line in lines:
             print(f"{title}: {line}")

@@ -147,10 +147,10 @@ def play(
     def by_seed(leaf: jax.Array) -> jax.Array:
         return leaf.reshape(num_seeds, num_envs, *leaf.shape[1:])
 
-    def kept(leaf: jax.Array) -> jax.Array:
+    def stored(leaf: jax.Array) -> jax.Array:
         return by_seed(leaf)[:, :num_kept]
 
-    def seen(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
+    def perturb(observations: jax.Array, keys: jax.Array, number: int) -> jax.Array:
         # Noise is sampled once per frame and stored with it, so that a frame equals itself when it becomes a goal.
         if not deviation:
             return observations
@@ -159,13 +159,13 @@ def play(
         return noisy.reshape(observations.shape)
 
     def recorded(state: State) -> Any:
-        return None if record is None else jax.tree.map(kept, jax.vmap(record)(state))
+        return None if record is None else jax.tree.map(stored, jax.vmap(record)(state))
 
     reset_keys, policy_keys = split_keys(keys, num_envs, draws)
     state = jax.vmap(env.reset)(reset_keys)
     assert state.obs is not None
-    first_observation = seen(state.obs["observation"], policy_keys, _FIRST_NOISE)
-    goal = seen(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
+    first_observation = perturb(state.obs["observation"], policy_keys, _FIRST_NOISE)
+    goal = perturb(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
     first_state, first_record = state.achieved_state, recorded(state)
     policies = jax.vmap(algorithm.policy_params)(train.agent, train.statistics)
     aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
@@ -177,8 +177,8 @@ def play(
         state, observation = carry
         action = jax.vmap(act)(policies, aims, step_keys, by_seed(observation)).reshape(num_seeds * num_envs, -1)
         state = jax.vmap(env.advance)(state, action)
-        observation = seen(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
-        step_results = tuple(kept(leaf) for leaf in (observation, state.achieved_state, action))
+        observation = perturb(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
+        step_results = tuple(stored(leaf) for leaf in (observation, state.achieved_state, action))
         return (state, observation), (step_results, recorded(state))
 
     carry = (state.replace(obs=None), first_observation)
@@ -187,8 +187,8 @@ def play(
     outcome = {name: by_seed(state.metrics[name]) for name in env.metric_names}
 
     episodes = Episodes(
-        observations=_episode_major(kept(first_observation)[None], observations, kept(goal)[None]),
-        states=_episode_major(kept(first_state)[None], states, kept(state.goal_state)[None]),
+        observations=_episode_major(stored(first_observation)[None], observations, stored(goal)[None]),
+        states=_episode_major(stored(first_state)[None], states, stored(state.goal_state)[None]),
         actions=jnp.moveaxis(actions, 0, 2),
     )
     record_of_all = jax.tree.map(lambda first, rest: _episode_major(first[None], rest), first_record, records)

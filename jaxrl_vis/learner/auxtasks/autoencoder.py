@@ -18,7 +18,7 @@ def make(spec: Spec) -> AuxTask:
     in_grey = spec.options.in_grey
     channels, height, width = spec.observation.shape
     shape = (1 if in_grey else channels, height, width)
-    whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
+    size = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
 
     def target(view: View) -> jax.Array:
         image = read(view, "image")
@@ -36,7 +36,7 @@ def make(spec: Spec) -> AuxTask:
         name="autoencoder",
         needs=frozenset({"image"}),
         init=lambda key: heads.init_decoder(key, spec.latent_size, shape, spec.levels),
-        predict=lambda params, view: from_blocks(decode(params, view), *whole),
+        predict=lambda params, view: from_blocks(decode(params, view), *size),
         loss=loss,
         number=3,
     )

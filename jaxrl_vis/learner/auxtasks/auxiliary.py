@@ -19,7 +19,7 @@ from jaxrl_vis.host.plugins import call, find
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.auxtasks import AuxTask, Spec, Transitions, View
 from jaxrl_vis.types import Batch, Episodes, Params
-from jaxrl_vis.weighting import MAIN, WEIGHTINGS, Way, Weighting, WeightingState, limited, make_weighting, with_cosines
+from jaxrl_vis.weighting import MAIN, WEIGHTINGS, GradientMode, Weighting, WeightingState, limited, make_weighting, with_cosines
 
 # Folded into a learner's key for the samples of a weighting.
 _DRAWS = 0x647261
@@ -33,12 +33,12 @@ class Auxiliary:
     Attributes:
         tasks: Tasks by name.
         weighting: Weighting of their losses and the main one.
-        way: Method of the gradients of losses (`weighting.gradients`).
+        gradient_mode: Method of the gradients of losses (`weighting.gradients`).
     """
 
     tasks: dict[str, AuxTask]
     weighting: Weighting
-    way: Way = "latents"
+    gradient_mode: GradientMode = "latents"
 
     @property
     def needs_image(self) -> bool:
@@ -199,7 +199,7 @@ def make_auxiliary(
         RequestError: Tasks and weighting are incompatible with each other or with the rest of the configuration.
     """
     if config.auxiliary.weighting in WEIGHTINGS:
-        weighting = _bounded(config, make_weighting(config.auxiliary.weighting, **_options(config)))
+        weighting = _bound_strength(config, make_weighting(config.auxiliary.weighting, **_options(config)))
     else:
         maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
         weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
@@ -227,11 +227,11 @@ def make_auxiliary(
     spec = Spec(
         observation, action_size, config.network.latent_size, frame_stack, len(config.network.encoder_filters), dtype, options
     )
-    way: Way = "per_loss" if weighting.needs == "gradients" else "latents"
-    return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, way)
+    gradient_mode: GradientMode = "per_loss" if weighting.needs == "gradients" else "latents"
+    return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, gradient_mode)
 
 
-def _bounded(config: Config, weighting: Weighting) -> Weighting:
+def _bound_strength(config: Config, weighting: Weighting) -> Weighting:
     """Bound and scale the weights as configured. OL-AUX applies the maximum weight in its own rule."""
     maximum, total = config.study.weighting_maximum, config.study.weighting_total
     if config.auxiliary.weighting == "ol_aux":
@@ -246,13 +246,13 @@ def _options(config: Config) -> dict[str, Any]:
         RequestError: The number of values of eps differs from the number of tasks.
     """
     options: dict[str, Any] = {}
-    tasks, each = config.auxiliary.aux_tasks, config.study.weighting_task_eps
-    if each and len(each) != len(tasks):
-        raise RequestError(f"weighting_task_eps has {len(each)} values for {len(tasks)} aux_tasks: give one for each")
+    tasks, eps = config.auxiliary.aux_tasks, config.study.weighting_task_eps
+    if eps and len(eps) != len(tasks):
+        raise RequestError(f"weighting_task_eps has {len(eps)} values for {len(tasks)} aux_tasks: give one for each")
     if config.study.weighting_heads is not None:
         options["heads"] = config.study.weighting_heads
-    if each:
-        options["eps"] = dict(zip(tasks, each, strict=True))
+    if eps:
+        options["eps"] = dict(zip(tasks, eps, strict=True))
     elif config.study.weighting_eps is not None:
         options["eps"] = config.study.weighting_eps
     if config.auxiliary.weighting in ("ol_aux", "ol_aux_ablation"):

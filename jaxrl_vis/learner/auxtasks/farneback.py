@@ -67,17 +67,17 @@ def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settin
         settings: Window, pyramid, iterations.
     """
     expand = jax.vmap(functools.partial(_expansions, settings=settings))
-    return _between(expand(images_t), expand(images_tp1), settings)
+    return _interpolate_planes(expand(images_t), expand(images_tp1), settings)
 
 
 def flow_along(images: jax.Array, settings: Settings = Settings()) -> jax.Array:
     """Compute `flow` between successive images, [T + 1, H, W] -> [T, H, W, 2], expanding each image only once."""
     expansions = jax.vmap(functools.partial(_expansions, settings=settings))(images)
     before, after = (jax.tree.map(lambda plane, part=part: plane[part], expansions) for part in (slice(-1), slice(1, None)))
-    return _between(before, after, settings)
+    return _interpolate_planes(before, after, settings)
 
 
-def _between(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
+def _interpolate_planes(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
     displace = functools.partial(_displacements, settings=settings)
     return jnp.stack(jax.vmap(displace)(before, after), axis=-1)
 
@@ -91,7 +91,9 @@ def _displacements(before: list[Planes], after: list[Planes], settings: Settings
             displacements = (jnp.zeros((rows, columns)),) * 2
         else:
             resize_rows, resize_columns = (_resizing(new, old) for new, old in zip((rows, columns), displacements[0].shape))
-            displacements = tuple(_product(resize_rows, plane, resize_columns.T) / settings.scale for plane in displacements)
+            displacements = tuple(
+                _multiply_planes(resize_rows, plane, resize_columns.T) / settings.scale for plane in displacements
+            )
         for _ in range(settings.iterations):
             equations = _equations(expansion_t, expansion_tp1, *displacements)
             displacements = _solve(tuple(_mean_in_window(plane, settings.window) for plane in equations))
@@ -101,20 +103,20 @@ def _displacements(before: list[Planes], after: list[Planes], settings: Settings
 def _mean_in_window(plane: jax.Array, window: int) -> jax.Array:
     """Average a plane [H, W] over a square window around each pixel; borders are replicated."""
     rows, columns = (_filter(size, np.full(window, 1.0 / window), "edge") for size in plane.shape)
-    return _product(rows, plane, columns.T)
+    return _multiply_planes(rows, plane, columns.T)
 
 
-def _product(left: np.ndarray, plane: jax.Array, right: np.ndarray) -> jax.Array:
+def _multiply_planes(left: np.ndarray, plane: jax.Array, right: np.ndarray) -> jax.Array:
     """Compute ``left @ plane @ right`` for a plane [H, W]."""
-    return _by_rows(left, _by_columns(plane, right))
+    return _multiply_left(left, _multiply_right(plane, right))
 
 
 # In full float32: determinants are differences of large numbers.
-def _by_columns(plane: jax.Array, right: np.ndarray) -> jax.Array:
+def _multiply_right(plane: jax.Array, right: np.ndarray) -> jax.Array:
     return jnp.matmul(plane, right.astype(np.float32), precision=jax.lax.Precision.HIGHEST)
 
 
-def _by_rows(left: np.ndarray, plane: jax.Array) -> jax.Array:
+def _multiply_left(left: np.ndarray, plane: jax.Array) -> jax.Array:
     return jnp.matmul(left.astype(np.float32), plane, precision=jax.lax.Precision.HIGHEST)
 
 
@@ -180,9 +182,9 @@ def _expansions(image: jax.Array, settings: Settings) -> list[Planes]:
     for scale in _scales(height, width, settings):
         value_y, slope_y, curvature_y = _fits(round(height * scale), height, scale, *shape)
         value_x, slope_x, curvature_x = _fits(round(width * scale), width, scale, *shape)
-        value, slope, curvature = (_by_columns(image, fit.T) for fit in (value_x, slope_x, curvature_x))
+        value, slope, curvature = (_multiply_right(image, fit.T) for fit in (value_x, slope_x, curvature_x))
         pairs = (value_y, slope), (slope_y, value), (value_y, curvature), (curvature_y, value), (0.5 * slope_y, slope)
-        expansions.append(tuple(_by_rows(of_rows, planes) for of_rows, planes in pairs))
+        expansions.append(tuple(_multiply_left(of_rows, planes) for of_rows, planes in pairs))
     return expansions
 
 

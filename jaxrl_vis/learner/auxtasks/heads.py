@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis.learner.networks.kernels import decoder as decoder_kernel
 from jaxrl_vis.learner.networks.kernels import patches as encoder_kernel_patches
-from jaxrl_vis.learner.networks.kernels.passes import LEAST_ROWS
+from jaxrl_vis.learner.networks.kernels.passes import MIN_ROWS
 from jaxrl_vis.learner.networks.matmul import product
 from jaxrl_vis.types import Params
 
@@ -88,7 +88,7 @@ def has_kernel(batch: int, shape: tuple[int, int, int], levels: int) -> bool:
     """Return True if `decoding_error` supports ``batch`` images of shape C, H, W and a decoder of this many levels."""
     channels, height, width = shape
     cells = batch * (height >> levels) * (width >> levels) * 4 ** (levels - 2)
-    is_whole = levels >= encoder_kernel_patches.LEVELS and cells % LEAST_ROWS == 0
+    is_whole = levels >= encoder_kernel_patches.LEVELS and cells % MIN_ROWS == 0
     return is_whole and decoder_kernel.supports(channels, _CHANNELS, _FINEST_CHANNELS)
 
 

@@ -35,7 +35,7 @@ def read_planes_between(planes: Sequence[jax.Array], x: jax.Array, y: jax.Array)
 
     def read(plane: jax.Array) -> jax.Array:
         flat = plane.reshape(height * width).astype(jnp.float32)
-        return _between(lambda offset: flat.at[first + offset].get(mode="promise_in_bounds"), width, right, down)
+        return _interpolate(lambda offset: flat.at[first + offset].get(mode="promise_in_bounds"), width, right, down)
 
     return [read(plane) for plane in planes]
 
@@ -47,7 +47,7 @@ def _neighbours(height: int, width: int, x: jax.Array, y: jax.Array) -> tuple[ja
     return (top * width + left).astype(jnp.int32), x - left, y - top
 
 
-def _between(pixel: Callable[[int], jax.Array], width: int, right: jax.Array, down: jax.Array) -> jax.Array:
+def _interpolate(pixel: Callable[[int], jax.Array], width: int, right: jax.Array, down: jax.Array) -> jax.Array:
     """Interpolate linearly between four pixels, at an offset from the upper left one."""
     upper = (1.0 - right) * pixel(0) + right * pixel(1)
     lower = (1.0 - right) * pixel(width) + right * pixel(width + 1)
@@ -72,11 +72,11 @@ def to_words(images: jax.Array) -> jax.Array:
 def from_words(words: jax.Array, channels: int) -> jax.Array:
     """Invert `to_words`: [B, words, H, W] uint32 -> [B, channels, H, W] uint8."""
     batch, _, *size = words.shape
-    apart = jnp.stack([_byte(words, byte) for byte in range(_BYTES)], axis=2)
+    apart = jnp.stack([_select_byte(words, byte) for byte in range(_BYTES)], axis=2)
     return apart.reshape(batch, -1, *size)[:, :channels].astype(jnp.uint8)
 
 
-def _byte(words: jax.Array, byte: int) -> jax.Array:
+def _select_byte(words: jax.Array, byte: int) -> jax.Array:
     return (words >> (8 * byte)) & 255
 
 
@@ -94,7 +94,7 @@ def read_words_between(words: jax.Array, x: jax.Array, y: jax.Array) -> jax.Arra
     read = {offset: flat.at[:, first + offset].get(mode="promise_in_bounds") for offset in places}
 
     def value(byte: int) -> jax.Array:
-        values = _between(lambda offset: _byte(read[offset], byte).astype(jnp.float32), width, right, down)
+        values = _interpolate(lambda offset: _select_byte(read[offset], byte).astype(jnp.float32), width, right, down)
         return jnp.round(values).astype(jnp.uint32) << (8 * byte)
 
     first_byte, second, third, fourth = (value(byte) for byte in range(_BYTES))

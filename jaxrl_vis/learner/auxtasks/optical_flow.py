@@ -15,7 +15,7 @@ def make(spec: Spec) -> AuxTask:
     """Build the task. The flow is computed once per episode, as it takes longer than the rest of a gradient step."""
     stretch = spec.options.stretch
     _, height, width = spec.observation.shape
-    whole = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
+    size = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
 
     def both(view: View) -> jax.Array:
         return jnp.concatenate([view.latent_t, read(view, "latent_tp1")], axis=-1)
@@ -33,7 +33,7 @@ def make(spec: Spec) -> AuxTask:
         name="optical_flow",
         needs=frozenset({"latent_tp1"}),
         init=lambda key: heads.init_decoder(key, 2 * spec.latent_size, (1, height, width), spec.levels),
-        predict=lambda params, view: from_blocks(decode(params, view), *whole)[:, 0],
+        predict=lambda params, view: from_blocks(decode(params, view), *size)[:, 0],
         loss=loss,
         episode=lambda images: to_bytes(flow_strength_along(images, spec.frame_stack, stretch), stretch),
         target=lambda batch: from_bytes(batch.stored, stretch),
@@ -42,21 +42,21 @@ def make(spec: Spec) -> AuxTask:
     )
 
 
-_BYTES_PER_PIXEL, _LARGEST_BYTE = 16.0, 255.0
+_BYTES_PER_PIXEL, _MAX_BYTE = 16.0, 255.0
 
 
 def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
     """Quantize strengths [...] for the replay: uint8, in steps of 1/16 pixel up to 15.9; stretched masks in 255 steps."""
-    return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _LARGEST_BYTE).astype(jnp.uint8)
+    return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _MAX_BYTE).astype(jnp.uint8)
 
 
-def from_bytes(kept: jax.Array, stretch: bool = False) -> jax.Array:
+def from_bytes(flow: jax.Array, stretch: bool = False) -> jax.Array:
     """Invert `to_bytes`, up to rounding: [...] float32."""
-    return kept.astype(jnp.float32) / _scale(stretch)
+    return flow.astype(jnp.float32) / _scale(stretch)
 
 
 def _scale(stretch: bool) -> float:
-    return _LARGEST_BYTE if stretch else _BYTES_PER_PIXEL
+    return _MAX_BYTE if stretch else _BYTES_PER_PIXEL
 
 
 def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
@@ -87,6 +87,6 @@ def _strength(flow: jax.Array, stretch: bool) -> jax.Array:
     strength = jnp.sqrt(jnp.sum(jnp.square(flow), axis=-1))
     if not stretch:
         return strength
-    least, most = (reduce(strength, axis=(1, 2), keepdims=True) for reduce in (jnp.min, jnp.max))
+    low, high = (reduce(strength, axis=(1, 2), keepdims=True) for reduce in (jnp.min, jnp.max))
     # Where nothing moves at all, there is nothing to stretch.
-    return jnp.where(most > least, (strength - least) / jnp.where(most > least, most - least, 1.0), 0.0)
+    return jnp.where(high > low, (strength - low) / jnp.where(high > low, high - low, 1.0), 0.0)

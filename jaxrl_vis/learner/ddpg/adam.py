@@ -53,13 +53,13 @@ def step(params: Params, gradient: Params, state: Any, learning_rate: float, cor
         correction: [2] float32, a row of `corrections`.
     """
     moments = state[0]
-    first, second = (_averaged(*terms, gradient) for terms in zip(_DECAYS, (1, 2), (moments.mu, moments.nu), strict=True))
+    first, second = (_update_average(*terms, gradient) for terms in zip(_DECAYS, (1, 2), (moments.mu, moments.nu), strict=True))
 
-    def moved(leaf: jax.Array, mean: jax.Array, square: jax.Array) -> jax.Array:
+    def update_leaf(leaf: jax.Array, mean: jax.Array, square: jax.Array) -> jax.Array:
         return leaf - learning_rate * (mean / correction[0] / (jnp.sqrt(square / correction[1]) + _SMALL))
 
-    return jax.tree.map(moved, params, first, second), (moments._replace(mu=first, nu=second), *state[1:])
+    return jax.tree.map(update_leaf, params, first, second), (moments._replace(mu=first, nu=second), *state[1:])
 
 
-def _averaged(decay: float, order: int, moment: Params, gradient: Params) -> Params:
+def _update_average(decay: float, order: int, moment: Params, gradient: Params) -> Params:
     return jax.tree.map(lambda average, slope: (1.0 - decay) * slope**order + decay * average, moment, gradient)

@@ -289,7 +289,7 @@ def make_ddpg(
         )
         if mean_square is not None:
             metrics["train/action_size"] = jnp.sqrt(mean_square)
-        metrics |= {f"train/{name}": share for name, share in diagnostics.shares(counts, shards.count).items()}
+        metrics |= {f"train/{name}": fraction for name, fraction in diagnostics.fractions(counts, shards.count).items()}
         critic_gradient = weighted.gradient if own_gradient is None else own_gradient
         return Gradients(critic_gradient, actor_gradient, weighted.state if keeps_state else None, of_model), metrics
 

@@ -4,8 +4,6 @@ The ratio of two fractions, each averaged over many batches, estimates the fract
 filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -20,9 +18,9 @@ def count_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """Count positives, negatives and errors among B transitions, [] float32 by name; `shares` converts them to fractions.
+    """Count positives, negatives and errors among B transitions, [] float32 by name; `fractions` converts them to fractions.
 
-    If a batch is divided among devices, average the counts over the devices before calling `shares`.
+    If a batch is divided among devices, average the counts over the devices before calling `fractions`.
 
     Args:
         reward: [B] float32.
@@ -47,12 +45,7 @@ def count_rewards(
     }
 
 
-def of_rewards(*args: Any, **kwargs: Any) -> Metrics:
-    """Compute the `shares` of an undivided batch; arguments as for `count_rewards`."""
-    return shares(count_rewards(*args, **kwargs))
-
-
-def shares(counts: Metrics, parts: int = 1) -> Metrics:
+def fractions(counts: Metrics, parts: int = 1) -> Metrics:
     """Compute fractions of a batch, [] float32 by name; docs/learner.md defines them.
 
     Args:
@@ -60,14 +53,14 @@ def shares(counts: Metrics, parts: int = 1) -> Metrics:
         parts: Number of parts.
     """
 
-    def share(part: str, whole: str) -> jax.Array:
-        return counts[part] / jnp.maximum(counts[whole], 1.0 / parts)
+    def fraction(part: str, total: str) -> jax.Array:
+        return counts[part] / jnp.maximum(counts[total], 1.0 / parts)
 
-    result = {"positive_share": counts["positive_share"], "filtered_share": share("filtered", "negative")}
+    result = {"positive_share": counts["positive_share"], "filtered_share": fraction("filtered", "negative")}
     if "failure" not in counts:
         return result
     return result | {
-        "false_positive_share": share("false_positive", "failure"),
-        "false_negative_share": share("false_negative", "negative"),
-        "filtered_false_share": share("filtered_false", "negative"),
+        "false_positive_share": fraction("false_positive", "failure"),
+        "false_negative_share": fraction("false_negative", "negative"),
+        "filtered_false_share": fraction("filtered_false", "negative"),
     }

@@ -54,7 +54,7 @@ class Rewarded(NamedTuple):
     gradient: Params
 
 
-class Seen(NamedTuple):
+class Compared(NamedTuple):
     """Observations that a model compares, in the form that encoders read.
 
     Attributes:
@@ -77,14 +77,14 @@ class LearnedReward:
         name: Name of the method, used for the metric of its loss.
         networks: Architecture of the encoder.
         init_params: key -> parameters.
-        loss_and_reward: (parameters, `Seen`) -> loss [] and rewards [B] float32.
+        loss_and_reward: (parameters, `Compared`) -> loss [] and rewards [B] float32.
         optimizer: Optimiser of the parameters.
     """
 
     name: str
     networks: Networks
     init_params: Callable[[jax.Array], Params]
-    loss_and_reward: Callable[[Params, Seen], tuple[jax.Array, jax.Array]]
+    loss_and_reward: Callable[[Params, Compared], tuple[jax.Array, jax.Array]]
     optimizer: optax.GradientTransformation
 
     def init(self, key: jax.Array) -> ModelState:
@@ -106,8 +106,8 @@ class LearnedReward:
         else:
             reached = batch.reached
             pieces = [(self.networks.prepare(scaling, reached), slice(None))]
-        seen = Seen(pieces, inputs.pieces("goal"), self.networks.normalize(scaling, reached), batch)
-        (loss, reward), gradient = jax.value_and_grad(self.loss_and_reward, has_aux=True)(state.params, seen)
+        compared = Compared(pieces, inputs.pieces("goal"), self.networks.normalize(scaling, reached), batch)
+        (loss, reward), gradient = jax.value_and_grad(self.loss_and_reward, has_aux=True)(state.params, compared)
         return Rewarded(jax.lax.stop_gradient(reward), loss, gradient)
 
     def apply(self, state: ModelState, gradient: Params) -> ModelState:
@@ -126,10 +126,10 @@ def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> 
         encoder_key, decoder_key = jax.random.split(key)
         return {"encoder": networks.init_encoder(encoder_key), "decoder": task.init(decoder_key)}
 
-    def loss_and_reward(params: Params, seen: Seen) -> tuple[jax.Array, jax.Array]:
-        latent = networks.encode_pieces(params, seen.reached)
-        view = auxtasks.View(latent_t=latent, action=seen.batch.action, image=seen.image)
-        goal_latent = networks.encode_pieces(jax.lax.stop_gradient(params), seen.goal)
+    def loss_and_reward(params: Params, compared: Compared) -> tuple[jax.Array, jax.Array]:
+        latent = networks.encode_pieces(params, compared.reached)
+        view = auxtasks.View(latent_t=latent, action=compared.batch.action, image=compared.image)
+        goal_latent = networks.encode_pieces(jax.lax.stop_gradient(params), compared.goal)
         reward = cosine_reward(latent, goal_latent, resolved.reward_positive, resolved.reward_negative)
         return task.loss(params["decoder"], view), reward
 
@@ -148,13 +148,13 @@ def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> L
         inputs = jnp.zeros((1, 2 * config.network.latent_size))
         return {"encoder": networks.init_encoder(encoder_key), "head": head.init(head_key, inputs)["params"]}
 
-    def loss_and_reward(params: Params, seen: Seen) -> tuple[jax.Array, jax.Array]:
-        reached, goal = (networks.encode_pieces(params, pieces) for pieces in (seen.reached, seen.goal))
+    def loss_and_reward(params: Params, compared: Compared) -> tuple[jax.Array, jax.Array]:
+        reached, goal = (networks.encode_pieces(params, pieces) for pieces in (compared.reached, compared.goal))
         pairs = jnp.stack([jnp.concatenate([goal, reached]), jnp.concatenate([goal, goal])])
         of_goals, of_reached = head.apply({"params": params["head"]}, pairs)[:, 0].reshape(2, -1)
         loss = jnp.mean(jax.nn.softplus(-of_goals)) + jnp.mean(jax.nn.softplus(of_reached))
-        share = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair in both classes, of probability 1/2, gets R+
-        return loss, resolved.reward_negative + (resolved.reward_positive - resolved.reward_negative) * share
+        fraction = jnp.minimum(2.0 * jax.nn.sigmoid(of_reached), 1.0)  # a pair in both classes, of probability 1/2, gets R+
+        return loss, resolved.reward_negative + (resolved.reward_positive - resolved.reward_negative) * fraction
 
     return LearnedReward("classifier", networks, init, loss_and_reward, optax.adam(config.ddpg.critic_learning_rate))
 

@@ -68,7 +68,7 @@ def actor_loss(
     action: jax.Array,
     action_penalty: float,
     log_below: float | None = None,
-    whole: Callable[[jax.Array], jax.Array] = lambda mean: mean,
+    global_mean: Callable[[jax.Array], jax.Array] = lambda mean: mean,
     log_of: Literal["value", "loss"] = "value",
 ) -> jax.Array:
     """Compute minus the mean value of the policy's actions, plus their weighted mean square: [] float32.
@@ -80,7 +80,7 @@ def actor_loss(
         log_below: Maximum possible value, R+/(1-gamma): the logarithm of the distance to it replaces minus the value, to match
             auxiliary losses minimised as logarithms. With the rewards 0/-1 of the OL-AUX release, it is 0, and this is the
             release's log(-Q). None for no logarithm.
-        whole: Function from the mean over these transitions to that over the whole batch, applied before a logarithm.
+        global_mean: Function from the mean over these transitions to that over the whole batch, applied before a logarithm.
         log_of: Argument of the logarithm: value, the distance alone, with the mean square added afterwards (the release); or
             loss, their sum. The derivative of a logarithm is the inverse of its argument: with ``value`` it divides the
             gradient of the value, but not that of the mean square.
@@ -89,5 +89,5 @@ def actor_loss(
     if log_below is None:
         return penalty - value
     if log_of == "loss":
-        return jnp.log(jnp.maximum(whole(log_below - value + penalty), LOG_FLOOR))
-    return jnp.log(jnp.maximum(log_below - whole(value), LOG_FLOOR)) + penalty
+        return jnp.log(jnp.maximum(global_mean(log_below - value + penalty), LOG_FLOOR))
+    return jnp.log(jnp.maximum(log_below - global_mean(value), LOG_FLOOR)) + penalty

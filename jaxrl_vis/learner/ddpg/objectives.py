@@ -97,32 +97,32 @@ def _encoders(networks: Networks, auxiliary: Auxiliary, inputs: Inputs) -> dict[
     return {_MAIN_READS: of("before", "goal"), _OTHERS_READ: of("before", *auxiliary.encoded)}
 
 
-def _together(auxiliary: Auxiliary, found: Latents | dict[str, jax.Array]) -> Latents:
+def _collect_latents(auxiliary: Auxiliary, encoded: Latents | dict[str, jax.Array]) -> Latents:
     """Collect the latents for the losses, whether encoded together or by `_encoders`."""
-    if isinstance(found, Latents):
-        return found
-    before, *others = found[_OTHERS_READ]
-    return _with_others(auxiliary, found[_MAIN_READS], before, others)
+    if isinstance(encoded, Latents):
+        return encoded
+    before, *others = encoded[_OTHERS_READ]
+    return _with_others(auxiliary, encoded[_MAIN_READS], before, others)
 
 
-def _next_latents(networks: Networks, now: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
+def _next_latents(networks: Networks, copies: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
     """Encode the next observation and the goal for the target actor and the target critic: [2, B, latent] each.
 
     Heads take them in this order; inputs are stored as (goal, after). ``latents`` are the online critic's.
     """
     if networks.config.network.target_encoder:
-        of_critic = _encode(networks, now.target_critic, inputs, "goal", "after")[::-1]
+        of_critic = _encode(networks, copies.target_critic, inputs, "goal", "after")[::-1]
     else:
         after = latents.after
-        after = _encode(networks, now.critic, inputs, "after") if after is None else after[None]
+        after = _encode(networks, copies.critic, inputs, "after") if after is None else after[None]
         of_critic = jnp.concatenate([after, latents.pair[1:]])
     if networks.config.network.encoders == "shared":
         return of_critic, of_critic
-    of_actor = _encode(networks, networks.with_encoder(now.target_actor, now.actor), inputs, "goal", "after")[::-1]
+    of_actor = _encode(networks, networks.with_encoder(copies.target_actor, copies.actor), inputs, "goal", "after")[::-1]
     return of_actor, of_critic
 
 
-def _least(values: jax.Array) -> jax.Array:
+def _minimum(values: jax.Array) -> jax.Array:
     """Return the minimum of the heads' values: [K, B] -> [B]."""
     return values[0] if values.shape[0] == 1 else jnp.min(values, axis=0)
 
@@ -148,51 +148,53 @@ class Objectives:
         return self.shards.count > 1 and (weighting.needs != "losses" or weighting.reads_losses)
 
     def critic_gradient(
-        self, now: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch, noise: jax.Array | None = None
+        self, copies: ComputeCopies, inputs: Inputs, image: jax.Array | None, batch: Batch, noise: jax.Array | None = None
     ) -> Callable[[Params, WeightingState], Weighted]:
         """Build the function that computes the critic's losses and gradient; ``extra`` is (latents, values [B], keep [B]).
 
         All heads are trained on the same target; ``values`` are the minimum over heads. ``noise`` as for `_target`.
         """
-        networks, weighting, way = self.networks, self.auxiliary.weighting, self.auxiliary.way
+        networks, weighting, mode = self.networks, self.auxiliary.weighting, self.auxiliary.gradient_mode
 
         def encode(encoder: Params) -> Latents:
-            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=way == "per_loss")
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=mode == "per_loss")
 
-        def critic_losses(critic: Params, found: Latents | dict[str, jax.Array]):
+        def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
-            latents = _together(self.auxiliary, found)
-            target = self._target(now, inputs, latents, batch, noise)
+            latents = _collect_latents(self.auxiliary, encoded)
+            target = self._target(copies, inputs, latents, batch, noise)
             values = networks.values(critic, latents.pair, batch.action)
-            value = _least(values)
+            value = _minimum(values)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
             others = self._auxiliary(critic, latents, inputs, image, batch)
-            errors = [losses.critic_loss(of_head, target, keep, self._kept(keep)) for of_head in values]
+            errors = [losses.critic_loss(of_head, target, keep, self._kept_mean(keep)) for of_head in values]
             return {MAIN: functools.reduce(jnp.add, errors), **others}, (latents, value, keep)
 
         # If losses are differentiated one by one, auxiliary losses need not pass through everything that the main one reads.
-        passes_apart = way == "latents" and weighting.needs in ("dots", "gramian")
+        passes_apart = mode == "latents" and weighting.needs in ("dots", "gramian")
         encoders = _encoders(networks, self.auxiliary, inputs) if passes_apart else encode
         options: dict[str, Any] = {"forwards": forward_mode.with_tangents, "encode": encoders, "has_aux": True}
         if self.reduces_early:
             options["reduce"] = self.shards.mean
-        return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), way, **options)
+        return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), mode, **options)
 
-    def _kept(self, keep: jax.Array) -> jax.Array | None:
+    def _kept_mean(self, keep: jax.Array) -> jax.Array | None:
         """Return the mean number of unfiltered transitions per shard, the divisor for all shards; None for each its own."""
         if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
 
-    def _target(self, now: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch, noise: jax.Array | None) -> jax.Array:
+    def _target(
+        self, copies: ComputeCopies, inputs: Inputs, latents: Latents, batch: Batch, noise: jax.Array | None
+    ) -> jax.Array:
         """Compute the critic's targets [B]; ``noise`` [B, A], unless None, is added to the next actions."""
         assert batch.reward is not None
         networks, resolved = self.networks, self.resolved
-        of_actor, of_critic = _next_latents(networks, now, inputs, jax.lax.stop_gradient(latents))
-        action = networks.act(now.target_actor, of_actor)
+        of_actor, of_critic = _next_latents(networks, copies, inputs, jax.lax.stop_gradient(latents))
+        action = networks.act(copies.target_actor, of_actor)
         if noise is not None:
             action = jnp.clip(action + noise, -1.0, 1.0)
-        value_tp1 = _least(networks.values(now.target_critic, of_critic, action))
+        value_tp1 = _minimum(networks.values(copies.target_critic, of_critic, action))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
@@ -213,12 +215,12 @@ class Objectives:
             latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
             others = self._auxiliary(actor, latents, inputs, image, batch, weights)
         if self.auxiliary.weighting.log:
-            others = {name: self.shards.whole(loss) for name, loss in others.items()}
+            others = {name: self.shards.global_mean(loss) for name, loss in others.items()}
         action = self.networks.act(actor, self.auxiliary.main_latents(latents.pair, weights) if has_encoder else latents.pair)
         value = self.networks.value(critic, critic_latents.pair, action)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
         loss = losses.actor_loss(
-            value, action, self.config.ddpg.action_penalty, best, self.shards.whole, self.config.ddpg.actor_log
+            value, action, self.config.ddpg.action_penalty, best, self.shards.global_mean, self.config.ddpg.actor_log
         )
         weighting = self.auxiliary.weighting
         of_heads = weighting.head_weights(weights)

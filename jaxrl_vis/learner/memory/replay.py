@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.learner.memory.random_integers import scaled
+from jaxrl_vis.learner.memory.random_integers import to_integers
 from jaxrl_vis.types import Batch, Episodes, ReplayState
 
 _WORD = 4  # bytes
@@ -101,7 +101,7 @@ class Replay(NamedTuple):
             stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`).
         """
         episodes, horizon = self.num_episodes, self.horizon
-        beside = {
+        fields = {
             name: _pack_steps(jnp.zeros((episodes, *spec.shape), spec.dtype)) for name, spec in dict(stored or {}).items()
         }
         first, *others = observation.shape
@@ -111,7 +111,7 @@ class Replay(NamedTuple):
                 observations=pack(jnp.zeros(stored_shape, observation.dtype)),
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
-                stored=beside,
+                stored=fields,
             ),
             size=jnp.zeros((), jnp.int32),
         )
@@ -175,8 +175,8 @@ class Replay(NamedTuple):
         if self.mean_age is not None:  # an exponential distribution that ends with the oldest episode
             mean = self.mean_age * self.num_envs
             of_episode = -mean * jnp.log1p(of_episode * jnp.expm1(-size / mean)) / size
-        age = scaled(of_episode, size)
-        return Indices(episode=(latest - age) % self.num_episodes, time=scaled(of_time, self.horizon))
+        age = to_integers(of_episode, size)
+        return Indices(episode=(latest - age) % self.num_episodes, time=to_integers(of_time, self.horizon))
 
     def gather(
         self,

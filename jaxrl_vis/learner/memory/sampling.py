@@ -18,7 +18,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.config.methods import RewardFunction
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.memory import reward_errors
-from jaxrl_vis.learner.memory.random_integers import scaled
+from jaxrl_vis.learner.memory.random_integers import to_integers
 from jaxrl_vis.learner.memory.relabel import choose_goal_slots
 from jaxrl_vis.learner.memory.replay import Indices, Replay
 from jaxrl_vis.learner.memory.rewards import make_reward
@@ -41,7 +41,7 @@ class Choice(NamedTuple):
         shift: [B, 2] int32, see `Batch`; or None.
         target_key: [] a typed key, for targets of auxiliary tasks; or None.
         clutter_end: [] float32, see `reward_errors`; or None.
-        gives_way: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached; None
+        is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached; None
             if none is, or if true states have decided that (``goal_episode``).
     """
 
@@ -51,7 +51,7 @@ class Choice(NamedTuple):
     shift: jax.Array | None = None
     target_key: jax.Array | None = None
     clutter_end: jax.Array | None = None
-    gives_way: jax.Array | None = None
+    is_replaceable: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,11 +92,11 @@ class Sampler:
         goal_slot = self.goal_slots(goal_key, indices.time)
         choice = Choice(indices, goal_slot)
         if self.config.goals.trivial_goals < 1.0:
-            choice = self._without_trivial(state, choice, jax.random.fold_in(key, _TRIVIAL))
+            choice = self._replace_trivial_goals(state, choice, jax.random.fold_in(key, _TRIVIAL))
         if self.config.network.random_shift:
-            most, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
+            max_shift, shape = self.config.network.random_shift, (self.config.run.batch_size, 2)
             fraction = jax.random.uniform(jax.random.fold_in(key, _SHIFT), shape)
-            choice = choice._replace(shift=scaled(fraction, 2 * most + 1) - most)
+            choice = choice._replace(shift=to_integers(fraction, 2 * max_shift + 1) - max_shift)
         if self.config.study.reward_clutter < 1.0:
             choice = choice._replace(clutter_end=self._clutter_end(state, iteration))
         parted = jax.tree.map(self.shards.part, choice._replace(clutter_end=None))
@@ -116,34 +116,34 @@ class Sampler:
 
     def goal_slots(self, key: jax.Array, time: jax.Array) -> jax.Array:
         """Choose goal slots for transitions that start at ``time`` [B] int32; see `relabel`."""
-        shares = self.config.goals.relabel_probability, self.resolved.balance_probability
+        probabilities = self.config.goals.relabel_probability, self.resolved.balance_probability
         discount = self.resolved.discount if self.config.goals.future_goals == "geometric" else None
-        return choose_goal_slots(key, time, self.replay.horizon, *shares, discount)
+        return choose_goal_slots(key, time, self.replay.horizon, *probabilities, discount)
 
-    def _without_trivial(self, state: ReplayState, choice: Choice, key: jax.Array) -> Choice:
-        """Have most of the relabelled goals that are already reached replaced by another episode's.
+    def _replace_trivial_goals(self, state: ReplayState, choice: Choice, key: jax.Array) -> Choice:
+        """Replace most of the relabelled goals that are already reached by goals from another episode.
 
         They are not replaced by original goals. If these look different from observations in episodes (VisualFingerTurn's
         finger always hangs down in them), rarely reached goals would all share that look, and the critic could infer rewards
         from it.
         """
         (episode, time), goal_slot = choice.indices, choice.goal_slot
-        gives_way = ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
-        gives_way &= goal_slot <= self.replay.horizon
+        is_replaceable = ~jax.random.bernoulli(key, self.config.goals.trivial_goals, time.shape)
+        is_replaceable &= goal_slot <= self.replay.horizon
         if self.resolved.method.reward != "oracle":  # observations decide, which are not read yet
-            return choice._replace(gives_way=gives_way)
+            return choice._replace(is_replaceable=is_replaceable)
         states = state.episodes.states
-        gives_way &= goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
+        is_replaceable &= goals.success(states[episode, time], states[episode, goal_slot], self.threshold) > 0
         # Transitions are sampled at random, so the next transition's episode is a random one.
-        return choice._replace(goal_episode=jnp.where(gives_way, jnp.roll(episode, 1), episode))
+        return choice._replace(goal_episode=jnp.where(is_replaceable, jnp.roll(episode, 1), episode))
 
-    def _with_goals_of_others(self, batch: Batch, gives_way: jax.Array) -> Batch:
-        """Replace the goals that ``gives_way`` [B] allows, and that are reached before the action, by the next transition's."""
+    def _replace_reached_goals(self, batch: Batch, is_replaceable: jax.Array) -> Batch:
+        """Replace the goals that ``is_replaceable`` [B] allows, and that are reached before the action, by the next transition's."""
         before = batch.observation_t if self.as_goal is None else jax.vmap(self.as_goal)(batch.observation_t)
-        gives_way = gives_way & (self._reward(batch, before, 1.0, 0.0) > 0.0)
+        is_replaceable = is_replaceable & (self._reward(batch, before, 1.0, 0.0) > 0.0)
 
         def replaced(values: jax.Array) -> jax.Array:
-            chosen = gives_way.reshape(-1, *(1,) * (values.ndim - 1))
+            chosen = is_replaceable.reshape(-1, *(1,) * (values.ndim - 1))
             return jnp.where(chosen, jnp.roll(values, 1, axis=0), values)
 
         observations = batch.observations.at[1].set(replaced(batch.goal))
@@ -171,8 +171,8 @@ class Sampler:
             batch = batch.replace(reached=reached)
             if batch.goal.ndim == 2:  # of states; the replay repeats a goal's newest image itself
                 batch = batch.replace(observations=batch.observations.at[1].set(jax.vmap(self.as_goal)(batch.goal)))
-        if choice.gives_way is not None:
-            batch = self._with_goals_of_others(batch, choice.gives_way)
+        if choice.is_replaceable is not None:
+            batch = self._replace_reached_goals(batch, choice.is_replaceable)
         if self.config.study.n_step > 1:
             return self._rewarded_over_steps(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
@@ -219,10 +219,10 @@ class Sampler:
             reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1
         )
         reward = goals.oracle_reward(states, batch.goal_state, self.threshold, positive, negative)
-        shares = config.study.reward_false_positives, config.study.reward_false_negatives
-        if not any(shares):
+        error_rates = config.study.reward_false_positives, config.study.reward_false_negatives
+        if not any(error_rates):
             return reward
         is_positive = reward_errors.flip(
-            reward == positive, batch.state_tp1, batch.goal_state, *shares, config.study.reward_clutter, clutter_end
+            reward == positive, batch.state_tp1, batch.goal_state, *error_rates, config.study.reward_clutter, clutter_end
         )
         return jnp.where(is_positive, positive, negative).astype(jnp.float32)

@@ -7,11 +7,11 @@ from jaxrl_vis.learner.networks import forward_mode
 
 def product(values: jax.Array, kernel: jax.Array) -> jax.Array:
     """Compute ``values @ kernel`` for [..., M, K] and [..., K, N]."""
-    return values @ kernel if forward_mode.are_wanted() else _with_rule(values, kernel)
+    return values @ kernel if forward_mode.are_wanted() else _product_with_gradient(values, kernel)
 
 
 @jax.custom_vjp
-def _with_rule(values: jax.Array, kernel: jax.Array) -> jax.Array:
+def _product_with_gradient(values: jax.Array, kernel: jax.Array) -> jax.Array:
     return values @ kernel
 
 
@@ -24,4 +24,4 @@ def _backward(residuals: tuple[jax.Array, jax.Array], gradient: jax.Array) -> tu
     return jax.lax.dot_general(gradient, kernel, (((columns,), (columns,)), (batch, batch))), kernel_gradient
 
 
-_with_rule.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _backward)
+_product_with_gradient.defvjp(lambda values, kernel: (values @ kernel, (values, kernel)), _backward)

@@ -21,7 +21,7 @@ from jaxrl_vis.learner.networks.matmul import product
 _glorot = nn.initializers.glorot_uniform()
 
 
-def _cold(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
+def _zero_init(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
     """Initialise kernels with outputs close to 0: uniform in [-1e-12, 1e-12]."""
     return jax.random.uniform(key, shape, dtype, -1e-12, 1e-12)
 
@@ -112,5 +112,5 @@ class Head(nn.Module):
             inputs = (nn.relu(values),)
         # The last layer stays in float32: near Q = -50 the spacing of bfloat16 numbers is 0.25.
         bias = nn.initializers.constant(self.output_bias)
-        kernel = _cold if self.stabilised else _glorot
+        kernel = _zero_init if self.stabilised else _glorot
         return Dense(self.outputs, jnp.float32, bias, kernel, name="output")(*inputs)

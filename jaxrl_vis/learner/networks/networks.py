@@ -115,11 +115,11 @@ class Networks:
             )
         if self.sees_images:
             *_, height, width = self.observation_spec.shape
-            least = 2**self._levels
-            if min(height, width) < least:
+            minimum = 2**self._levels
+            if min(height, width) < minimum:
                 raise RequestError(
                     f"image_size {min(height, width)} is too small for {self._levels} encoder layers, which need at least "
-                    f"{least}: raise --image-size or shorten --encoder-filters"
+                    f"{minimum}: raise --image-size or shorten --encoder-filters"
                 )
             if shift >= min(height, width):
                 raise RequestError(
@@ -193,8 +193,8 @@ class Networks:
 
     def init_target(self, online: Params) -> Params:
         """Copy online parameters for a target network: only the head if targets have no encoders."""
-        kept = online if self.config.network.target_encoder else {"head": online["head"]}
-        return jax.tree.map(jnp.copy, kept)  # a donated buffer must not appear twice
+        copied = online if self.config.network.target_encoder else {"head": online["head"]}
+        return jax.tree.map(jnp.copy, copied)  # a donated buffer must not appear twice
 
     def with_encoder(self, params: Params, other: Params) -> Params:
         """Add the encoder of ``other`` to ``params``, unless they have their own or none is needed."""

@@ -147,7 +147,7 @@ class Layout:
 
         return jax.tree.map(placed, self.shardings(specs), tree)
 
-    def folded(self, replay: ReplayState, num_envs: int) -> ReplayState:
+    def fold_replay(self, replay: ReplayState, num_envs: int) -> ReplayState:
         """Return one device's part of a learner's replay in its form between two iterations.
 
         Args:
@@ -160,8 +160,8 @@ class Layout:
         episodes = jax.tree.map(lambda leaf: leaf.reshape(-1, num_envs, *leaf.shape[1:]), replay.episodes)
         return ReplayState(episodes=episodes, size=replay.size * count)
 
-    def unfolded(self, replay: ReplayState) -> ReplayState:
-        """Invert `folded`."""
+    def unfold_replay(self, replay: ReplayState) -> ReplayState:
+        """Invert `fold_replay`."""
         count = self.shards.count
         if count == 1:
             return replay

@@ -36,7 +36,7 @@ class Shards:
         """Sum over the shards."""
         return array if self.count == 1 else jax.lax.psum(array, DATA)
 
-    def whole(self, mean: jax.Array) -> jax.Array:
+    def global_mean(self, mean: jax.Array) -> jax.Array:
         """Average over the shards, with the gradient of this shard alone, which is itself to be averaged by `mean`."""
         return mean if self.count == 1 else mean + jax.lax.stop_gradient(self.mean(mean) - mean)
 
@@ -58,7 +58,7 @@ class Shards:
 
     def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """Sample standard normal numbers of ``shape`` for this shard's images, independent of the number of shards."""
-        return self.draw(lambda whole: jax.random.normal(key, whole), shape)
+        return self.draw(lambda size: jax.random.normal(key, size), shape)
 
     def split(self, key: jax.Array, count: int) -> jax.Array:
         """Return a key for each of the ``count`` environments of this shard."""

@@ -76,7 +76,7 @@ def show_bytes(count: float) -> str:
     return f"{gib:.1f} GiB" if gib >= 0.1 else f"{gib:.3f} GiB" if gib >= 0.001 else "under 0.001 GiB"
 
 
-def _least_available(layout: Layout) -> int | None:
+def _available_bytes(layout: Layout) -> int | None:
     """Return the minimum free memory of the run's devices, in bytes; None if one is unknown."""
     if layout.mesh is None:
         return available_bytes()
@@ -113,63 +113,63 @@ def check_memory(
     """
     capacity = math.ceil(config.run.replay_transitions / steps_per_iteration) * steps_per_iteration
     parts = layout.shards.count
-    share = parts / layout.num_devices  # fraction of the seeds on each device
-    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.run.seeds) * share
-    replay = replay_bytes * config.run.seeds * share / parts
+    fraction = parts / layout.num_devices  # fraction of the seeds on each device
+    train = max(0, tree_bytes(loop_shapes) - replay_bytes * config.run.seeds) * fraction
+    replay = replay_bytes * config.run.seeds * fraction / parts
     bytes_per_rollout = replay * steps_per_iteration / capacity
     collected = bytes_per_rollout * frame_stack
     batch = collected / steps_per_iteration * config.run.batch_size * 4
-    beside = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
-    there, each = _least_available(layout), "" if layout.num_devices == 1 else " a device"
-    if there is None:
-        return f"replay {show_bytes(replay)}{each}"
-    if replay + beside > there:
-        fitting = int((there - beside) // bytes_per_rollout) * steps_per_iteration
+    other = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
+    available, suffix = _available_bytes(layout), "" if layout.num_devices == 1 else " a device"
+    if available is None:
+        return f"replay {show_bytes(replay)}{suffix}"
+    if replay + other > available:
+        fitting = int((available - other) // bytes_per_rollout) * steps_per_iteration
         if fitting > 0:
-            mend = f"--replay-transitions {fitting} fits"
+            hint = f"--replay-transitions {fitting} fits"
         else:
-            mend = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
+            hint = "not even one rollout fits: lower --num-envs, --image-size or --seeds"
         seeds = "1 seed" if config.run.seeds == 1 else f"{config.run.seeds} seeds"
         raise RequestError(
             f"a replay of {config.run.replay_transitions} transitions for {seeds} needs "
-            f"{show_bytes(replay)}{each}, and networks and rollouts {show_bytes(beside)} more; there are "
-            f"{show_bytes(there)}{each}: {mend}"
+            f"{show_bytes(replay)}{suffix}, and networks and rollouts {show_bytes(other)} more; there are "
+            f"{show_bytes(available)}{suffix}: {hint}"
         )
-    return f"replay {show_bytes(replay)} of {show_bytes(there)}{each}"
+    return f"replay {show_bytes(replay)} of {show_bytes(available)}{suffix}"
 
 
-def check_compiled(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> None:
+def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> None:
     """Compare the compiler's own figures with the free memory, before anything is allocated.
 
     Args:
         programs: Compiled programs by name; must include ``learn`` if the loop state is still to be allocated.
-        already_there: True if the loop state is already on the device.
+        is_allocated: True if the loop state is already on the device.
         layout: Placement of the run; the compiler's figures are those of one device.
 
     Raises:
         RequestError: A program's scratch memory does not fit beside the state.
     """
-    there = _least_available(layout)
-    if there is None:
+    available = _available_bytes(layout)
+    if available is None:
         return
     state, scratch = _sizes(programs)
     for name, size in scratch.items():
-        if size + (0 if already_there else state) > there:
+        if size + (0 if is_allocated else state) > available:
             raise RequestError(
                 f"{name} needs {show_bytes(size)} of scratch memory beside a state of {show_bytes(state)}; there are "
-                f"{show_bytes(there)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
+                f"{show_bytes(available)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
             )
 
 
-def fit_together(programs: dict[str, Any], already_there: bool, layout: Layout = ONE_DEVICE) -> bool:
+def fit_together(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> bool:
     """Return True if all programs fit into memory at once, so that one may be launched while another still runs.
 
     Args:
-        programs, already_there, layout: As in `check_compiled`.
+        programs, is_allocated, layout: As in `check_compiled`.
     """
-    there = _least_available(layout)
+    available = _available_bytes(layout)
     state, scratch = _sizes(programs)
-    return there is None or sum(scratch.values()) + (0 if already_there else state) <= there
+    return available is None or sum(scratch.values()) + (0 if is_allocated else state) <= available
 
 
 def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:

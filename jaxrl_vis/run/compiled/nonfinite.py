@@ -14,13 +14,13 @@ from jaxrl_vis.types import LoopState
 _MAX_EPISODES = 64
 
 
-def _checked(tree: Any) -> dict[str, Any]:
+def _checked_part(tree: Any) -> dict[str, Any]:
     return {name: leaf for name, leaf in named_leaves(tree).items() if jnp.issubdtype(leaf.dtype, jnp.floating)}
 
 
-def broken_leaves(loop: LoopState) -> dict[str, jax.Array]:
+def nonfinite_leaves(loop: LoopState) -> dict[str, jax.Array]:
     """Return for each floating-point leaf, by name, whether it has a NaN or an infinity, [] bool. Traceable under jit."""
-    return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked(loop).items()}
+    return {name: ~jnp.isfinite(leaf).all() for name, leaf in _checked_part(loop).items()}
 
 
 def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
@@ -30,7 +30,7 @@ def _episodes(loop: LoopState, *names: str) -> dict[str, np.ndarray]:
     return {name: array.reshape(len(array), -1, *array.shape[-2:]) for name, array in episodes.items()}
 
 
-def made_by_simulation(loop: LoopState, num_envs: int) -> str | None:
+def nonfinite_simulation(loop: LoopState, num_envs: int) -> str | None:
     """Describe the evidence that the simulation produced the non-finite number; None if there is none.
 
     There is evidence if a non-finite state precedes the first non-finite action: later ones are due to the learner.

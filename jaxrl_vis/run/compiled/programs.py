@@ -25,7 +25,7 @@ from jaxrl_vis.learner.acting.rollout import NO_EXPLORATION, Exploration
 from jaxrl_vis.learner.iteration import Learned
 from jaxrl_vis.learner.train_step import JIT_OPTIONS
 from jaxrl_vis.report import videos
-from jaxrl_vis.run.compiled.nonfinite import broken_leaves
+from jaxrl_vis.run.compiled.nonfinite import nonfinite_leaves
 from jaxrl_vis.run.compiled.pending import Pending, stacked
 from jaxrl_vis.run.compiled.threaded_rollout import ThreadedRollout
 from jaxrl_vis.run.compiled.trace_cache import TraceCache, fingerprint
@@ -101,7 +101,7 @@ class Programs:
     @functools.cached_property
     def shows_images(self) -> bool:
         """True if observations can be shown in a video."""
-        replay = jax.eval_shape(jax.vmap(self.layout.unfolded), self.shapes.replay)
+        replay = jax.eval_shape(jax.vmap(self.layout.unfold_replay), self.shapes.replay)
         _, episodes, slots, *image = replay.episodes.observations.shape
         return videos.shows_images((episodes, slots, *image))
 
@@ -122,16 +122,16 @@ class Programs:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the programs that a run needs, slowest to compile first: they compile while others are traced."""
-        return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "broken_leaves", "keys")))
+        return tuple(dict.fromkeys(("play", "learn", *self._evaluation, "init", "nonfinite_leaves", "keys")))
 
-    def compile(self, names: Sequence[str] | None = None, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    def compile(self, names: Sequence[str] | None = None, concurrent_work: Callable[[], None] = lambda: None) -> dict[str, Any]:
         """Compile programs in parallel, including the small operations of saving and evaluating.
 
         Each function is traced once, here, and the programs compiled here are the ones that run later.
 
         Args:
             names: Names of the programs; None for all that a run needs. Compiled ones are skipped.
-            meanwhile: Called after tracing, while XLA compiles.
+            concurrent_work: Called after tracing, while XLA compiles.
 
         Returns:
             All programs compiled so far, by name.
@@ -154,7 +154,7 @@ class Programs:
                             else:
                                 lowered = function.lower(*arguments)
                         futures[name] = pool.submit(lowered.compile)
-                    self._finish(missing, meanwhile)
+                    self._finish(missing, concurrent_work)
                     self._keep({name: future.result() for name, future in futures.items()})
                 if traces is not None:
                     traces.write()
@@ -177,12 +177,12 @@ class Programs:
             return None
         return TraceCache(Path(cache) / "programs", identity, self.shapes, JIT_OPTIONS)
 
-    def _finish(self, names: Sequence[str], meanwhile: Callable[[], None]) -> None:
+    def _finish(self, names: Sequence[str], concurrent_work: Callable[[], None]) -> None:
         """Do all work that can overlap with XLA's compilation."""
         if "init" in names and not distributed.are_several():
             # Extracting the data of keys, as in saving, is also a compiled program.
             to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
-        meanwhile()
+        concurrent_work()
 
     def _keep(self, compiled: dict[str, Any]) -> None:
         """Store compiled programs, and compile the stacking of their metrics."""
@@ -199,7 +199,7 @@ class Programs:
         shapes, number = self.shapes, jax.ShapeDtypeStruct((), jnp.float32)
         first, noise = jax.ShapeDtypeStruct((), jnp.int32), Exploration(number, number)  # type: ignore[arg-type]
         calls: dict[str, tuple[Any, tuple]] = {
-            "broken_leaves": (jax.jit(broken_leaves), (shapes,)),
+            "nonfinite_leaves": (jax.jit(nonfinite_leaves), (shapes,)),
             "keys": (self.program.keys, (shapes.key, shapes.iteration)),
             "play": (self.program.play, (shapes.train, shapes.key, first, noise)),
             "learn": (self.program.learn, (shapes, self.program.parts_spec)),
@@ -272,11 +272,11 @@ class Programs:
         """Prepare metrics of `train_iteration` or `evaluate` for reading by the host, without compiling anything."""
         return Pending(metrics, self._stacks.get(frozenset(metrics), stacked))
 
-    def broken_leaves(self, loop: LoopState) -> list[str]:
+    def nonfinite_leaves(self, loop: LoopState) -> list[str]:
         """List the floating-point leaves of the loop state that hold a NaN or an infinity."""
-        return [name for name, is_broken in jax.device_get(self.compiled("broken_leaves")(loop)).items() if is_broken]
+        return [name for name, is_broken in jax.device_get(self.compiled("nonfinite_leaves")(loop)).items() if is_broken]
 
-    def says_of_cache(self) -> str:
+    def cache_message(self) -> str:
         """Describe, for messages, whether the next start will find the programs compiled now in the cache."""
         folder, fault = enable_compilation_cache(), cache_fault()
         if fault is not None:

@@ -39,7 +39,7 @@ from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import target_platform, tracing_for_default_device, use_gpu_kernels
 
 VARIABLE = "JAXRL_VIS_KEEP_PROGRAMS"
-MOST_FILES = 300
+MAX_FILES = 300
 """Maximum number of files, of half a megabyte each; the oldest are deleted."""
 
 _PACKAGES = ("jaxrl_vis", "jaxrl_vis_envs")
@@ -129,7 +129,7 @@ class TraceCache:
             for name, data in self._fresh.items() if self._is_private() else ():
                 with replacing(self._path(name), durable=False, mode=0o600) as file:
                     file.write(self._digest(name, data) + data)
-            for path in sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-MOST_FILES]:
+            for path in sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)[:-MAX_FILES]:
                 path.unlink(missing_ok=True)
         self._fresh.clear()
 
@@ -165,7 +165,7 @@ class TraceCache:
             return False
         reason = stranger_to(status)
         if reason is not None:
-            _say_once(
+            _print_once(
                 f"programs kept in {self._folder} are not used: it {reason}; JAX_COMPILATION_CACHE_DIR names another folder"
             )
         return reason is None
@@ -192,6 +192,6 @@ def _register(tree: Any) -> None:
 
 
 @functools.cache
-def _say_once(line: str) -> None:
+def _print_once(line: str) -> None:
     with contextlib.suppress(OSError, ValueError, AttributeError):  # a stream that is closed, or none
         print(line, file=sys.stderr)

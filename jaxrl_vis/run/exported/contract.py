@@ -161,11 +161,11 @@ def read_contract(path: Path) -> Contract:
         RequestError: The contract is missing or damaged, or describes another file.
     """
     folder = path if path.is_dir() else path.parent
-    file, mend = folder / FILE, "export again with --overwrite"
+    file, hint = folder / FILE, "export again with --overwrite"
     if not file.exists():
         what = path if path.exists() else f"{path} does not exist, and"
         raise RequestError(f"{what} has no {FILE} beside it: name a file that `jaxrl-vis export` wrote")
-    values = read_json(file, mend=mend)
+    values = read_json(file, hint=hint)
     try:
         if values["schema"] != SCHEMA:
             raise RequestError(f"{file} is of schema {values['schema']!r}, not {SCHEMA}: use the version that wrote it")
@@ -176,11 +176,11 @@ def read_contract(path: Path) -> Contract:
     except RequestError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise RequestError(f"{file} is no contract of an exported policy: {mend}") from error
+        raise RequestError(f"{file} is no contract of an exported policy: {hint}") from error
     if path.is_file() and path.name not in (name, FILE):
         raise RequestError(f"{file} describes {name}, not {path.name}: name that file")
     if not (folder / name).is_file():
-        raise RequestError(f"{folder / name} is missing: {mend}")
+        raise RequestError(f"{folder / name} is missing: {hint}")
     return Contract(values["format"], folder / name, folder / GOLDEN, forms, values)
 
 

@@ -81,7 +81,7 @@ def export_run(
     policy = make_policy(trainer, restored, seed)
     layers = None if kind == "stablehlo" else layers_of(policy)
     frames = golden.record(trainer, restored.train, policy)
-    contract = contracts.make_contract(policy, run_dir, kind, _unclipped(policy))
+    contract = contracts.make_contract(policy, run_dir, kind, _input_ranges(policy))
     _write(folder, kind, policy, layers, frames, contract)
     return check_file(folder)
 
@@ -96,7 +96,7 @@ def _check_folder(folder: Path, overwrite: bool) -> None:
         raise RequestError(f"{folder} holds an exported policy: --overwrite replaces it, or name another folder with --out")
 
 
-def _unclipped(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _input_ranges(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the unclipped range (low [S], high [S]) of each input of a state policy; empty for images or if unknown."""
     if len(policy.observation_spec.shape) == 3:
         return {}
@@ -104,11 +104,11 @@ def _unclipped(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         layers = layers_of(policy)
     except RequestError:
         return {}
-    found = {}
+    ranges = {}
     for name in INPUTS:
         mean, scale = (layers.arrays[f"{layers.scaling(name)}/{part}"] for part in ("mean", "scale"))
-        found[name] = (mean - layers.limit / scale, mean + layers.limit / scale)
-    return found
+        ranges[name] = (mean - layers.limit / scale, mean + layers.limit / scale)
+    return ranges
 
 
 def _write(
@@ -152,7 +152,7 @@ def check_file(path: Path | str) -> Check:
     """
     contract = contracts.read_contract(Path(path))
     frames = golden.read(contract.golden, contract.forms)
-    run = _of_weights(contract) if contract.format == "safetensors" else _of_program(contract)
+    run = _load_weights(contract) if contract.format == "safetensors" else _load_program(contract)
     try:
         action = run(frames.observation, frames.goal)
     except Exception as error:  # the file may contain an arbitrary graph
@@ -163,14 +163,14 @@ def check_file(path: Path | str) -> Check:
     return Check(contract.file, float(np.max(np.abs(action.astype(np.float64) - frames.action))), len(frames.action))
 
 
-def _of_program(contract: Contract) -> Any:
+def _load_program(contract: Contract) -> Any:
     """Load a policy in ONNX or StableHLO, and compare its inputs and outputs with the contract."""
     model = (onnx_file.Model if contract.format == "onnx" else stablehlo.Program)(contract.file)
-    found = {**model.inputs, **model.outputs}
+    tensors = {**model.inputs, **model.outputs}
     for name, (shape, dtype) in contract.forms.items():
-        if name not in found:
+        if name not in tensors:
             raise RequestError(f"{contract.file} has no {name}, which its contract names: export it again")
-        (_, *sizes), kind = found[name]
+        (_, *sizes), kind = tensors[name]
         if tuple(sizes) != shape or kind != dtype:
             raise RequestError(
                 f"{contract.file} does not fit its contract, {name} is {kind} {tuple(sizes)} and not {dtype} {shape}: "
@@ -179,7 +179,7 @@ def _of_program(contract: Contract) -> Any:
     return model
 
 
-def _of_weights(contract: Contract) -> Any:
+def _load_weights(contract: Contract) -> Any:
     """Load weights, and return their forward pass in NumPy."""
 
     def declare(about: dict[str, Any]) -> tuple[float, Any]:

@@ -76,25 +76,25 @@ def read(path: Path, forms: dict[str, tuple[tuple[int, ...], str]]) -> Golden:
     Raises:
         RequestError: The file is missing or damaged, or its arrays have other shapes.
     """
-    mend = "export again with --overwrite"
+    hint = "export again with --overwrite"
     try:
         with zipfile.ZipFile(path) as archive:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
         for name in (*INPUTS, OUTPUT):
             shape, dtype = forms[name]
-            most = COUNT * int(np.prod(shape)) * np.dtype(dtype).itemsize + 1024
-            if not 0 < sizes.get(f"{name}.npy", 0) <= most:  # before anything is unpacked
-                raise RequestError(f"{path} has no {COUNT} frames of {name} as the contract says: {mend}")
+            max_bytes = COUNT * int(np.prod(shape)) * np.dtype(dtype).itemsize + 1024
+            if not 0 < sizes.get(f"{name}.npy", 0) <= max_bytes:  # before anything is unpacked
+                raise RequestError(f"{path} has no {COUNT} frames of {name} as the contract says: {hint}")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in (*INPUTS, OUTPUT)}
     except FileNotFoundError as error:
-        raise RequestError(f"{path} is missing: {mend}") from error
+        raise RequestError(f"{path} is missing: {hint}") from error
     except RequestError:
         raise
     except Exception as error:  # zipfile, zlib and NumPy raise various exceptions
-        raise RequestError(f"{path} is damaged ({type(error).__name__}): {mend}") from error
+        raise RequestError(f"{path} is damaged ({type(error).__name__}): {hint}") from error
     for name, array in arrays.items():
         shape, dtype = forms[name]
         if array.shape != (COUNT, *shape) or array.dtype != np.dtype(dtype):
-            raise RequestError(f"{path}: {name} is {array.dtype} {array.shape}, not {dtype} {(COUNT, *shape)}: {mend}")
+            raise RequestError(f"{path}: {name} is {array.dtype} {array.shape}, not {dtype} {(COUNT, *shape)}: {hint}")
     return Golden(**arrays)

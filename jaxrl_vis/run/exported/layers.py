@@ -130,7 +130,7 @@ def forward(layers: Layers, observation: np.ndarray, goal: np.ndarray) -> np.nda
         values = (values.astype(np.float32) - arrays[f"{source}/mean"]) * arrays[f"{source}/scale"]
         values = np.clip(values, -layers.limit, layers.limit)
         for level in range(layers.convolutions):
-            values = _convolved(values, arrays[f"encoder/{level}/kernel"], arrays[f"encoder/{level}/bias"])
+            values = _convolve(values, arrays[f"encoder/{level}/kernel"], arrays[f"encoder/{level}/bias"])
         if layers.convolutions:
             values = np.moveaxis(values, 1, -1).reshape(len(values), -1)
             values = values @ arrays["encoder/latent/kernel"] + arrays["encoder/latent/bias"]
@@ -141,7 +141,7 @@ def forward(layers: Layers, observation: np.ndarray, goal: np.ndarray) -> np.nda
     return np.tanh(values @ arrays["head/output/kernel"] + arrays["head/output/bias"])
 
 
-def _convolved(images: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
+def _convolve(images: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
     """Convolve images [N, C, H, W] with a kernel [out, C, 2, 2] and stride 2, and apply ReLU."""
     count, channels, height, width = images.shape
     rows, columns = height // 2, width // 2

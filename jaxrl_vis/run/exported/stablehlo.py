@@ -11,7 +11,7 @@ from jaxrl_vis.run.exported.layers import INPUTS, OUTPUT
 from jaxrl_vis.run.trained.policy import Policy
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-_LARGEST = 1 << 30  # bytes
+_MAX_BYTES = 1 << 30  # bytes
 
 
 def to_bytes(policy: Policy) -> bytes:
@@ -53,7 +53,7 @@ class Program:
 
     def __init__(self, path: Path):
         try:
-            if path.stat().st_size > _LARGEST:
+            if path.stat().st_size > _MAX_BYTES:
                 raise RequestError(f"{path} is larger than any policy: export it again")
             self._exported = export.deserialize(bytearray(path.read_bytes()))
             self.inputs = {name: _form(aval) for name, aval in zip(INPUTS, self._exported.in_avals, strict=True)}

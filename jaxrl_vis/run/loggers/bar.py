@@ -12,7 +12,7 @@ from rich.text import Text
 
 from jaxrl_vis.host.streams import SafeStream
 
-_LEAST_BAR = 10  # minimum width of the bar, columns
+_MIN_BAR = 10  # minimum width of the bar, columns
 _BETWEEN = "  "
 
 Wordings = Callable[[Task, str, str], Sequence[Sequence[str]]]
@@ -23,8 +23,8 @@ def clock(seconds: float | None) -> str:
     """Format a duration as ``0:07:30``, with unlimited hours; ``-:--:--`` for None."""
     if seconds is None:
         return "-:--:--"
-    whole = max(0, int(seconds))
-    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}"
+    seconds_left = max(0, int(seconds))
+    return f"{seconds_left // 3600}:{seconds_left // 60 % 60:02}:{seconds_left % 60:02}"
 
 
 class FittingProgress(Progress):
@@ -53,7 +53,7 @@ class FittingProgress(Progress):
         shown = next((line for line in lines if cell_len(line) <= width), lines[-1])
         table = Table.grid(expand=True)
         room = width - cell_len(shown) - len(_BETWEEN)
-        if room < _LEAST_BAR:
+        if room < _MIN_BAR:
             table.add_column(no_wrap=True, overflow="crop")
             table.add_row(Text(shown, no_wrap=True, overflow="crop"))
             return table

@@ -20,12 +20,12 @@ def show_shares(values: Sequence[float]) -> str:
 
 def show_seconds(seconds: float) -> str:
     """Format a duration as ``42 s``, ``3 min 5 s`` or ``2 h 10 min``."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+    rounded = round(seconds)
+    if rounded < 60:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{rounded} s"
+    if rounded < 3600:
+        return f"{rounded // 60} min {rounded % 60} s"
+    return f"{rounded // 3600} h {rounded % 3600 // 60} min"
 
 
 def _wordings(task: Task, elapsed: str, left: str) -> list[tuple[str, ...]]:
@@ -58,14 +58,14 @@ class RunConsole:
         self._bar: FittingProgress | None = None
         self._task = None
 
-    def say(self, line: str) -> None:
+    def echo(self, line: str) -> None:
         """Print one line."""
         if self._quiet:
             return
         if self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False, soft_wrap=True)
         else:
-            streams.say(line)
+            streams.echo(line)
 
     def start(self, total: int, done: int) -> None:
         """Start the progress bar, on a terminal.

@@ -55,11 +55,11 @@ class Loggers:
     Args:
         names: Names of the loggers, from `NAMES`.
         folder: The run folder.
-        say: Called with one line about each failure.
+        echo: Called with one line about each failure.
     """
 
-    def __init__(self, names: Sequence[str], folder: Path, say: Callable[[str], None]):
-        self._names, self._folder, self._say = tuple(dict.fromkeys(names)), folder, say
+    def __init__(self, names: Sequence[str], folder: Path, echo: Callable[[str], None]):
+        self._names, self._folder, self._echo = tuple(dict.fromkeys(names)), folder, echo
         self._open: dict[str, Logger] = {}
 
     def open(self, record: Mapping[str, Any], seeds: Sequence[int], rows: Sequence[Row]) -> None:
@@ -73,7 +73,7 @@ class Loggers:
         for name in self._names:
 
             def begin(name: str = name) -> None:
-                self._open[name] = _open(name, self._folder, record, seeds, self._say)
+                self._open[name] = _open(name, self._folder, record, seeds, self._echo)
                 self._open[name].rows(rows)
 
             self._try(name, begin)
@@ -97,7 +97,7 @@ class Loggers:
             thread.start()
             thread.join(_LEAVING_S[in_a_hurry])
             if thread.is_alive():
-                self._say(f"--log {name} has not sent everything yet and is not waited for; metrics.jsonl has it all")
+                self._echo(f"--log {name} has not sent everything yet and is not waited for; metrics.jsonl has it all")
 
     def _try(self, name: str, act: Callable[[], None]) -> None:
         try:
@@ -105,14 +105,14 @@ class Loggers:
         except Exception as error:
             self._open.pop(name, None)
             description = " ".join(f"{type(error).__name__}: {error}".split())
-            self._say(f"--log {name} failed and is not used any more ({description[:200]}); metrics.jsonl has everything")
+            self._echo(f"--log {name} failed and is not used any more ({description[:200]}); metrics.jsonl has everything")
 
 
-def _open(name: str, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]) -> Logger:
+def _open(name: str, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], echo: Callable[[str], None]) -> Logger:
     if name == "wandb":
         from jaxrl_vis.run.loggers.weights_and_biases import WeightsAndBiases
 
-        return WeightsAndBiases(folder, record, seeds, say)
+        return WeightsAndBiases(folder, record, seeds, echo)
     from jaxrl_vis.run.loggers.tensorboard import TensorBoard
 
     return TensorBoard(folder, record, seeds)

@@ -34,14 +34,14 @@ class WeightsAndBiases:
         folder: The run folder.
         record: The contents of config.json.
         seeds: The seeds of the run.
-        say: Called with the addresses of the runs.
+        echo: Called with the addresses of the runs.
 
     Raises:
         RequestError: No account is logged in.
         Exception: Any error of W&B, for example if it cannot be reached.
     """
 
-    def __init__(self, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], say: Callable[[str], None]):
+    def __init__(self, folder: Path, record: Mapping[str, Any], seeds: Sequence[int], echo: Callable[[str], None]):
         self._state_file = folder / WANDB_STATE
         self._run_id = record[RUN_ID]
         self._state = self._read_state()
@@ -70,13 +70,13 @@ class WeightsAndBiases:
             run.define_metric("*", step_metric="env_steps")
             self._runs[seed] = run
             if run.url and mode == "online":
-                say(f"Weights & Biases shows seed {seed} at {run.url}")
+                echo(f"Weights & Biases shows seed {seed} at {run.url}")
         self._write_state()
 
     def _read_state(self) -> dict[str, dict[str, Any]]:
         if not self._state_file.exists():
             return {}
-        state = read_json(self._state_file, mend="delete it to begin new runs there")
+        state = read_json(self._state_file, hint="delete it to begin new runs there")
         return {seed: known for seed, known in state.items() if isinstance(known, dict) and known.get(RUN_ID) == self._run_id}
 
     def _write_state(self) -> None:

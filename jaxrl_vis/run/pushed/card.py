@@ -12,14 +12,14 @@ class Score(NamedTuple):
     """Success rate at the last step of evaluation episodes.
 
     Attributes:
-        share: Success rate, 0 to 1.
+        success: Success rate, 0 to 1.
         low, high: Bounds of the 95 % Wilson interval.
         episodes: Number of episodes.
         env_steps: Environment steps trained before the evaluation.
         distance: Mean distance to the goal, in the task's unit.
     """
 
-    share: float
+    success: float
     low: float
     high: float
     episodes: int
@@ -31,10 +31,10 @@ def score(row: Mapping[str, Any], episodes: int) -> Score:
     """Summarise a row of metrics.jsonl of an evaluation on ``episodes`` episodes."""
     from scipy.stats import binomtest
 
-    share = float(row["eval/success"])
-    interval = binomtest(round(share * episodes), episodes).proportion_ci(method="wilson")
+    success = float(row["eval/success"])
+    interval = binomtest(round(success * episodes), episodes).proportion_ci(method="wilson")
     distance = float(row["eval/goal_distance"])
-    return Score(share, float(interval.low), float(interval.high), episodes, int(row["env_steps"]), distance)
+    return Score(success, float(interval.low), float(interval.high), episodes, int(row["env_steps"]), distance)
 
 
 def card(
@@ -64,11 +64,11 @@ def card(
     lines += [f"# {name}", "", f"A policy that reaches goals of the task {task}, trained by jaxrl-vis.", ""]
     lines += [f"![{caption}]({file})\n" for caption, file in (pictures or {}).items()]
     lines += ["| seed | environment steps | success | 95 % interval | episodes | mean distance |", "|---|---|---|---|---|---|"]
-    for number, each in scores.items():
+    for number, result in scores.items():
         here = " (these weights)" if number == seed else ""
         lines.append(
-            f"| {number}{here} | {each.env_steps:,} | {each.share:.3f} | {each.low:.3f} to {each.high:.3f} | "
-            f"{each.episodes} | {each.distance:.3g} {unit} |"
+            f"| {number}{here} | {result.env_steps:,} | {result.success:.3f} | {result.low:.3f} to {result.high:.3f} | "
+            f"{result.episodes} | {result.distance:.3g} {unit} |"
         )
     if not scores:
         lines[-2:] = [f"Weights of seed {seed}; not evaluated where they were saved."]
@@ -111,7 +111,7 @@ def _front(task: str, name: str, of_seed: Score | None) -> dict[str, Any]:
     }
     if of_seed is not None:
         kind = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
-        metric = {"type": "success_rate", "name": "success", "value": round(of_seed.share, 4), "verified": False}
+        metric = {"type": "success_rate", "name": "success", "value": round(of_seed.success, 4), "verified": False}
         result = {"task": kind, "dataset": {"name": task, "type": task}, "metrics": [metric]}
         front["model-index"] = [{"name": name, "results": [result]}]
     return front

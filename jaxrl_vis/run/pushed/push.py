@@ -65,19 +65,19 @@ def push(run_dir: Path | str, to: str, seed: int | None = None, trust: bool = Fa
     """
     check_target(to)
     policy = load_policy(run_dir, seed=seed, trust=trust)
-    beside = None if to.startswith(HUB) else Path(to).absolute().parent
+    parent = None if to.startswith(HUB) else Path(to).absolute().parent
     try:
-        if beside is not None:
-            beside.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".push-", dir=beside) as temporary:
-            whole = Path(temporary) / "policy"
-            whole.mkdir()
-            assemble(Path(run_dir), policy, whole)
+        if parent is not None:
+            parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".push-", dir=parent) as temporary:
+            folder = Path(temporary) / "policy"
+            folder.mkdir()
+            assemble(Path(run_dir), policy, folder)
             if to.startswith(HUB):
-                return _upload(whole, to.removeprefix(HUB))
+                return _upload(folder, to.removeprefix(HUB))
             if Path(to).exists():
                 Path(to).rmdir()
-            shutil.move(whole, to)
+            shutil.move(folder, to)
     except OSError as error:
         raise StorageError(f"cannot write to {to} ({error.strerror or error}): nothing is left of it there") from error
     return to

@@ -115,8 +115,8 @@ def is_intact(array: np.ndarray, described: list) -> bool:
 
 def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
     """Return True for shapes [S, rollouts, E, ...] and [S, rollouts * E, ...] of the same episodes (`sharding.Layout`)."""
-    (start, *rest), (folded_start, *folded) = sorted((tuple(one), tuple(other)), key=len)
-    return len(folded) >= 2 and start == folded_start and rest == [folded[0] * folded[1], *folded[2:]]
+    (start, *rest), (folded_start, *fold_replay) = sorted((tuple(one), tuple(other)), key=len)
+    return len(fold_replay) >= 2 and start == folded_start and rest == [fold_replay[0] * fold_replay[1], *fold_replay[2:]]
 
 
 def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:

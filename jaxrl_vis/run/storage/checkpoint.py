@@ -17,7 +17,7 @@ checkpoints/replaced/ until the new one is complete.
 """
 
 import contextlib
-import dataclasses
+import functools
 import itertools
 import shutil
 from collections.abc import Callable, Iterator
@@ -27,11 +27,12 @@ from typing import TYPE_CHECKING, Any
 from jaxrl_vis.errors import RequestError, StorageError
 from jaxrl_vis.host import distributed, streams
 from jaxrl_vis.host.files import read_json
-from jaxrl_vis.run.storage import hush, sums
-from jaxrl_vis.run.storage.arrays import as_saved, check_structure, describe, host_specs, is_intact, rebuild, to_host, to_save
-from jaxrl_vis.run.storage.manifest import FILE, SCHEMA, is_manifest
+from jaxrl_vis.run.storage import hush, restoring, sums
+from jaxrl_vis.run.storage.arrays import describe, to_save
+from jaxrl_vis.run.storage.manifest import FILE, SCHEMA
 from jaxrl_vis.run.storage.metrics import RUN_ID
 from jaxrl_vis.run.storage.recent import ANY_RUN, Recent, Unusable
+from jaxrl_vis.run.storage.restoring import Restored, state_without_learner
 from jaxrl_vis.types import LoopState, TrainState
 
 if TYPE_CHECKING:  # orbax takes a fifth of this package's import time, so it is imported where it is used
@@ -44,48 +45,10 @@ _TIMEOUT_S = 10**9
 DAMAGED, FOREIGN, REPLACED = "damaged", "foreign", "replaced"
 
 
-@contextlib.contextmanager
-def _damage_first(where: Path) -> Iterator[None]:
-    """Raise Unusable instead of a RequestError if files of the checkpoint have changed: damage is not another version."""
-    try:
-        yield
-    except RequestError:
-        changes = None
-        with contextlib.suppress(OSError):
-            changes = sums.compare_sums(where)
-        if changes:
-            raise Unusable(changes[0]) from None
-        raise
-
-
-@dataclasses.dataclass(frozen=True)
-class Restored:
-    """Contents of a checkpoint.
-
-    Attributes:
-        tier: `LIGHT`, `FULL`, `RECENT` or `BEST`.
-        iteration: Iterations completed.
-        train: The learner, [S, ...].
-        loop: The complete state; None from the light tier.
-        progress: Progress that was saved with it.
-    """
-
-    tier: str
-    iteration: int
-    train: TrainState
-    loop: LoopState | None
-    progress: dict[str, Any]
-
-
-def _free(path: Path) -> Path:
+def _unused_path(path: Path) -> Path:
     """Return an unused path: ``path`` itself, or the first free one of path-2, path-3, ..."""
     numbered = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
     return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())
-
-
-def state_without_learner(loop: LoopState) -> dict[str, Any]:
-    """Return the part of a loop state that full checkpoints have in addition to the learner."""
-    return {"replay": loop.replay, "key": loop.key, "iteration": loop.iteration}
 
 
 class Checkpoints:
@@ -93,7 +56,7 @@ class Checkpoints:
 
     Args:
         folder: Folder of the tiers; created by the first save.
-        say: Called with one line about each unusable checkpoint.
+        echo: Called with one line about each unusable checkpoint.
         read_only: Never save: nothing is created or cleaned up.
 
     Attributes:
@@ -104,14 +67,14 @@ class Checkpoints:
     def __init__(
         self,
         folder: Path,
-        say: Callable[[str], None] = streams.say,
+        echo: Callable[[str], None] = streams.echo,
         read_only: bool = False,
         run_id: str = ANY_RUN,
     ):
         self._folder = folder.absolute()  # orbax refuses relative names
-        self._say = say
+        self._echo = echo
         self._read_only = read_only
-        self.recent = Recent(self._folder / RECENT, say)
+        self.recent = Recent(self._folder / RECENT, echo)
         self.run_id = run_id
         self._managers: dict[str, ocp.CheckpointManager] = {}
         self._reported: set[tuple[str, int]] = set()  # damaged ones
@@ -186,7 +149,7 @@ class Checkpoints:
         self._save(LIGHT, iteration, {"train": to_save(train, copy=True)}, progress)
 
     def save_best(self, iteration: int, train: TrainState, progress: dict[str, Any]) -> None:
-        """Write the learner, wait for the disk, and only then delete the best one before. See `save_light`."""
+        """Write the learner, wait for the disk, then delete the previous best checkpoint. See `save_light`."""
         self._save(BEST, iteration, {"train": to_save(train, copy=False)}, progress)
         self.wait()
         for earlier in self.iterations(BEST):
@@ -210,7 +173,7 @@ class Checkpoints:
         arguments["manifest"] = ocp.args.JsonSave(manifest)
         if distributed.are_several():
             self.wait()  # with two tiers written concurrently, processes would confuse one with the other
-        with self._writing(tier):
+        with self._storage_errors(tier):
             manager = self._manager(tier)
             self._wait(tier)
             if distributed.any_process(iteration in self.iterations(tier)):  # orbax would silently keep the old one
@@ -230,11 +193,11 @@ class Checkpoints:
                 sums.write_sums(folder)
             self._unsummed.discard(saved)
             if distributed.is_first():
-                shutil.rmtree(self._replaced(*saved), ignore_errors=True)
+                shutil.rmtree(self._replaced_path(*saved), ignore_errors=True)
                 with contextlib.suppress(OSError):  # others are in there, or it does not exist
                     (self._folder / REPLACED).rmdir()
 
-    def _replaced(self, tier: str, iteration: int) -> Path:
+    def _replaced_path(self, tier: str, iteration: int) -> Path:
         """Return the place of a checkpoint while a new one of the same iteration is written."""
         return self._folder / REPLACED / f"{tier}-{iteration}"
 
@@ -242,7 +205,7 @@ class Checkpoints:
         """Move a checkpoint aside, where `_recover` finds it if the process is killed before the replacement is complete."""
         distributed.meet("replacing")
         if distributed.is_first():
-            aside = self._replaced(tier, iteration)
+            aside = self._replaced_path(tier, iteration)
             aside.parent.mkdir(exist_ok=True)
             shutil.rmtree(aside, ignore_errors=True)
             (self._folder / tier / str(iteration)).rename(aside)
@@ -262,7 +225,7 @@ class Checkpoints:
         distributed.meet("recovered")
 
     @contextlib.contextmanager
-    def _writing(self, tier: str) -> Iterator[None]:
+    def _storage_errors(self, tier: str) -> Iterator[None]:
         """Convert orbax's exceptions on writing into a `StorageError`."""
         try:
             yield
@@ -282,13 +245,13 @@ class Checkpoints:
             StorageError: Something could not be written.
         """
         for tier in list(self._managers):
-            with self._writing(tier):
+            with self._storage_errors(tier):
                 self._wait(tier)
 
     def close(self) -> None:
         """Wait for pending writes, then release orbax's threads."""
         for tier, manager in list(self._managers.items()):
-            with self._writing(tier):
+            with self._storage_errors(tier):
                 self._wait(tier)
                 manager.close()
         self._managers.clear()
@@ -331,7 +294,7 @@ class Checkpoints:
         """
         foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL, BEST)}
         moved = self._move(foreign, FOREIGN)
-        recent = _free(self._folder / FOREIGN / RECENT)
+        recent = _unused_path(self._folder / FOREIGN / RECENT)
         if distributed.is_first() and self.recent.set_foreign_aside(recent):
             moved.append(recent)
         return moved
@@ -340,7 +303,7 @@ class Checkpoints:
         moved = []
         for tier, iteration in [(tier, iteration) for tier, numbers in iterations.items() for iteration in numbers]:
             self._forget(tier)
-            moved.append(_free(self._folder / folder / f"{tier}-{iteration}"))
+            moved.append(_unused_path(self._folder / folder / f"{tier}-{iteration}"))
             if distributed.is_first():
                 moved[-1].parent.mkdir(exist_ok=True)
                 if tier == RECENT:
@@ -364,11 +327,11 @@ class Checkpoints:
             RequestError: A checkpoint has another structure.
         """
         self._recover()
-        return self._newest_good(template, with_rest=True)
+        return self._newest_good(template, with_replay=True)
 
     def restore_train(self, template: LoopState, iteration: int | None = None) -> Restored | None:
         """Restore the learner of the newest valid light or full checkpoint, or of ``iteration``; see `restore_for_resume`."""
-        return self._newest_good(template, with_rest=False, only=iteration)
+        return self._newest_good(template, with_replay=False, requested=iteration)
 
     def manifest(self, tier: str, iteration: int) -> dict[str, Any]:
         """Return the manifest of a checkpoint: ``schema``, ``iteration``, ``items`` (`arrays.describe`), and ``progress``.
@@ -387,7 +350,7 @@ class Checkpoints:
         """
         iteration = manifest["iteration"]
         with self._damage_as_request_error(tier, iteration):
-            return self._restored(tier, iteration, template, tier == FULL, manifest)
+            return self._restore_from(tier, iteration, template, tier == FULL, manifest)
 
     @contextlib.contextmanager
     def _damage_as_request_error(self, tier: str, iteration: int) -> Iterator[None]:
@@ -396,61 +359,42 @@ class Checkpoints:
         except Unusable as damage:
             raise RequestError(f"checkpoint {tier}/{iteration} is damaged ({damage})") from None
 
-    def _newest_good(self, template: LoopState, with_rest: bool, only: int | None = None) -> Restored | None:
+    def _newest_good(self, template: LoopState, with_replay: bool, requested: int | None = None) -> Restored | None:
         # A light checkpoint is smaller, and a recent one may be deleted by the run while it is read.
-        tiers = _PRECEDENCE if with_rest else (LIGHT, FULL)
-        candidates = [(iteration, tier) for tier in tiers for iteration in self.iterations(tier) if only in (None, iteration)]
+        tiers = _PRECEDENCE if with_replay else (LIGHT, FULL)
+        candidates = [
+            (iteration, tier) for tier in tiers for iteration in self.iterations(tier) if requested in (None, iteration)
+        ]
         for iteration, tier in sorted(candidates, key=lambda item: (-item[0], tiers.index(item[1]))):
             try:
                 if tier == RECENT:
                     loop, progress = self.recent.restore(iteration, template)
                     return Restored(RECENT, iteration, loop.train, loop, progress)
                 manifest = self._read_manifest(tier, iteration)
-                return self._restored(tier, iteration, template, with_rest and tier == FULL, manifest)
+                return self._restore_from(tier, iteration, template, with_replay and tier == FULL, manifest)
             except Unusable as damage:
                 if (tier, iteration) not in self._reported:
-                    self._say(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
+                    self._echo(f"checkpoint {tier}/{iteration} is damaged ({damage}); trying the one before")
                 self._reported.add((tier, iteration))
         return None
 
     def _read_manifest(self, tier: str, iteration: int) -> dict[str, Any]:
-        import orbax.checkpoint as ocp
-
-        manifest = self._read(tier, iteration, {"manifest": ocp.args.JsonRestore()})["manifest"]
-        if not is_manifest(manifest):
-            raise Unusable("its manifest is incomplete")
         where = self._folder / tier / str(iteration)
-        with _damage_first(where):
-            if manifest["schema"] != SCHEMA:
-                raise RequestError(f"{where} is of schema {manifest['schema']}, not {SCHEMA}: use the version that wrote it")
-        return manifest
+        return restoring.read_manifest(functools.partial(self._read, tier, iteration), where)
 
-    def _restored(self, tier: str, iteration: int, template: LoopState, with_rest: bool, manifest: dict[str, Any]) -> Restored:
-        import orbax.checkpoint as ocp
-
-        templates = {"train": template.train} | ({"rest": state_without_learner(template)} if with_rest else {})
-        specs = {name: host_specs(tree) for name, tree in templates.items()}
-        where = self._folder / tier / str(iteration)
-        for name, spec in specs.items():
-            with _damage_first(where):
-                check_structure(where, manifest["items"].get(name, {}), spec)
-            specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
-        read = self._read(tier, iteration, {name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
-        trees = {}
-        for name, tree in templates.items():
-            for leaf_name, array in to_host(read[name], copy=False).items():
-                if not is_intact(array, manifest["items"][name][leaf_name]):
-                    raise Unusable(f"wrong checksum of {leaf_name}")
-            trees[name] = rebuild(tree, read[name])
-        loop = LoopState(train=trees["train"], **trees["rest"]) if with_rest else None
-        return Restored(tier, iteration, trees["train"], loop, manifest["progress"])
+    def _restore_from(
+        self, tier: str, iteration: int, template: LoopState, with_replay: bool, manifest: dict[str, Any]
+    ) -> Restored:
+        read, where = functools.partial(self._read, tier, iteration), self._folder / tier / str(iteration)
+        train, loop = restoring.restore_items(read, where, manifest, template, with_replay)
+        return Restored(tier, iteration, train, loop, manifest["progress"])
 
     def _read(self, tier: str, iteration: int, arguments: dict[str, Any]) -> Any:
         import orbax.checkpoint as ocp
 
         try:
-            manager = self._manager(tier)  # first, because `hushed` restores the hooks that it finds
-            with hush.hushed():
+            manager = self._manager(tier)  # first, because `silenced` restores the hooks that it finds
+            with hush.silenced():
                 return manager.restore(iteration, args=ocp.args.Composite(**arguments))
         # orbax and tensorstore report damage by arbitrary exceptions, plain Exception included.
         except Exception as error:

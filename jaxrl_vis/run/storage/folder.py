@@ -131,37 +131,37 @@ class RunFolder:
             return rows
         return [row for row in rows if row.get(RUN_ID) == run_id]
 
-    def check_place(self, held: Held) -> None:
+    def check_place(self, lock: Held) -> None:
         """Check that the folder is still in place since it was locked, before the run starts.
 
         Args:
-            held: What holds the folder.
+            lock: The lock of the folder, held by this process.
 
         Raises:
             FolderGoneError: It was moved, deleted or taken over.
         """
-        held.check()
-        if not held.is_in_place():
-            raise FolderGoneError(_where_gone(self.path, held.current_path(), "before the run began"))
+        lock.check()
+        if not lock.is_in_place():
+            raise FolderGoneError(_where_gone(self.path, lock.current_path(), "before the run began"))
 
-    def check_ours(self, run_id: str, held: Held) -> None:
+    def check_ours(self, run_id: str, lock: Held) -> None:
         """Check that the folder still belongs to a run, before writing into it.
 
         Args:
             run_id: Id of the run.
-            held: What holds the folder.
+            lock: The lock of the folder, held by this process.
 
         Raises:
             FolderGoneError: It was moved, deleted or taken over.
         """
-        held.check()
+        lock.check()
         try:
-            is_ours = held.is_in_place() and read_run_id(self.path) == run_id
+            is_ours = lock.is_in_place() and read_run_id(self.path) == run_id
         except RequestError:  # an unreadable file, temporarily or permanently, is no reason to stop
             is_ours = self.config.exists()
         if not is_ours:
             when = "while the run wrote there, and what was trained since its last checkpoint is lost"
-            raise FolderGoneError(_where_gone(self.path, held.current_path(), when))
+            raise FolderGoneError(_where_gone(self.path, lock.current_path(), when))
 
     def remove_remains(self, run_id: str) -> None:
         """Delete files that checkpoint threads have recreated in a folder after it was moved or deleted.
@@ -217,8 +217,8 @@ class RunFolder:
         Raises:
             RequestError: As in `check`; or the folder is not writable, or something in it cannot be deleted.
         """
-        goes_on = self.check(config, resume, overwrite)
-        run_id = read_run_id(self.path) if goes_on else secrets.token_hex(16)
+        is_resumed = self.check(config, resume, overwrite)
+        run_id = read_run_id(self.path) if is_resumed else secrets.token_hex(16)
         if overwrite:
             self._delete_run()
         try:
@@ -229,7 +229,7 @@ class RunFolder:
             write_atomically(self.config, json.dumps(_record(config, log, run_id), indent=2) + "\n")
         except OSError as error:
             raise RequestError(f"cannot write to {self.path} ({error.strerror}): choose another --run-dir") from error
-        return goes_on
+        return is_resumed
 
     def _delete_run(self) -> None:
         """Delete a run's files, checkpoints first: after a failure, the rest is still a run.
@@ -270,15 +270,15 @@ def _is_remainder(checkpoint: Path, run_id: str) -> bool:
         return False
 
 
-def _where_gone(path: Path, place: Path | None, when: str) -> str:
+def _where_gone(path: Path, current: Path | None, when: str) -> str:
     """Return a message about a run folder that is not in place."""
-    if place is None:
+    if current is None:
         return f"{path} is gone: it was deleted, or moved away, {when}"
-    is_there = place == path.resolve()
-    resume = f"go on with --run-dir {shlex.quote(str(path if is_there else place))} --resume"
+    is_there = current == path.resolve()
+    resume = f"go on with --run-dir {shlex.quote(str(path if is_there else current))} --resume"
     if is_there:
         return f"{path / 'config.json'} is gone, or is that of another run: put it back, then {resume}"
-    return f"{path} was moved to {place} {when}: {resume}"
+    return f"{path} was moved to {current} {when}: {resume}"
 
 
 def _record(config: Config, log: tuple[str, ...], run_id: str) -> dict[str, Any]:
@@ -304,7 +304,7 @@ def read_record(path: Path) -> dict[str, Any]:
     _check_run_path(path)
     if not file.exists():
         raise RequestError(f"no run in {path}: there is no config.json")
-    record = read_json(file, mend="put back what it held, or train --overwrite")
+    record = read_json(file, hint="put back what it held, or train --overwrite")
     if record.get("schema") != SCHEMA:
         raise RequestError(
             f"{file} is not of schema {SCHEMA}: it was written by another version; use that, or train --overwrite"

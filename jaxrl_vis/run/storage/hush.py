@@ -10,7 +10,7 @@ from typing import Any
 
 
 @contextlib.contextmanager
-def hushed() -> Iterator[None]:
+def silenced() -> Iterator[None]:
     """Suppress orbax's output about a checkpoint whose error will be reported in one line."""
     absl, before = logging.getLogger("absl"), sys.unraisablehook
     disabled = absl.disabled

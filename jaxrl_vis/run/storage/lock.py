@@ -28,7 +28,7 @@ _POLL_S = 0.1
 # Errors of file systems without locks: Lustre and FUSE, NFS without its lock daemon, 9p.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EINVAL, *(getattr(errno, name, None) for name in ("ENOTSUP", "EOPNOTSUPP"))}
 _MARKER = "filelock/"  # first bytes of a file that is itself the lock
-_MEND = "wait for it, stop it, or choose another --run-dir"
+_HINT = "wait for it, stop it, or choose another --run-dir"
 
 
 class FolderGoneError(StorageError):
@@ -100,12 +100,12 @@ class Held:
 
 
 @contextlib.contextmanager
-def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]:
+def run_lock(folder: Path, echo: Callable[[str], None] = print) -> Iterator[Held]:
     """Lock a run folder; create it if missing, and remove it again if it is still empty at the end.
 
     Args:
         folder: The folder.
-        say: Called with one line if the file system has no locks, and if a dead holder's lock is taken over.
+        echo: Called with one line if the file system has no locks, and if a dead holder's lock is taken over.
 
     Raises:
         RequestError: Another process holds the folder, or it cannot be written to.
@@ -120,7 +120,7 @@ def run_lock(folder: Path, say: Callable[[str], None] = print) -> Iterator[Held]
         with contextlib.ExitStack() as stack:
             try:
                 if not _lock_by_system(path, stack):
-                    _lock_by_marker(path, held, say, stack)
+                    _lock_by_marker(path, held, echo, stack)
             except OSError as error:
                 raise _unwritable(folder, error) from error
             yield held
@@ -175,7 +175,7 @@ def _release(lock: filelock.BaseFileLock, path: Path, status: os.stat_result) ->
     lock.release()
 
 
-def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: contextlib.ExitStack) -> None:
+def _lock_by_marker(path: Path, lock: Held, echo: Callable[[str], None], stack: contextlib.ExitStack) -> None:
     """Use the file itself as the lock until the end of ``stack``.
 
     Raises:
@@ -183,12 +183,12 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
         OSError: It cannot be written.
     """
     if not _read(path).startswith(_MARKER):
-        say(f"the file system of {path.parent} has no locks: {FILE_NAME} is the lock itself, touched every {HEARTBEAT_S:g} s")
+        echo(f"the file system of {path.parent} has no locks: {FILE_NAME} is the lock itself, touched every {HEARTBEAT_S:g} s")
     lease = filelock.SoftFileLease(
         path,
         lease_duration=LEASE_S,
         heartbeat_interval=HEARTBEAT_S,
-        on_compromise=held.note_loss,
+        on_compromise=lock.note_loss,
         thread_local=False,
     )
     last_touch: tuple[float, int] | None = None
@@ -202,9 +202,9 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
                 lease.acquire(blocking=False)
             break
         except filelock.Timeout:
-            now, text = _touched(path), _read(path)
+            now, text = _touch_time(path), _read(path)
             if last_touch is None and now is not None:
-                say(f"{path} belongs to {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life")
+                echo(f"{path} belongs to {_holder(text)}: waiting up to {LEASE_S:g} s for a sign of life")
                 last_touch, last_touch_at = now, time.monotonic()
             elif now is not None and now != last_touch and text:  # a new file is empty until its holder writes into it
                 raise _in_use(path, text) from None
@@ -214,12 +214,12 @@ def _lock_by_marker(path: Path, held: Held, say: Callable[[str], None], stack: c
         except filelock.LeaseSettingsMismatch:
             raise _in_use(path, _read(path)) from None
     stack.callback(lease.release)
-    held.watch(path)
+    lock.watch(path)
     if before:
-        say(f"took over {path} of {_holder(before)}, which is dead")
+        echo(f"took over {path} of {_holder(before)}, which is dead")
 
 
-def _touched(path: Path) -> tuple[float, int] | None:
+def _touch_time(path: Path) -> tuple[float, int] | None:
     try:
         status = path.stat()
     except OSError:
@@ -267,8 +267,8 @@ def _is_alive_or_elsewhere(text: str) -> bool:
     return True
 
 
-def _in_use(path: Path, text: str, mend: str = "") -> RequestError:
-    return RequestError(f"{path.parent} is in use by {_holder(text)}: {mend}{_MEND}")
+def _in_use(path: Path, text: str, hint: str = "") -> RequestError:
+    return RequestError(f"{path.parent} is in use by {_holder(text)}: {hint}{_HINT}")
 
 
 def _unwritable(folder: Path, error: OSError) -> RequestError:

@@ -46,7 +46,7 @@ class Place(NamedTuple):
 
 
 _NO_FIGURES = {*Place._fields, RUN_ID} - {"updates"}
-_LARGEST = 2**63  # of a number in a row: the range of integer arrays
+_MAX_VALUE = 2**63  # of a number in a row: the range of integer arrays
 _SHOWN = 8  # line numbers in a message
 
 
@@ -65,16 +65,16 @@ def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed
     }
 
 
-def with_precision(means: PerSeed) -> PerSeed:
-    """Add the precision of the filter to ``means``: the fraction of the dropped negatives that were false; NaN if none.
+def with_precision(metrics: PerSeed) -> PerSeed:
+    """Add the precision of the filter to ``metrics``: the fraction of the dropped negatives that were false; NaN if none.
 
     This is a ratio of means, not a mean of ratios: the fraction among all dropped samples.
     """
-    if "train/filtered_false_share" not in means:
-        return means
-    pairs = zip(means["train/filtered_false_share"], means["train/filtered_share"], strict=True)
+    if "train/filtered_false_share" not in metrics:
+        return metrics
+    pairs = zip(metrics["train/filtered_false_share"], metrics["train/filtered_share"], strict=True)
     precision = [_nine_digits(false / dropped) if dropped > 0.0 else math.nan for false, dropped in pairs]
-    return {**means, "train/filter_precision": precision}
+    return {**metrics, "train/filter_precision": precision}
 
 
 def _nine_digits(value: float) -> float:
@@ -167,7 +167,7 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
 
 def _is_figure(value: Any) -> bool:
     if isinstance(value, int) and not isinstance(value, bool):
-        return abs(value) < _LARGEST
+        return abs(value) < _MAX_VALUE
     return value is None or (isinstance(value, float) and math.isfinite(value))
 
 

@@ -32,14 +32,14 @@ from jaxrl_vis.types import LoopState, ReplayState
 SCHEMA = 1
 ANY_RUN = "*"
 _KEPT = 2
-_MOST_BYTES = 2**30  # maximum size of a replay
-_SHARE = 0.03  # maximum fraction of the time spent on saving: about every iteration of `cpu` on two cores
+_MAX_BYTES = 2**30  # maximum size of a replay
+_FRACTION = 0.03  # maximum fraction of the time spent on saving: about every iteration of `cpu` on two cores
 _EPISODES = "replay.episodes."
 
 
 def is_cheap(replay: ReplayState) -> bool:
     """Return True if a replay (arrays or shapes) is cheap to keep up to date in files, in time and disk space."""
-    return jax.default_backend() == "cpu" and num_bytes(replay) <= _MOST_BYTES
+    return jax.default_backend() == "cpu" and num_bytes(replay) <= _MAX_BYTES
 
 
 class Unusable(Exception):
@@ -51,15 +51,15 @@ class Recent:
 
     Args:
         folder: Folder of the states; created by the first save.
-        say: Called with one line when there is no more space for them.
+        echo: Called with one line when there is no more space for them.
 
     Attributes:
         run_id: Id of the run: other runs' states are ignored, except by `set_foreign_aside`. `ANY_RUN`:
             all states.
     """
 
-    def __init__(self, folder: Path, say: Callable[[str], None]):
-        self._folder, self._say = folder, say
+    def __init__(self, folder: Path, echo: Callable[[str], None]):
+        self._folder, self._echo = folder, echo
         self.run_id = ANY_RUN
         self._rollouts: dict[int, int] = {}  # rollouts known to exist, and their checksums
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
@@ -70,7 +70,7 @@ class Recent:
         Args:
             in_any_case: Ignore the time since the last save.
         """
-        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _SHARE)
+        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _FRACTION)
 
     def iterations(self) -> list[int]:
         """Return the iterations of this run's states, ascending, including damaged ones."""
@@ -92,7 +92,7 @@ class Recent:
         return is_foreign
 
     def save(
-        self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], started: float | None = None
+        self, iteration: int, loop: LoopState, num_envs: int, progress: dict[str, Any], start_time: float | None = None
     ) -> None:
         """Write a state and its missing rollouts; if there is no space, report it and disable further saving.
 
@@ -101,15 +101,15 @@ class Recent:
             loop: The state, on one device.
             num_envs: E, episodes that one iteration adds to the replay.
             progress: A JSON value.
-            started: Start of the work for it, checks included (`time.monotonic`); None: now.
+            start_time: Start of the work for it, checks included (`time.monotonic`); None: now.
         """
-        self._saved_at = time.monotonic() if started is None else started
+        self._saved_at = time.monotonic() if start_time is None else start_time
         try:
             self._write(iteration, loop, num_envs, progress)
         except OSError as error:
             self._is_off = True
             self._drop_unfinished()
-            self._say(
+            self._echo(
                 f"the replay is not kept up to date any more ({error.strerror or type(error).__name__}): "
                 "if this process is killed, the run goes on without it"
             )
@@ -142,7 +142,7 @@ class Recent:
             file.write(f"{zlib.crc32(text.encode()):08x} {text}\n".encode())
             for array in arrays.values():
                 file.write(_bytes(array))
-        self._tidy()
+        self._remove_stale_files()
 
     def _write_rollout(self, number: int, parts: Arrays) -> int:
         """Write the episodes of one rollout, arrays [S, E, ...] one after the other; return their checksum."""
@@ -154,7 +154,7 @@ class Recent:
                 file.write(contents)
         return checksum
 
-    def _tidy(self) -> None:
+    def _remove_stale_files(self) -> None:
         """Delete all but the newest states, and older rollouts that these do not need."""
         for number in self.iterations()[:-_KEPT]:
             self._path(number, "state").unlink(missing_ok=True)

@@ -62,5 +62,5 @@ def enough_at(config: Config, rows: Sequence[Mapping[str, Any]], seeds: Collecti
     for row in rows:
         if isinstance(row.get(name), int | float) and row["seed"] in seeds:
             by_iteration.setdefault(row["iteration"], {})[row["seed"]] = row[name]
-    complete = {number: found for number, found in sorted(by_iteration.items()) if len(found) == len(seeds)}
-    return [number for number, found in complete.items() if is_enough(config, score(config, {name: list(found.values())}))]
+    complete = {number: values for number, values in sorted(by_iteration.items()) if len(values) == len(seeds)}
+    return [number for number, values in complete.items() if is_enough(config, score(config, {name: list(values.values())}))]

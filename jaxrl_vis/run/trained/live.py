@@ -98,7 +98,7 @@ class Session:
     def new_goal(self) -> None:
         """Sample a goal as at the start of an episode; the robot keeps its pose."""
         _, goal_data = self._begin(next(self._keys))
-        self._aim(goal_data)
+        self._update_goal(goal_data)
 
     def place_goal(self, point: np.ndarray) -> None:
         """Set the goal to a given point.
@@ -108,9 +108,9 @@ class Session:
         """
         assert self.env.goal_box is not None
         low, high = self.env.goal_box
-        self._aim(self._place(jnp.asarray(np.clip(point, low, high), jnp.float32)))
+        self._update_goal(self._place(jnp.asarray(np.clip(point, low, high), jnp.float32)))
 
-    def _aim(self, goal_data: Any) -> None:
+    def _update_goal(self, goal_data: Any) -> None:
         image, goal_state = self._look(goal_data)
         self.goal_data, self.goal = goal_data, self.env.as_goal(image)
         self.state = self.state.replace(goal_state=goal_state)
@@ -250,7 +250,7 @@ class Page:
         shown = videos.EpisodeImages(
             np.stack(frames)[None, :, :channels], np.asarray(session.goal)[None, :channels], np.array([success])
         )
-        path = _unused(self._out)
+        path = _unused_path(self._out)
         try:
             videos.write_video(shown, path, max(0.04, session.env.control_period))
         except OSError as error:  # shown on the page, which continues
@@ -264,7 +264,7 @@ def _poses(data: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(data.xpos), np.asarray(data.xquat)
 
 
-def _unused(path: Path) -> Path:
+def _unused_path(path: Path) -> Path:
     """Return ``path``, or the first free one of path-2, path-3, ..."""
     numbered = (path.with_name(f"{path.stem}-{number}{path.suffix}") for number in itertools.count(2))
     return next(choice for choice in itertools.chain([path], numbered) if not choice.exists())

@@ -18,7 +18,7 @@ from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.learner.algorithm import Algorithm, PolicyParams
-from jaxrl_vis.run.storage.checkpoint import Restored
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.run.trained import policy_file
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
 from jaxrl_vis.run.trained.shipped import find
@@ -93,14 +93,14 @@ class Policy:
         spec = self.observation_spec
         shape, wanted = np.shape(value), tuple(spec.shape)
         if shape != wanted:
-            mend = ""
+            hint = ""
             if shape[1:] == wanted:
-                mend = ": jax.vmap(policy) takes a batch"
+                hint = ": jax.vmap(policy) takes a batch"
             elif len(wanted) == 3 and shape == (*wanted[1:], wanted[0]):
-                mend = f": images are planar here, so move the channels first, np.moveaxis({name}, -1, 0)"
+                hint = f": images are planar here, so move the channels first, np.moveaxis({name}, -1, 0)"
             elif len(wanted) == 3 and name == "goal" and shape == (wanted[0] // self.env.frame_stack, *wanted[1:]):
-                mend = f": repeat the goal's image {self.env.frame_stack} times, as policy.env.as_goal does"
-            raise RequestError(f"{self.env_name}: {name} must have the shape {wanted}, not {shape}{mend}")
+                hint = f": repeat the goal's image {self.env.frame_stack} times, as policy.env.as_goal does"
+            raise RequestError(f"{self.env_name}: {name} must have the shape {wanted}, not {shape}{hint}")
         dtype = np.dtype(getattr(value, "dtype", None) or np.asarray(value).dtype)
         if spec.dtype == jnp.uint8:
             if dtype != np.uint8:

@@ -48,7 +48,7 @@ def check_whole(run_dir: Path | str, use: str) -> None:
         raise RequestError(f"{run_dir} holds a policy alone, and {use} needs the whole run: name the run folder")
 
 
-def _named(parameters: PolicyParams) -> dict[str, Any]:
+def _name_parameters(parameters: PolicyParams) -> dict[str, Any]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(parameters)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
@@ -70,8 +70,8 @@ def write(folder: Path, parameters: PolicyParams, source: Source, bits: Literal[
         parameters,
         is_leaf=lambda part: isinstance(part, NormalizerState),
     )
-    exact = [name for name, is_statistic in _named(statistics).items() if is_statistic]
-    arrays, same = {name: np.asarray(leaf) for name, leaf in _named(parameters).items()}, {}
+    exact = [name for name, is_statistic in _name_parameters(statistics).items() if is_statistic]
+    arrays, same = {name: np.asarray(leaf) for name, leaf in _name_parameters(parameters).items()}, {}
     for index, name in enumerate(exact):  # goals mostly have the statistics of observations
         first = next((other for other in exact[:index] if np.array_equal(arrays[other], arrays[name])), None)
         same |= {} if first is None else {name: first}
@@ -111,18 +111,18 @@ def read(folder: Path, trainer: Trainer) -> tuple[TrainState, Source]:
     same: dict[str, str] = {}
 
     def declare(about: dict[str, Any]) -> tuple[Source, dict[str, Any]]:
-        named = _named(wanted)
-        found = about.pop(_SAME, {})
-        if not isinstance(found, dict) or not all(isinstance(other, str) for other in found.values()):
+        named = _name_parameters(wanted)
+        aliases = about.pop(_SAME, {})
+        if not isinstance(aliases, dict) or not all(isinstance(other, str) for other in aliases.values()):
             raise ValueError(_SAME)
-        same.update(found)
+        same.update(aliases)
         if any(named[name].shape != named[other].shape or other in same for name, other in same.items()):
             raise ValueError("an array is not the same as another one")
         return _source(folder, about), {name: leaf for name, leaf in named.items() if name not in same}
 
     nested, source, _ = read_parameters(folder / FILE_NAME, _WRITER, declare)
-    read_leaves = _named(nested)
-    leaves = [read_leaves[same.get(name, name)].astype(leaf.dtype)[None] for name, leaf in _named(wanted).items()]
+    read_leaves = _name_parameters(nested)
+    leaves = [read_leaves[same.get(name, name)].astype(leaf.dtype)[None] for name, leaf in _name_parameters(wanted).items()]
     nothing_seen = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return nothing_seen.replace(agent=jax.tree.unflatten(jax.tree.structure(wanted), leaves)), source
 

@@ -25,7 +25,7 @@ def record_run(run_dir: Path | str, episodes: int = 50, seed: int = 0, trust: bo
     Raises:
         RequestError: There is no run or no usable checkpoint, or the task's images do not have 1, 3 or 4 channels per frame.
     """
-    trainer = open_run(run_dir, keep_programs=True, trust=trust)
+    trainer = open_run(run_dir, cache_programs=True, trust=trust)
     restored, programs, env = load(trainer, run_dir), trainer.programs, trainer.env
     spec = env.observation_spec
     if len(spec.shape) == 3 and spec.shape[0] // env.frame_stack not in (1, 3, 4):

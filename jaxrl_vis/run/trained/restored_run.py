@@ -13,20 +13,21 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.acting.evaluate import num_recorded
 from jaxrl_vis.report import videos, viewer
 from jaxrl_vis.run.compiled.memory import check_compiled
-from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, Checkpoints, Restored
+from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, Checkpoints
 from jaxrl_vis.run.storage.folder import read_config, read_run_id
+from jaxrl_vis.run.storage.restoring import Restored
 from jaxrl_vis.run.trained import policy_file
 from jaxrl_vis.run.trained.shipped import find
 from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
 
 
-def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
+def open_run(run_dir: Path | str, cache_programs: bool = False, trust: bool = False, **changes: object) -> Trainer:
     """Create the trainer of a run on one device, with changed fields of its configuration; its folder is not modified.
 
     Args:
         run_dir: The run folder.
-        keep_programs: As in `make_trainer`; programs traced by the training are reused.
+        cache_programs: As in `make_trainer`; programs traced by the training are reused.
         trust: Allow execution of the run's custom code (`jaxrl_vis.run.trust`).
         **changes: New values of fields of `Config`.
 
@@ -40,7 +41,7 @@ def open_run(run_dir: Path | str, keep_programs: bool = False, trust: bool = Fal
     alone = policy_file.holds_policy(folder)
     if alone:
         config = config.replace(seed=policy_file.read_source(folder).seed, seeds=1)
-    return make_trainer(config, keep_programs=keep_programs, policy_alone=alone)
+    return make_trainer(config, cache_programs=cache_programs, policy_alone=alone)
 
 
 Choice = int | Literal["best"] | None
@@ -83,10 +84,10 @@ def load(trainer: Trainer, run_dir: Path | str, checkpoint: Choice = None) -> Re
 
 def _load_best(trainer: Trainer, run_dir: Path | str, checkpoints: Checkpoints) -> Restored:
     try:
-        kept = checkpoints.iterations(BEST)
-        if not kept:
+        iterations = checkpoints.iterations(BEST)
+        if not iterations:
             raise RequestError(f"the run in {run_dir} has kept no best checkpoint: train with --best-by, such as success")
-        return checkpoints.restore(BEST, checkpoints.manifest(BEST, kept[-1]), trainer.shapes)
+        return checkpoints.restore(BEST, checkpoints.manifest(BEST, iterations[-1]), trainer.shapes)
     finally:
         checkpoints.close()
 
@@ -94,7 +95,7 @@ def _load_best(trainer: Trainer, run_dir: Path | str, checkpoints: Checkpoints) 
 def evaluate_run(
     run_dir: Path | str,
     episodes: int | None = None,
-    keep_programs: bool = False,
+    cache_programs: bool = False,
     trust: bool = False,
     checkpoint: Choice = None,
 ) -> dict[str, list[float]]:
@@ -103,7 +104,7 @@ def evaluate_run(
     Args:
         run_dir: The run folder.
         episodes: Number of episodes; None for that of the training.
-        keep_programs, trust: As in `open_run`.
+        cache_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Returns:
@@ -112,9 +113,9 @@ def evaluate_run(
     Raises:
         RequestError: There is no run, no usable checkpoint, or too little memory for this number of episodes.
     """
-    trainer = open_run(run_dir, keep_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
+    trainer = open_run(run_dir, cache_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir, checkpoint)
-    check_compiled(trainer.programs.of_evaluation(), already_there=True)
+    check_compiled(trainer.programs.of_evaluation(), is_allocated=True)
     values = jax.device_get(trainer.evaluate(restored.train))
     return {name: [float(number) for number in value] for name, value in values.items()}
 
@@ -124,7 +125,7 @@ def play_run(
     out: Path | str,
     episodes: int = 6,
     three_dimensional: bool = False,
-    keep_programs: bool = False,
+    cache_programs: bool = False,
     trust: bool = False,
     checkpoint: Choice = None,
 ) -> None:
@@ -136,7 +137,7 @@ def play_run(
         episodes: Number of episodes.
         three_dimensional: Write an .html page for brax's viewer (needs brax) instead of the robot's images; also for state
             variants.
-        keep_programs, trust: As in `open_run`.
+        cache_programs, trust: As in `open_run`.
         checkpoint: The checkpoint.
 
     Raises:
@@ -144,7 +145,7 @@ def play_run(
     """
     out = Path(out)
     (viewer.check_page if three_dimensional else videos.check_output)(out)
-    trainer = open_run(run_dir, keep_programs, trust, eval_episodes=num_recorded(max(1, episodes)))
+    trainer = open_run(run_dir, cache_programs, trust, eval_episodes=num_recorded(max(1, episodes)))
     programs = trainer.programs
     if not (programs.shows_images or three_dimensional):
         raise RequestError(

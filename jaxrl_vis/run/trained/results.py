@@ -29,11 +29,11 @@ class Results:
         programs: Programs of the run.
         folder: Folder of the files.
         loggers: Loggers that also receive the images.
-        say: Prints a line.
+        echo: Prints a line.
     """
 
-    def __init__(self, programs: Programs, folder: RunFolder, loggers: Loggers, say: Callable[[str], None]):
-        self._programs, self._folder, self._loggers, self._say = programs, folder, loggers, say
+    def __init__(self, programs: Programs, folder: RunFolder, loggers: Loggers, echo: Callable[[str], None]):
+        self._programs, self._folder, self._loggers, self._echo = programs, folder, loggers, echo
 
     def show(self, done: int, progress_now: Callable[[], Progress], recorded: dict[str, Any]) -> None:
         """Write the curve and video of a finished run, and print a summary.
@@ -52,8 +52,8 @@ class Results:
         written = [file.name for file in (self._folder.curve, self._folder.video) if file.exists()]
         progress = progress_now()
         compiling = show_seconds(progress.compile_s)
-        self._say(f"success at the end: {success}; {show_seconds(progress.wall_s)}, of which {compiling} compiling")
-        self._say(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
+        self._echo(f"success at the end: {success}; {show_seconds(progress.wall_s)}, of which {compiling} compiling")
+        self._echo(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def draw_curve(self, done: int) -> None:
         """Draw the evaluations up to ``done`` iterations."""

@@ -56,7 +56,7 @@ class Expected:
     run_id: str
 
 
-def listed(values: Iterable[Any]) -> str:
+def format_list(values: Iterable[Any]) -> str:
     """Format the first few values, and the number of further ones."""
     words = [str(value) for value in values]
     return ", ".join(words[:_SHOWN]) + (f" and {len(words) - _SHOWN} more" if len(words) > _SHOWN else "")
@@ -136,7 +136,7 @@ def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: Expecte
 def missing_rows(
     rows: Sequence[Mapping[str, Any]],
     expected: Expected,
-    reached: int,
+    last_written: int,
     total: int,
     without: Collection[int],
     is_written: bool,
@@ -146,7 +146,7 @@ def missing_rows(
     Args:
         rows: The rows of the file.
         expected: Conditions on the rows.
-        reached: Last iteration whose rows were written, according to checkpoints, or 0.
+        last_written: Last iteration whose rows were written, according to checkpoints, or 0.
         total: Iterations of the run; the last one is always evaluated.
         without: Scheduled iterations without an evaluation.
         is_written: Another process may be writing rows of the last iteration.
@@ -154,20 +154,20 @@ def missing_rows(
     seeds_at: dict[int, set[int]] = {}
     for row in rows:
         seeds_at.setdefault(row["iteration"], set()).add(row["seed"])
-    last = max([reached, *seeds_at])
+    last = max([last_written, *seeds_at])
     scheduled = set(range(expected.eval_interval, last + 1, expected.eval_interval)) - set(without)
-    scheduled |= {total} if reached == total else set()
+    scheduled |= {total} if last_written == total else set()
     absent = sorted(scheduled - set(seeds_at))
     lines = []
     if absent:
         lines.append(
-            f"metrics.jsonl: rows of iteration {listed(absent)} are missing (every {expected.eval_interval}, "
+            f"metrics.jsonl: rows of iteration {format_list(absent)} are missing (every {expected.eval_interval}, "
             "unless a part of the run before a resumption had another eval_interval)"
         )
     for iteration, seeds in sorted(seeds_at.items()):
         if seeds < set(expected.seeds) and not (is_written and iteration == max(seeds_at)):
             lines.append(
-                f"metrics.jsonl: iteration {iteration} has no row of seed {listed(sorted(set(expected.seeds) - seeds))}"
+                f"metrics.jsonl: iteration {iteration} has no row of seed {format_list(sorted(set(expected.seeds) - seeds))}"
             )
     return lines
 
@@ -196,7 +196,7 @@ def check_record(record: Mapping[str, Any], config: Config, findings: Findings) 
     groups = saved.values() if isinstance(saved, Mapping) else ()
     unset = sorted(set(OPTIONS).difference(*(group for group in groups if isinstance(group, Mapping))))
     if unset:
-        findings.notes.append(f"config.json does not have {listed(unset)}: taken to be the default")
+        findings.notes.append(f"config.json does not have {format_list(unset)}: taken to be the default")
 
 
 def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findings: Findings) -> None:
@@ -225,13 +225,13 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
         for name, reason in _ASIDE.items():
             if (folder.checkpoints / name).is_dir():
                 aside = sorted(entry.name for entry in (folder.checkpoints / name).iterdir())
-                findings.notes.append(f"set aside before as {reason}: {listed(aside)}")
+                findings.notes.append(f"set aside before as {reason}: {format_list(aside)}")
     if None in read_processes(folder.processes):
         findings.notes.append(f"{folder.processes.name} has a damaged line: the goodput of the run is unknown")
     if folder.nonfinite.is_dir():
         findings.notes.append(f"the run has met a non-finite number: {folder.nonfinite.name}/ has its state")
     if foreign:
-        findings.notes.append(f"not files of a run: {listed(sorted(foreign))}")
+        findings.notes.append(f"not files of a run: {format_list(sorted(foreign))}")
     if is_finished:
         wanted = [folder.curve, *([folder.video] if shows_images else [])]
         findings.problems += [f"{file.name} is missing, though the run is finished" for file in wanted if not file.exists()]

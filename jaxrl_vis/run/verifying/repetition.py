@@ -10,10 +10,11 @@ from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.loop import GUARD
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.arrays import is_intact, to_host
-from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT, state_without_learner
+from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.storage.progress import Progress
-from jaxrl_vis.run.verifying.inspection import Expected, Findings, listed
+from jaxrl_vis.run.storage.restoring import state_without_learner
+from jaxrl_vis.run.verifying.inspection import Expected, Findings, format_list
 from jaxrl_vis.types import LoopState
 
 NOT_REPEATED = (RUN_ID, "time/", "resume/")
@@ -60,7 +61,7 @@ class Repeater:
         rows: Rows of its file.
         manifests: Manifests of its checkpoints, by tier and iteration.
         report: Receives the results.
-        say: Called with a line about each step.
+        echo: Called with a line about each step.
 
     Attributes:
         repeated: Iterations whose rows were compared.
@@ -74,43 +75,45 @@ class Repeater:
         rows: Sequence[Row],
         manifests: Mapping[tuple[str, int], dict[str, Any]],
         report: Verification,
-        say: Callable[[str], None],
+        echo: Callable[[str], None],
     ):
         self._programs, self._expected, self._rows = programs, expected, rows
-        self._manifests, self._report, self._say = manifests, report, say
+        self._manifests, self._report, self._echo = manifests, report, echo
         self.repeated: set[int] = set()
         self.without_evaluation: set[int] = set()
 
-    def repeat(self, name: str, begin: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]) -> None:
+    def repeat(
+        self, name: str, first_iteration: int, progress: Progress, loop: LoopState, compared_iterations: Sequence[int]
+    ) -> None:
         """Repeat iterations and compare the results.
 
         Args:
             name: Name of the starting point, for messages.
-            begin: Iterations completed at the start.
+            first_iteration: Iterations completed at the start.
             progress: Progress of the host at the start.
             loop: State at the start; donated.
             compared_iterations: Iterations whose rows are compared, ascending; the repetition ends at the last one.
         """
-        self._say(f"repeating iterations {begin + 1} to {compared_iterations[-1]} from {name} ...")
-        history = {begin - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
-        if begin in compared_iterations:
-            self._compare(name, begin, loop, history)
-        for iteration in range(begin + 1, compared_iterations[-1] + 1):
+        self._echo(f"repeating iterations {first_iteration + 1} to {compared_iterations[-1]} from {name} ...")
+        history = {first_iteration - back: values for back, values in enumerate(reversed(progress.since_evaluation))}
+        if first_iteration in compared_iterations:
+            self._compare(name, first_iteration, loop, history)
+        for iteration in range(first_iteration + 1, compared_iterations[-1] + 1):
             loop, values = self._programs.train_iteration(loop)
             read = self._programs.pending(values).read_per_seed(len(self._expected.seeds))
             broken = [key for key, counts in read.items() if key.startswith(GUARD) and any(counts)]
             if broken:
-                self._differ(f"iteration {iteration}: the repetition from {name} meets non-finite numbers")
+                self._note_difference(f"iteration {iteration}: the repetition from {name} meets non-finite numbers")
                 return
             history[iteration] = {key: per_seed for key, per_seed in read.items() if not key.startswith(GUARD)}
             if iteration in compared_iterations:
                 self._compare(name, iteration, loop, history)
             self._compare_checkpoints(iteration, progress.replay_lost_at, loop)
 
-    def _differ(self, line: str) -> None:
+    def _note_difference(self, line: str) -> None:
         self._report.differences.append(line)
         self._report.problems.append(line)
-        self._say(f"  {line}")
+        self._echo(f"  {line}")
 
     def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
         """Compare the rows of an iteration with the repetition."""
@@ -124,7 +127,7 @@ class Repeater:
                 (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
             ]
             if best is None:
-                best, numbers = differences, sum(len(_compared(row)) for row in there)
+                best, numbers = differences, sum(len(_comparable_values(row)) for row in there)
             if not differences:
                 if best:
                     self.without_evaluation.update(range(begin + 1, iteration))
@@ -142,15 +145,17 @@ class Repeater:
             self._report_differences(name, iteration, best)
         else:
             seeds = "1 seed" if len(there) == 1 else f"{len(there)} seeds"
-            self._say(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
+            self._echo(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
 
     def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
         self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
-        shown = listed(f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences)
+        shown = format_list(
+            f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences
+        )
         hint = ""
         if all(key.startswith("eval/") for _, key, _, _ in differences):
             hint = " (or eval_episodes had another value then)"
-        self._differ(f"iteration {iteration}, from {name}: {shown}{hint}")
+        self._note_difference(f"iteration {iteration}, from {name}: {shown}{hint}")
 
     def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
         """List candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
@@ -176,7 +181,7 @@ class Repeater:
             if manifest is None or saved_progress(manifest).replay_lost_at != mark:
                 continue
             differing = []
-            for described, tree in _saved(tier, manifest, loop):
+            for described, tree in _saved_arrays(tier, manifest, loop):
                 arrays = to_host(tree, copy=False)
                 differing += [
                     leaf
@@ -188,12 +193,14 @@ class Repeater:
             if (checkpoint := f"{tier}/{iteration}") not in self._report.checkpoints:
                 self._report.checkpoints.append(checkpoint)
             if differing:
-                self._differ(f"checkpoint {tier}/{iteration} differs from the repetition: {listed(differing)} differ")
+                self._note_difference(
+                    f"checkpoint {tier}/{iteration} differs from the repetition: {format_list(differing)} differ"
+                )
             else:
-                self._say(f"  checkpoint {tier}/{iteration}: equal")
+                self._echo(f"  checkpoint {tier}/{iteration}: equal")
 
 
-def _saved(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
+def _saved_arrays(tier: str, manifest: Mapping[str, Any], loop: LoopState) -> Iterator[tuple[Mapping[str, Any], Any]]:
     """Yield pairs of a manifest's items and the arrays that they describe."""
     items = manifest["items"]
     if tier == RECENT:
@@ -227,21 +234,21 @@ def has_progress(manifest: Mapping[str, Any], seeds: int) -> bool:
     return all(isinstance(number, float) for number in figures) and set(counts) <= {seeds}
 
 
-def _compared(row: Mapping[str, Any]) -> Row:
+def _comparable_values(row: Mapping[str, Any]) -> Row:
     return {name: value for name, value in row.items() if not name.startswith(NOT_REPEATED)}
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yield the names of values that differ as JSON text, with both values."""
-    compared = _compared(row)
+    compared = _comparable_values(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
         if json.dumps(value) != json.dumps(again):
             yield name, value, again
 
 
-def _relative(value: Any, again: Any) -> float:
+def _relative(value: Any, repeated: Any) -> float:
     """Return the difference of two numbers relative to the larger one; infinite if either value is not numeric."""
-    if not (isinstance(value, int | float) and isinstance(again, int | float)):
+    if not (isinstance(value, int | float) and isinstance(repeated, int | float)):
         return math.inf
-    return abs(value - again) / max(abs(value), abs(again)) if value != again else 0.0
+    return abs(value - repeated) / max(abs(value), abs(repeated)) if value != repeated else 0.0

@@ -36,7 +36,7 @@ from jaxrl_vis.run.verifying.inspection import (
     Expected,
     check_files,
     check_record,
-    listed,
+    format_list,
     missing_rows,
     read_file,
 )
@@ -51,8 +51,8 @@ EVALUATIONS = 2
 def verify_run(
     run_dir: Path | str,
     iterations: int | None = None,
-    keep_programs: bool = False,
-    say: Callable[[str], None] = lambda line: None,
+    cache_programs: bool = False,
+    echo: Callable[[str], None] = lambda line: None,
     trust: bool = False,
 ) -> Verification:
     """Repeat the beginning of a run and the continuation of each full checkpoint; its folder is not modified.
@@ -60,8 +60,8 @@ def verify_run(
     Args:
         run_dir: The run folder; the run may still be in progress.
         iterations: Number of iterations to repeat from each start; None: up to the second evaluation.
-        keep_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
-        say: Called with a line about each step.
+        cache_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
+        echo: Called with a line about each step.
         trust: Allow the run's own code, if its task is module:Name and was trained by another user.
 
     Raises:
@@ -81,8 +81,8 @@ def verify_run(
     if config.run.devices > devices:
         findings.elsewhere.append(f"the run was on {config.run.devices} devices, and is repeated on one")
         config = config.replace(devices=1, data_devices=None)
-    trainer = make_trainer(config, keep_programs=keep_programs)
-    return verify(trainer, path, record, iterations, findings, say)
+    trainer = make_trainer(config, cache_programs=cache_programs)
+    return verify(trainer, path, record, iterations, findings, echo)
 
 
 def verify(
@@ -91,18 +91,18 @@ def verify(
     record: Mapping[str, Any],
     iterations: int | None,
     report: Verification,
-    say: Callable[[str], None],
+    echo: Callable[[str], None],
 ) -> Verification:
     """Verify a run with an existing trainer of its configuration and the contents of its config.json."""
-    return _Verifier(trainer, RunFolder(path), record, report, say).verify(iterations)
+    return _Verifier(trainer, RunFolder(path), record, report, echo).verify(iterations)
 
 
 class _Verifier:
     def __init__(
-        self, trainer: Trainer, folder: RunFolder, record: Mapping[str, Any], report: Verification, say: Callable[[str], None]
+        self, trainer: Trainer, folder: RunFolder, record: Mapping[str, Any], report: Verification, echo: Callable[[str], None]
     ):
         self._programs, self._config, self._folder = trainer.programs, trainer.config, folder
-        self._record, self._report, self._say = record, report, say
+        self._record, self._report, self._echo = record, report, echo
         program = trainer.program
         self._expected = Expected(
             seeds=list(trainer.seeds),
@@ -112,14 +112,14 @@ class _Verifier:
             run_id=read_run_id(folder.path),
         )
         self._total: int = program.num_iterations
-        self._checkpoints = Checkpoints(folder.checkpoints, self._say, read_only=True)
+        self._checkpoints = Checkpoints(folder.checkpoints, self._echo, read_only=True)
         self._manifests: dict[tuple[str, int], dict[str, Any]] = {}
         self._rows: list[Row] = []
 
     def verify(self, iterations: int | None) -> Verification:
         """Run all checks, see `verify_run`."""
         try:
-            self._say_origin()
+            self._print_origin()
             is_written = (self._folder.path / LOCK_NAME).exists()
             if is_written:
                 self._report.notes.append("another process may be writing into the folder: verified as far as it is there")
@@ -143,7 +143,7 @@ class _Verifier:
 
     # -- Provenance
 
-    def _say_origin(self) -> None:
+    def _print_origin(self) -> None:
         record, report = self._record, self._report
         device, versions = _mapping(record.get("device")), _mapping(record.get("versions"))
         name = provenance.device_name()
@@ -153,10 +153,12 @@ class _Verifier:
             **_flat(provenance.device_record() | {"name": name}),
         }
         recorded = {"revision": record.get("git_revision"), **versions, **_flat(device)}
-        self._say(f"{self._folder.path}: {self._config.environment.env}, {describe(self._config)}, run {self._expected.run_id}")
+        self._echo(
+            f"{self._folder.path}: {self._config.environment.env}, {describe(self._config)}, run {self._expected.run_id}"
+        )
         libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
-        self._say(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
+        self._echo(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
         other = [name for name in recorded if recorded[name] != current.get(name)]
         report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in other]
         if recorded["revision"] is None:
@@ -195,7 +197,7 @@ class _Verifier:
                     )
                 continue
             if differences:
-                problems.append(f"{name}: {listed(differences)}")
+                problems.append(f"{name}: {format_list(differences)}")
                 continue
             if differences is None:
                 self._report.notes.append(f"{name} has no {SUMS_NAME}: only its arrays are compared with their checksums")
@@ -244,7 +246,7 @@ class _Verifier:
     def _repeat_all(self, iterations: int | None) -> Repeater:
         """Repeat the run from the seed, and from each full checkpoint."""
         programs, seed = self._programs, Progress()
-        repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._say)
+        repeater = Repeater(programs, self._expected, self._rows, self._manifests, self._report, self._echo)
         compared_iterations = self._plan(0, seed, iterations)
         starts = [number for tier, number in self._manifests if tier == FULL]
         if compared_iterations or starts:
@@ -253,7 +255,7 @@ class _Verifier:
             repeater.repeat("the seed", 0, seed, programs.init(programs.run_keys), compared_iterations)
         for number in starts:
             self._repeat_after(number, repeater, iterations)
-        self._say_rest(repeater.repeated)
+        self._print_remaining(repeater.repeated)
         return repeater
 
     def _repeat_after(self, number: int, repeater: Repeater, iterations: int | None) -> None:
@@ -284,22 +286,22 @@ class _Verifier:
             layout,
             program.replay.frame_stack,
         )
-        self._say("compiling ...")
-        check_compiled(self._programs.compile(), already_there=False, layout=layout)
+        self._echo("compiling ...")
+        check_compiled(self._programs.compile(), is_allocated=False, layout=layout)
 
-    def _plan(self, begin: int, progress: Progress, iterations: int | None) -> list[int]:
-        """List iterations whose rows can be repeated from a state after ``begin`` iterations."""
-        mark, first = progress.replay_lost_at, begin if progress.evaluation_due else begin + 1
+    def _plan(self, first_iteration: int, progress: Progress, iterations: int | None) -> list[int]:
+        """List iterations whose rows can be repeated from a state after ``first_iteration`` iterations."""
+        mark, first = progress.replay_lost_at, first_iteration if progress.evaluation_due else first_iteration + 1
         # Up to the next loss of the replay: what follows it started from a state that was not saved.
-        losses = [row[LOST] for row in self._rows if LOST in row and row[LOST] != mark and row[LOST] >= begin]
+        losses = [row[LOST] for row in self._rows if LOST in row and row[LOST] != mark and row[LOST] >= first_iteration]
         last = min(losses, default=math.inf)
         compared_iterations = sorted({row["iteration"] for row in self._rows if first <= row["iteration"] <= last})
         if iterations is None:
             return compared_iterations[:EVALUATIONS]
-        near = [number for number in compared_iterations if number <= begin + iterations]
+        near = [number for number in compared_iterations if number <= first_iteration + iterations]
         return near or compared_iterations[:1]
 
-    def _say_rest(self, repeated: set[int]) -> None:
+    def _print_remaining(self, repeated: set[int]) -> None:
         """Report rows and checkpoints that no repetition has reached."""
         unverified = self._report.unverified
         rest = [row["iteration"] for row in self._rows if row["iteration"] not in repeated]
@@ -316,7 +318,7 @@ class _Verifier:
         compared = self._report.checkpoints
         others = [name for tier, number in self._manifests if (name := f"{tier}/{number}") not in compared]
         if others:
-            unverified.append(f"checkpoints {listed(others)}: intact, but not reached by a repetition")
+            unverified.append(f"checkpoints {format_list(others)}: intact, but not reached by a repetition")
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

@@ -129,15 +129,18 @@ def _reach(options: Eval, table: RecordFile, numbers: range) -> None:
         score = records.grasp_score([table.records[number] for number in numbers], str(reaches))
         scores[str(reaches)] = score
         print(f"the arm, {reaches}:")
-        for share in score.shares:
-            print(f"  {share}")
+        for proportion in score.proportions:
+            print(f"  {proportion}")
         print(f"  the thesis's ratio: {score.thesis_ratio:.4f}", flush=True)
     if len(scores) > 1:
         width = max(map(len, scores))
         print(f"{'':{width}}  with room  crowded  reachable  touched another")
         for kind, score in scores.items():
-            shares = (score.with_room, score.crowded, score.of_reachable, score.touches)
-            print(f"{kind:{width}}  " + "  ".join(f"{share.share:9.1%}" if share.of else f"{'none':>9}" for share in shares))
+            proportions = (score.with_room, score.crowded, score.of_reachable, score.touches)
+            print(
+                f"{kind:{width}}  "
+                + "  ".join(f"{proportion.value:9.1%}" if proportion.of else f"{'none':>9}" for proportion in proportions)
+            )
 
 
 def _policy(options: Eval) -> "tuple[Policy | None, str]":

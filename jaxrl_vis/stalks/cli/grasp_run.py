@@ -73,11 +73,11 @@ def run(options: Run) -> int:
     variant, mount = THESIS_VARIANT if options.thesis else DEFAULT_VARIANT, Mount(options.height, options.pitch)
     request = Request(options.out, variant, name, known, mount, options.speed, from_any_stop)
 
-    def say(row) -> None:
+    def echo(row) -> None:
         print(f"{row['run']}: {row['grasp_points']} grasp points in {row['pairs']} pairs: {row['flag']}", flush=True)
 
     try:
-        skipped = run(runs, find, request, say)
+        skipped = run(runs, find, request, echo)
     except OSError as error:
         raise StorageError(
             f"cannot write to {options.out}: {error.strerror or error}; run the command again to go on"

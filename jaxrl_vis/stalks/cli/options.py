@@ -175,7 +175,7 @@ class DetectorTraining(TrainingOptions):
     but `shipped` for --data, as a few images do not suffice to train from scratch."""
     batch: int = 8
     """Batch size in images."""
-    snips: int = 32
+    crops: int = 32
     """Number of full-resolution stalk crops per update, for the masks."""
 
 

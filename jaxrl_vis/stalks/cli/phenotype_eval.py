@@ -27,7 +27,7 @@ class Eval(EvaluationOptions):
     """Number of plots."""
     method: Literal["strip", "ellipse"] = "strip"
     """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
-    least_score: float = 0.5
+    min_score: float = 0.5
     """Minimum score of a detection that counts as a stalk, 0 to 1."""
     thesis: bool = False
     """Also score the thesis's methods (ellipses, semi-global matching, stalks per metre of image) on the same detections."""
@@ -40,8 +40,8 @@ def evaluate(options: Eval) -> int:
     """Evaluate the plots, print their scores, and return the exit status."""
     check_counts(plots=options.plots)
     options.check()
-    if not 0.0 <= options.least_score <= 1.0:
-        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    if not 0.0 <= options.min_score <= 1.0:
+        raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_masks(options.masks, options.weights)
     check_extra("phenotyping")
     if options.json is not None:
@@ -58,7 +58,7 @@ def evaluate(options: Eval) -> int:
         from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder, resolve_weights
 
         weights = resolve_weights(options.weights)
-        load_finder(weights, options.least_score)  # reports what is wrong with the weights
+        load_finder(weights, options.min_score)  # reports what is wrong with the weights
         name = detector_name(weights)
     figures = _evaluate(options, _factors(options) if options.each_factor else {"": family}, weights, name)
     if options.each_factor:
@@ -85,7 +85,7 @@ def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | N
     from jaxrl_vis.stalks.phenotyping.evaluation import records
 
     tasks = {
-        factor: records.Task(family, weights, name, options.method, options.least_score, options.thesis, options.workers)
+        factor: records.Task(family, weights, name, options.method, options.min_score, options.thesis, options.workers)
         for factor, family in families.items()
     }
 
@@ -94,7 +94,7 @@ def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | N
             print(f"evaluated before: {count} of {len(tasks) * options.plots} plots, in {options.json}", flush=True)
 
     def done(factor: str, seed: int, record: Record) -> None:
-        one = records.summarise(options.least_score, [record])
+        one = records.summarise(options.min_score, [record])
         print(
             f"{factor} plot {seed}: {record['counted']} of {record['true']} stalks, ".lstrip()
             + f"width error {one['width_mae_mm']:.2f} mm, F1 {one['f1']:.3f}",

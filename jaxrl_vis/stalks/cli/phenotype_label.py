@@ -22,14 +22,14 @@ class Label:
     LabelMe .json beside each image."""
     weights: Path | None = None
     """Weights from `phenotype train`; the shipped ones if not given."""
-    least_score: float = 0.3
+    min_score: float = 0.3
     """Minimum score of a proposal, 0 to 1; low, as deleting a false one is quicker than drawing a missing one."""
 
 
 def label(options: Label) -> int:
     """Write the proposals, and return the exit status: 3 if images were skipped."""
-    if not 0.0 <= options.least_score <= 1.0:
-        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    if not 0.0 <= options.min_score <= 1.0:
+        raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_extra("phenotyping")
     from jaxrl_vis.stalks.phenotyping.io.folders import image_files
     from jaxrl_vis.stalks.phenotyping.report.proposals import write_coco, write_labelme
@@ -55,9 +55,9 @@ def label(options: Label) -> int:
     from jaxrl_vis.stalks.phenotyping.io.images import read_image, rgb8
 
     weights = resolve_weights(options.weights)
-    find = load_finder(weights, options.least_score)
-    found, skipped = [], 0
-    for place, path in enumerate(paths, start=1):
+    find = load_finder(weights, options.min_score)
+    labelled, skipped = [], 0
+    for index, path in enumerate(paths, start=1):
         try:
             image = rgb8(read_image(path))
         except OSError as error:
@@ -65,13 +65,13 @@ def label(options: Label) -> int:
             skipped += 1
             continue
         detections = find(image)
-        found.append((path, (image.shape[0], image.shape[1]), detections))
+        labelled.append((path, (image.shape[0], image.shape[1]), detections))
         if options.format == "labelme":
             write_labelme(path, (image.shape[0], image.shape[1]), detections)
-        print(f"{place} of {len(paths)}  {path.name}: {len(detections)} proposals", flush=True)
+        print(f"{index} of {len(paths)}  {path.name}: {len(detections)} proposals", flush=True)
     if options.format == "coco":
-        write_coco(there, found, f"proposals of {detector_name(weights)}: correct them")
-    total = sum(len(detections) for _, _, detections in found)
+        write_coco(there, labelled, f"proposals of {detector_name(weights)}: correct them")
+    total = sum(len(detections) for _, _, detections in labelled)
     where = there if options.format == "coco" else f"{options.images}/*.json"
-    print(f"{where}: {total} proposals in {len(found)} images; correct them, then `jaxrl-vis phenotype train`")
+    print(f"{where}: {total} proposals in {len(labelled)} images; correct them, then `jaxrl-vis phenotype train`")
     return 3 if skipped else 0

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.cli.parsing import AlsoPositional
@@ -34,7 +34,7 @@ class Run(CameraOptions):
     """Source of masks: the networks, or the ground truth of synthetic plots, to evaluate everything downstream of the masks."""
     method: Literal["strip", "ellipse"] = "strip"
     """Method of measuring widths: between two edges (strip), or by ellipses as in the thesis."""
-    least_score: float = 0.5
+    min_score: float = 0.5
     """Minimum score of a detection that counts as a stalk, 0 to 1."""
     disparity_scale: float = 256.0
     """Scale of 16-bit disparity files (disparity_000.png beside the images): their values divided by it are pixels. 256 for
@@ -53,8 +53,8 @@ class Run(CameraOptions):
 
 def run(options: Run) -> int:
     """Process the plots, write tables, the page and overlays, and return the exit status: 3 if pairs were skipped."""
-    if not 0.0 <= options.least_score <= 1.0:
-        raise RequestError(f"--least-score must be from 0 to 1, not {options.least_score:g}")
+    if not 0.0 <= options.min_score <= 1.0:
+        raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_speed(options.speed)
     if not options.disparity_scale > 0:
         raise RequestError(f"--disparity-scale must be more than 0, not {options.disparity_scale:g}")
@@ -81,7 +81,6 @@ def run(options: Run) -> int:
     enable_compilation_cache()
     from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
     from jaxrl_vis.stalks.phenotyping.pipeline import Request, run
-    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS, UNFAMILIAR
 
     gate = None
     if options.masks == "truth":
@@ -92,19 +91,17 @@ def run(options: Run) -> int:
         from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, find_stalks, load_finder, resolve_weights
 
         weights = resolve_weights(options.weights)
-        gate = load_finder(weights, options.least_score).gate  # reports what is wrong with the weights
-        name = f"{detector_name(weights)}, least score {options.least_score:g}"
+        gate = load_finder(weights, options.min_score).gate  # reports what is wrong with the weights
+        name = f"{detector_name(weights)}, least score {options.min_score:g}"
         if gate is None:
             print(
                 "these weights have no gate: nothing tells whether your images are like those that they know", file=sys.stderr
             )
-        find = functools.partial(find_stalks, weights, options.least_score)
+        find = functools.partial(find_stalks, weights, options.min_score)
 
     tried = TRIED if options.masks == "network" else None
-    most_doubt = None if gate is None else gate.threshold
-    request = Request(
-        options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried, most_doubt
-    )
+    max_doubt = None if gate is None else gate.threshold
+    request = Request(options.out, options.method, name, calibrations, options.speed, options.disparity_scale, tried, max_doubt)
     for plot in plots:
         if calibrations[plot.name] is None:
             print(f"{plot.name}: no calibration, so no millimetres and no count: name one with --calibration", file=sys.stderr)
@@ -121,25 +118,26 @@ def run(options: Run) -> int:
     for name, why in uncounted.items():
         if calibrations[name] is not None:
             print(f"{name}: {why}, so no count", file=sys.stderr)
-    for row in rows:
-        if NO_WIDTHS in row["flag"]:
-            print(
-                f"{row['plot']}: no width: none of its {row['stalks']} stalks could be measured, see qc.html", file=sys.stderr
-            )
-        if NO_GROUND in row["flag"]:
-            print(
-                f"{row['plot']}: the ground is not seen, so nobody knows at what height the widths were taken", file=sys.stderr
-            )
-        if UNFAMILIAR in row["flag"]:
-            print(
-                f"{row['plot']}: its images are unlike those that the networks read rightly: look at its overlays before you "
-                "trust a number",
-                file=sys.stderr,
-            )
-        if FEW_FRAMES in row["flag"]:
-            print(f"{row['plot']}: most widths were measured in fewer than three pairs: take more of them", file=sys.stderr)
+    _warn_of_flags(rows)
     for row in skipped:
         print(f"skipped {row['plot']}/{row['pair']}: {row['why']}", file=sys.stderr)
     counts = f"plots: {len(plots)}, pairs skipped: {len(skipped)}"
     print(f"{options.out}: stalks.csv, plots.csv, {written}, qc.html and overlays ({counts})")
     return SKIPPED if skipped else 0
+
+
+def _warn_of_flags(rows: list[dict[str, Any]]) -> None:
+    """Print a line for each flag of each row of plots.csv, with a hint."""
+    from jaxrl_vis.stalks.phenotyping.report.tables import FEW_FRAMES, NO_GROUND, NO_WIDTHS, UNFAMILIAR
+
+    hints = {
+        NO_WIDTHS: "no width: none of its {stalks} stalks could be measured, see qc.html",
+        NO_GROUND: "the ground is not seen, so nobody knows at what height the widths were taken",
+        UNFAMILIAR: "its images are unlike those that the networks read rightly: look at its overlays before you trust "
+        "a number",
+        FEW_FRAMES: "most widths were measured in fewer than three pairs: take more of them",
+    }
+    for row in rows:
+        for flag, hint in hints.items():
+            if flag in row["flag"]:
+                print(f"{row['plot']}: {hint.format(stalks=row['stalks'])}", file=sys.stderr)

@@ -38,7 +38,7 @@ def synth(options: Synth) -> int:
 
 
 def write_synthetic(
-    options: SynthOptions, family: "Family", count: int, truth: Literal["all", "boxes", "none"], noun: str
+    options: SynthOptions, family: "Family", count: int, truth: Literal["all", "boxes", "none"], unit: str
 ) -> None:
     """Write plots or runs with progress, and print a one-line summary.
 
@@ -47,7 +47,7 @@ def write_synthetic(
         family: Family that the plots are sampled from.
         count: Number of plots.
         truth: Ground truth to write.
-        noun: Noun for the plots in the summary, in the plural.
+        unit: Noun for the plots in the summary, in the plural.
 
     Raises:
         RequestError: The folder cannot be written to, or holds another family's plots.
@@ -65,4 +65,4 @@ def write_synthetic(
     except OSError as error:
         raise RequestError(f"cannot write to {options.out}: {error.strerror or error}") from error
     already = f", {present} there already" if present else ""
-    print(f"{options.out}: {len(seeds)} synthetic {noun} of family {family.name}{already}")
+    print(f"{options.out}: {len(seeds)} synthetic {unit} of family {family.name}{already}")

@@ -25,7 +25,7 @@ _FIRST_SEED = 100_000
 
 def train(options: DetectorTraining) -> int:
     """Train the networks, write their weights, and return the exit status."""
-    check_counts(snips=options.snips)
+    check_counts(crops=options.crops)
     options.check()
     drawn = (options.family, options.shift, options.spec, options.frames, options.width)
     if options.data is not None and any(drawn):
@@ -66,7 +66,7 @@ def _train(options: DetectorTraining) -> int:
         images=options.images,
         first=min(24, options.images),
         batch=options.batch,
-        snips=options.snips,
+        crops=options.crops,
         rate=options.rate or (1e-3 if before is None else 3e-4),
         seed=options.seed,
     )

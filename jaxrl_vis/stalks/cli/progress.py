@@ -24,11 +24,11 @@ def progress(unit: str) -> Iterator[Done]:
     stream = safe(sys.stdout)
     if not stream.isatty():
 
-        def say(name: str, done: int, total: int) -> None:
+        def echo(name: str, done: int, total: int) -> None:
             if done == total:
                 print(f"{name}: {total} {unit}", flush=True, file=stream)
 
-        yield say
+        yield echo
         return
 
     def wordings(task: Task, elapsed: str, left: str) -> Sequence[Sequence[str]]:

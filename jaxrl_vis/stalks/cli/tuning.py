@@ -33,16 +33,16 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
     """
     began = time.monotonic()
 
-    def say(line: str) -> None:
+    def echo(line: str) -> None:
         print(f"{time.monotonic() - began:6.1f} s  {line}", flush=True)
 
-    say(f"reading the annotations in {folder} ...")
+    echo(f"reading the annotations in {folder} ...")
     page = options.out.with_suffix(".html")
     check_writable(page, "OUT")
     from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 
     names = read_annotations(folder, options.label)
-    say(f"{folder}: {names['summary']}")
+    echo(f"{folder}: {names['summary']}")
     check_devices()
     enable_compilation_cache()
     from jaxrl_vis import __version__
@@ -50,17 +50,17 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
     from jaxrl_vis.stalks.phenotyping.training.examples import any_outlined
     from jaxrl_vis.stalks.phenotyping.training.tuning import Tuning, tune
 
-    start, settings, origin = _start(options, folder, say)
+    start, settings, origin = _start(options, folder, echo)
     masks = any_outlined(folder, options.label)
     if not masks:
-        say("masks stay as they are: no annotation has an outline, only boxes")
-    examples = _read_examples(options, folder, settings, len(names["images"]), say)
-    parts = _split(options, [image["file_name"] for image in names["images"]], examples, say)
+        echo("masks stay as they are: no annotation has an outline, only boxes")
+    examples = _read_examples(options, folder, settings, len(names["images"]), echo)
+    parts = _split(options, [image["file_name"] for image in names["images"]], examples, echo)
     tuning = Tuning(
         steps=options.steps or _STEPS,
         minutes=options.minutes,
         batch=options.batch,
-        snips=options.snips if masks or start is None else 0,
+        crops=options.crops if masks or start is None else 0,
         rate=options.rate or (_RATE_FROM_RANDOM if start is None else _RATE),
         seed=options.seed,
     )
@@ -69,41 +69,42 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
         about = {"version": __version__, "origin": f"annotated images{origin}", "steps": step, "seed": options.seed}
         write_weights(options.out, params, settings, about)
 
-    tuned = tune(examples, parts, settings, tuning, start, say, keep)
+    tuned = tune(examples, parts, settings, tuning, start, echo, keep)
     keep(tuned.params, tuned.steps)
-    say(f"the end: {tuned.why}; weights are those of update {tuned.steps}")
+    echo(f"the end: {tuned.why}; weights are those of update {tuned.steps}")
     if parts.test:
-        _report(page, examples, parts, tuned, settings, start, masks, say)
+        _report(page, examples, parts, tuned, settings, start, masks, echo)
     size = options.out.stat().st_size / 1e6
-    say(f"{options.out}: {tuned.made} updates on annotated images{origin}, {size:.1f} MB")
+    echo(f"{options.out}: {tuned.made} updates on annotated images{origin}, {size:.1f} MB")
     return 0
 
 
-def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, count: int, say: Any) -> list[Example]:
+def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, count: int, echo: Any) -> list[Example]:
     """Read all images with their stalks and stalk crops, and report the progress every few seconds."""
     from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples
 
-    examples, told = [], time.monotonic()
-    say(f"reading {count} images ...")
+    examples, last_report = [], time.monotonic()
+    echo(f"reading {count} images ...")
     for example in annotated_examples(folder, settings, options.label):
         examples.append(example)
-        if time.monotonic() - told > 5.0:
-            told = time.monotonic()
-            say(f"{len(examples)} of {count} images read")
+        if time.monotonic() - last_report > 5.0:
+            last_report = time.monotonic()
+            echo(f"{len(examples)} of {count} images read")
     return examples
 
 
-def _split(options: DetectorTraining, names: list[str], examples: list[Example], say: Any) -> Split:
+def _split(options: DetectorTraining, names: list[str], examples: list[Example], echo: Any) -> Split:
     """Split the images by photograph into training, early-stopping and test sets, and report their sizes."""
-    from jaxrl_vis.stalks.phenotyping.training.photographs import FEWEST, photographs_of, split
+    from jaxrl_vis.stalks.phenotyping.training.photographs import MIN_IMAGES, photographs_of, split
 
     parts = split(photographs_of(names, [example.image for example in examples]), options.seed)
     if not parts.test:
-        say(
-            f"{parts.photographs} photographs, fewer than {FEWEST}: none is held out, so nothing tells how good the weights are"
+        echo(
+            f"{parts.photographs} photographs, fewer than {MIN_IMAGES}: none is held out, "
+            "so nothing tells how good the weights are"
         )
     else:
-        say(
+        echo(
             f"{len(examples)} images of {parts.photographs} photographs: {len(parts.train)} to learn from, {len(parts.stop)} "
             f"to decide when to stop, {len(parts.test)} for the report"
         )
@@ -118,7 +119,7 @@ def _report(
     settings: Settings,
     start: Any,
     masks: bool,
-    say: Any,
+    echo: Any,
 ) -> None:
     """Write the page that compares the weights before and after training on the test images, and print its scores."""
     import jax.numpy as jnp
@@ -136,11 +137,11 @@ def _report(
             for name, params in pairs.items()
             if params is not None
         }
-    for name, each in scores.items():
+    for name, result in scores.items():
         overlap = overlaps.get(name, math.nan)
-        say(
-            f"{name:6} on {each.images} held-out images: {each.right} of {each.labels} stalks found, {each.finds - each.right} "
-            f"false finds, F1 {each.f1:.2f}, AP50 {each.ap50:.2f}"
+        echo(
+            f"{name:6} on {result.images} held-out images: {result.right} of {result.labels} stalks found, "
+            f"{result.finds - result.right} false finds, F1 {result.f1:.2f}, AP50 {result.ap50:.2f}"
             + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
         )
     facts = [
@@ -150,10 +151,10 @@ def _report(
         f"{tuned.why}; the weights are those of update {tuned.steps}.",
     ]
     write_page(page, facts, test, {"before": tuned.before, "after": tuned.after}, scores, overlaps)
-    say(f"{page}: the held-out images, before and after")
+    echo(f"{page}: the held-out images, before and after")
 
 
-def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Settings, str]:
+def _start(options: DetectorTraining, folder: Path, echo: Any) -> tuple[Any, Settings, str]:
     """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
 
     Raises:
@@ -168,20 +169,20 @@ def _start(options: DetectorTraining, folder: Path, say: Any) -> tuple[Any, Sett
         return None, settings_for(folder, Settings(), options.label), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
     fitting = settings_for(folder, settings, options.label)
-    if not 0.5 <= fitting.band_lines / settings.band_lines <= 2.0:
+    if not 0.5 <= fitting.band_height / settings.band_height <= 2.0:
         why = (
-            f"boxes of {folder} are {fitting.band_lines:.0f} pixels tall in images of {fitting.width}, and those that "
-            f"the weights `{start}` find {settings.band_lines:.0f}"
+            f"boxes of {folder} are {fitting.band_height:.0f} pixels tall in images of {fitting.width}, and those that "
+            f"the weights `{start}` find {settings.band_height:.0f}"
         )
         if options.start is not None:
             raise RequestError(f"{why}: annotate stalks from 8 to 16 inches above the ground, or give --start random")
-        say(f"starting from random weights: {why}")
+        echo(f"starting from random weights: {why}")
         return None, fitting, ""
     # The weights are tied to their anchors, so these are kept instead of those that fit the annotations. The number of
     # candidates is not: training adapts the head to new ones.
     settings = dataclasses.replace(
         fitting,
-        band_lines=settings.band_lines,
+        band_height=settings.band_height,
         anchor_widths=settings.anchor_widths,
         candidates=Settings().candidates,
     )

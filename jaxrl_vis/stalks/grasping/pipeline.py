@@ -159,12 +159,12 @@ def _is_whole(record: dict[str, Any]) -> bool:
     return known and record["skipped"] == []
 
 
-def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
+def _record(folder: PlotFolder, distances: dict[str, float] | None, find: Find, request: Request) -> dict[str, Any]:
     """Compute the record of one run, and write its overlay.
 
     Args:
         folder: Folder of the run.
-        driven: Distance driven at each pair by the pair's name, m; None if unknown.
+        distances: Distance driven at each pair by the pair's name, m; None if unknown.
         find: Function that returns the mask of a pair.
         request: The request.
 
@@ -180,7 +180,7 @@ def _record(folder: PlotFolder, driven: dict[str, float] | None, find: Find, req
         except Unusable as problem:
             skipped.append({"run": folder.name, "pair": pair.name, "why": str(problem)})
             continue
-        views.append(View(number, left, right, None if driven is None else driven.get(pair.name)))
+        views.append(View(number, left, right, None if distances is None else distances.get(pair.name)))
     if not views:
         return {"row": _row(folder, request, len(skipped), None, views), "points": [], "skipped": skipped}
     perception = perceive(
@@ -231,12 +231,12 @@ def _points(folder: PlotFolder, request: Request, perception: Perception) -> lis
     """Return the rows of the grasp points of a run, in the robot frame of its last pair."""
     can = _can_reach(request, perception)
     rows = []
-    for place, point in enumerate(perception.points):
+    for index, point in enumerate(perception.points):
         x, y, z = point.point
         rows.append(
             {
                 "run": folder.name,
-                "point": place + 1,
+                "point": index + 1,
                 "x_m": f"{x:.4f}",
                 "y_m": f"{y:.4f}",
                 "z_m": f"{z:.4f}",
@@ -244,7 +244,7 @@ def _points(folder: PlotFolder, request: Request, perception: Perception) -> lis
                 "diameter_mm": f"{1e3 * point.thickness:.1f}" if math.isfinite(point.thickness) else "",
                 "pairs": point.frames or "",
                 "spread_mm": f"{1e3 * point.spread:.2f}" if math.isfinite(point.spread) else "",
-                "reachable": "" if can is None else "yes" if can[place] else "no",
+                "reachable": "" if can is None else "yes" if can[index] else "no",
                 "method": request.method,
                 "version": jaxrl_vis.__version__,
             }
@@ -258,12 +258,12 @@ def draw_points(left: np.ndarray, perception: Perception, calibration: Calibrati
     red = perception.clouds[-1].red
     image[red] = (0.4 * image[red] + 0.6 * np.array([255, 0, 0])).astype(np.uint8)
     size = max(image.shape[1] // 170, 3)
-    for place, point in enumerate(perception.points):
+    for index, point in enumerate(perception.points):
         x, y, z = mount.pose.to_camera(point.point)
         column, line = calibration.focal * x / z + calibration.centre[0], calibration.focal * y / z + calibration.centre[1]
         middle = (round(column), round(line))
         cv2.circle(image, middle, size, (255, 255, 0), -1, cv2.LINE_AA)
         cv2.circle(image, middle, size, (0, 0, 0), 1, cv2.LINE_AA)
-        beside = (middle[0] + size + 2, middle[1] + size)
-        cv2.putText(image, str(place + 1), beside, cv2.FONT_HERSHEY_SIMPLEX, size / 10, (255, 255, 0), 1, cv2.LINE_AA)
+        label_place = (middle[0] + size + 2, middle[1] + size)
+        cv2.putText(image, str(index + 1), label_place, cv2.FONT_HERSHEY_SIMPLEX, size / 10, (255, 255, 0), 1, cv2.LINE_AA)
     return image

@@ -29,7 +29,7 @@ from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
 from jaxrl_vis.stalks.phenotyping.io.pair_reading import Unusable, known_disparity, read_pair, read_side
-from jaxrl_vis.stalks.phenotyping.io.tables.odometry import read_odometries, why_no_odometry
+from jaxrl_vis.stalks.phenotyping.io.tables.odometry import odometry_fault, read_odometries
 from jaxrl_vis.stalks.phenotyping.measure.lens import UNTRIED, LensRange, lens_fault
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.report.overlay import draw_overlay
@@ -74,7 +74,7 @@ class Request:
         speed: Speed of the robot, m/s, for odometry with times only; None if unknown.
         disparity_scale: Divisor of disparities in 16-bit images.
         tried: Range of lenses on which the detector was validated; None to accept any.
-        most_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
+        max_doubt: Doubt of the gate above which an image is reported as unfamiliar; None if there is no gate.
     """
 
     out: Path
@@ -84,7 +84,7 @@ class Request:
     speed: float | None = None
     disparity_scale: float = 256.0
     tried: LensRange | None = None
-    most_doubt: float | None = None
+    max_doubt: float | None = None
 
 
 def run(
@@ -93,7 +93,7 @@ def run(
     request: Request,
     done: Callable[[str, int, int], None] = lambda plot, pair, of: None,
     workers: int = 1,
-    say: Callable[[str, str], None] = lambda plot, why: None,
+    echo: Callable[[str, str], None] = lambda plot, why: None,
 ) -> tuple[list[Row], list[Row]]:
     """Process plots and write their results, resuming from those that are already there.
 
@@ -103,7 +103,7 @@ def run(
         request: Options of the run.
         done: Progress callback, called after each pair with the plot's name, and the numbers of finished and of all its pairs.
         workers: Number of processes that measure pairs and render overlays; 1 to use the calling process.
-        say: Callback for each plot without a count, with its name and the reason.
+        echo: Callback for each plot without a count, with its name and the reason.
 
     Returns:
         Rows of plots.csv, and rows of skipped.csv.
@@ -112,7 +112,7 @@ def run(
         RequestError: The folder holds other results, or a plot's odometry cannot be read.
         OSError: A file cannot be written.
     """
-    driven = read_odometries(plots, request.speed)
+    distances = read_odometries(plots, request.speed)
     claim(
         request.out,
         "plots",
@@ -133,21 +133,21 @@ def run(
     if request.tried is not None:
         about.append(
             "Counting and measuring was tried on synthetic rows of sorghum in the light of a flash alone, seen from aside with "
-            f"{request.tried.density:.0f} pixels or more per metre of the row and {request.tried.view:.2f} m of it from top to "
-            "bottom; on no real row."
+            f"{request.tried.pixels_per_metre:.0f} pixels or more per metre of the row and {request.tried.view:.2f} m of it "
+            "from top to bottom; on no real row."
         )
     with worker_pool(workers) as run_all, Page(about, request.out / "overlays", len(plots)) as page:
-        return _run(plots, find, request, driven, page, done, say, run_all)
+        return _run(plots, find, request, distances, page, done, echo, run_all)
 
 
 def _run(
     plots: list[PlotFolder],
     find: Find,
     request: Request,
-    driven: dict[str, dict[str, float] | None],
+    distances: dict[str, dict[str, float] | None],
     page: Page,
     done: Callable[[str, int, int], None],
-    say: Callable[[str, str], None],
+    echo: Callable[[str, str], None],
     run_all: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
     """Process plots one by one; see `run`."""
@@ -172,9 +172,9 @@ def _run(
             for pair, record in zip(plot.pairs, records)
             if "skipped" in record
         ]
-        result = _finish(plot, records, driven[plot.name], request, run_all)
+        result = _finish(plot, records, distances[plot.name], request, run_all)
         if result.row["stalks"] == "":
-            say(plot.name, result.row["flag"] + (f" ({result.why})" if result.why else ""))
+            echo(plot.name, result.row["flag"] + (f" ({result.why})" if result.why else ""))
         page.add(result)
         stalks, rows, skipped = stalks + result.stalks, [*rows, result.row], skipped + bad
         write_rows(request.out / "stalks.csv", STALK_COLUMNS, stalks)
@@ -184,10 +184,10 @@ def _run(
     return rows, skipped
 
 
-def _why_no_count(flag: str, frames: list[list[Sighting]], plot: PlotFolder, driven: dict[str, float] | None) -> str:
+def _missing_count_reason(flag: str, frames: list[list[Sighting]], plot: PlotFolder, distances: dict[str, float] | None) -> str:
     """Return an explanation beyond the flag of why a plot has no count; empty if there is none."""
     if flag == NO_ODOMETRY:
-        return why_no_odometry(plot, driven, plot.pairs) or ""
+        return odometry_fault(plot, distances, plot.pairs) or ""
     if PARTLY_SEEN in flag:
         return "its pairs do not show all of the row that the robot passed: take some before its beginning and beyond its end"
     if flag == NO_FIT:
@@ -249,7 +249,12 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
     except Unusable as problem:
         return {"skipped": str(problem)}
     view = view_pair(
-        lambda image, density: find(image, density, plot, pair), left, right, calibration, request.method, disparity
+        lambda image, pixels_per_metre: find(image, pixels_per_metre, plot, pair),
+        left,
+        right,
+        calibration,
+        request.method,
+        disparity,
     )
     wrong = None
     if calibration is not None and disparity is None:
@@ -263,12 +268,12 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
         "columns": list(view.frame.columns),
         "doubt": None if doubt is None else round(doubt, 4),
         "camera_height_m": None if view.ground is None else round(view.ground.camera_height, 4),
-        "sightings": [dataclasses.asdict(sighting) for sighting in view.sightings],
+        "sightings": [sighting.json_values() for sighting in view.sightings],
     }
 
 
 def _finish(
-    plot: PlotFolder, records: list[dict[str, Any]], driven: dict[str, float] | None, request: Request, run_all: UnorderedMap
+    plot: PlotFolder, records: list[dict[str, Any]], distances: dict[str, float] | None, request: Request, run_all: UnorderedMap
 ) -> PlotResult:
     """Track the stalks of a plot, compute its table rows, and render its overlays."""
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
@@ -276,16 +281,16 @@ def _finish(
     frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
     origin = Origin(plot.name, request.method, jaxrl_vis.__version__)
     calibration = request.calibrations[plot.name]
-    known = driven is not None and all(pair.name in driven for pair, _ in usable)
-    flag, tracks, start = _what_is_missing(len(usable), calibration), [], 0.0
+    known = distances is not None and all(pair.name in distances for pair, _ in usable)
+    flag, tracks, start = _tracking_fault(len(usable), calibration), [], 0.0
     labels: list[list[str | None]] = [[None] * len(frame) for frame in frames]
     drive = None
     why = _lens_fault(request, frames, [record for _, record in usable], plot.name)
     if why is not None:
         flag = UNTRIED
-    elif calibration is not None and driven is not None and known and len(usable) >= 2:
+    elif calibration is not None and distances is not None and known and len(usable) >= 2:
         first, last = np.median([record["columns"] for _, record in usable], axis=0)
-        driven_at = np.array([driven[pair.name] for pair, _ in usable])
+        driven_at = np.array([distances[pair.name] for pair, _ in usable])
         drive = follow_either_way(frames, driven_at, calibration, (float(first), float(last)))
         flag = NO_FIT
     if drive is None or not drive.fits:
@@ -295,26 +300,26 @@ def _finish(
         labels = sighting_labels(frames, tracks)
         start = float(path.places[0])
         stalks, row = plot_rows(frames, tracks, path, skipped, origin)
-    strange = _strange(request, [record for _, record in usable])
+    strange = _unfamiliar_note(request, [record for _, record in usable])
     if strange:
         row = {**row, "flag": UNFAMILIAR if row["flag"] == "ok" else f"{row['flag']}; {UNFAMILIAR}"}
     _draw_overlays(plot.name, request.out / "overlays" / file_name(plot.name), usable, labels, run_all)
     width = usable[0][1]["size"][1] if usable else 0
-    why = why or (_why_no_count(row["flag"], frames, plot, driven) if row["stalks"] == "" else "")
+    why = why or (_missing_count_reason(row["flag"], frames, plot, distances) if row["stalks"] == "" else "")
     return PlotResult(row, stalks, [pair.name for pair, _ in usable], frames, tracks, start, width, why, strange)
 
 
-def _strange(request: Request, records: list[dict[str, Any]]) -> str:
+def _unfamiliar_note(request: Request, records: list[dict[str, Any]]) -> str:
     """Return a warning if more than half of the pairs of a plot are unfamiliar to the networks; else an empty string."""
     doubts = [record["doubt"] for record in records if record.get("doubt") is not None]
-    if request.most_doubt is None or not doubts:
+    if request.max_doubt is None or not doubts:
         return ""
-    unlike = sum(doubt > request.most_doubt for doubt in doubts)
+    unlike = sum(doubt > request.max_doubt for doubt in doubts)
     if unlike <= len(doubts) / 2:
         return ""
     return (
         f"{unlike} of {len(doubts)} pairs are unlike the images that the networks read rightly (the median of their doubts is "
-        f"{np.median(doubts):.2f}, the limit {request.most_doubt:.2f}): look at the overlays before you trust a number"
+        f"{np.median(doubts):.2f}, the limit {request.max_doubt:.2f}): look at the overlays before you trust a number"
     )
 
 
@@ -350,13 +355,13 @@ def _draw_overlays(
         write_atomically(index, json.dumps(shown) + "\n")
 
 
-def _draw_overlay(plot: str, asked: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
+def _draw_overlay(plot: str, job: tuple[Path, PairFiles, list[Sighting], list[str | None]]) -> None:
     """Render and write the overlay of one pair."""
-    target, pair, frame, names = asked
+    target, pair, frame, names = job
     write_image(target, draw_overlay(read_side(pair, "left"), frame, names, f"{plot} {pair.name}"))
 
 
-def _what_is_missing(pairs: int, calibration: Calibration | None) -> str:
+def _tracking_fault(pairs: int, calibration: Calibration | None) -> str:
     """Return a flag on why the stalks of a plot cannot be tracked."""
     if pairs == 0:
         return "no usable pairs"

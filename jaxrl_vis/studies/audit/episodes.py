@@ -102,11 +102,11 @@ def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
         return pairs
     draw = np.random.default_rng(seed)
 
-    def noisy(images: Any) -> Any:
+    def add_noise(images: Any) -> Any:
         changed = images + deviation * draw.standard_normal(images.shape, np.float32)
         return np.clip(np.round(changed), 0, 255).astype(np.uint8)
 
-    return pairs._replace(images=noisy(pairs.images), goals=noisy(pairs.goals))
+    return pairs._replace(images=add_noise(pairs.images), goals=add_noise(pairs.goals))
 
 
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
@@ -118,9 +118,9 @@ def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
     goals = (episodes.images[:, -1], episodes.images[others, -1], episodes.goals)
     goal_states = (episodes.states[:, -1], episodes.states[others, -1], episodes.goal_states)
     flat: list[Any] = [array.reshape(-1, *array.shape[2:]) for array in (images, states)]
-    shown: list[Any] = [np.repeat(each, length, axis=0) for each in goal_states]
-    distance = [np.asarray(truth.goal_distance(flat[1], each)) for each in shown]
-    repeated = [np.repeat(each, length, axis=0) for each in goals]
+    shown: list[Any] = [np.repeat(goal, length, axis=0) for goal in goal_states]
+    distance = [np.asarray(truth.goal_distance(flat[1], goal)) for goal in shown]
+    repeated = [np.repeat(goal, length, axis=0) for goal in goals]
     return Pairs(np.concatenate([flat[0]] * 3), np.concatenate(repeated), np.concatenate(distance))
 
 
@@ -142,5 +142,5 @@ def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) 
         best = jnp.argmax(rewards)
         return rewards[best], is_reached[best], jnp.any(is_reached)
 
-    found = jaxrl_vis_envs.jit(lambda keys: jax.lax.map(of_goal, keys))(jax.random.split(jax.random.key(seed), goals))
-    return Found(*map(np.asarray, found))
+    episodes = jaxrl_vis_envs.jit(lambda keys: jax.lax.map(of_goal, keys))(jax.random.split(jax.random.key(seed), goals))
+    return Found(*map(np.asarray, episodes))

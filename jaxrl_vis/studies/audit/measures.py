@@ -51,5 +51,5 @@ def calibration(reward: np.ndarray, is_reached: np.ndarray) -> tuple[np.ndarray,
 
 def calibration_error(reward: np.ndarray, is_reached: np.ndarray) -> float:
     """Compute the expected calibration error: the mean over pairs of |mean reward - fraction reached| of their bin."""
-    mean, share, count = calibration(reward, is_reached)
-    return float(np.nansum(count * np.abs(mean - share)) / np.sum(count))
+    mean, frequency, count = calibration(reward, is_reached)
+    return float(np.nansum(count * np.abs(mean - frequency)) / np.sum(count))

@@ -30,7 +30,7 @@ COLUMNS = {
 _BATCH = 512
 
 
-def _described(name: str, reward: Reward) -> Reward:
+def _with_errors_named(name: str, reward: Reward) -> Reward:
     """Wrap a reward so that its errors name it."""
 
     def call(images: jax.Array, goals: jax.Array) -> jax.Array:
@@ -51,7 +51,7 @@ def _rewards(name: str, reward: Reward, images: np.ndarray, goals: np.ndarray) -
     Raises:
         RequestError: The rewards are not one number between 0 and 1 for each pair.
     """
-    compiled, rows = jaxrl_vis_envs.jit(_described(name, reward)), []
+    compiled, rows = jaxrl_vis_envs.jit(_with_errors_named(name, reward)), []
     for first in range(0, len(images), _BATCH):
         part = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
         rows.append(np.asarray(compiled(images[part], goals[part]))[: len(images) - first])
@@ -97,10 +97,10 @@ def audit(
     time = np.arange(env.horizon)
     records, values = {}, {}
     for name, reward in rewards.items():
-        found = values[name] = _rewards(name, reward, pairs.images, pairs.goals)
-        false_positive, false_negative = measures.error_shares(found, is_reached)
-        by_distance = [measures.rank_correlation(found[rows], -pairs.distance[rows]) for rows in own]
-        by_time = [measures.rank_correlation(found[rows], time) for rows in own]
+        predicted = values[name] = _rewards(name, reward, pairs.images, pairs.goals)
+        false_positive, false_negative = measures.error_shares(predicted, is_reached)
+        by_distance = [measures.rank_correlation(predicted[rows], -pairs.distance[rows]) for rows in own]
+        by_time = [measures.rank_correlation(predicted[rows], time) for rows in own]
         best = search(env, reward, goals, sequences, seed)
         claimed = best.reward >= 0.5
         records[name] = {
@@ -108,7 +108,7 @@ def audit(
             "false_negative": false_negative,
             "order_distance": float(np.mean(by_distance)),
             "order_time": float(np.mean(by_time)),
-            "calibration_error": measures.calibration_error(found, is_reached),
+            "calibration_error": measures.calibration_error(predicted, is_reached),
             "exploited": float(np.mean(claimed & ~best.is_reached)),
             "solved": float(np.mean(best.is_reached)),
             "solvable": float(np.mean(best.could_reach)),
@@ -141,14 +141,14 @@ def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit:
         above.axvline(threshold, color=FAINT, linewidth=0.8)
         above.set_title(name, color=INK, fontsize=10)
         above.set_xlabel(f"true distance, {unit}")
-        mean, share, _ = measures.calibration(reward, is_reached)
+        mean, frequency, _ = measures.calibration(reward, is_reached)
         below.plot([0, 1], [0, 1], color=FAINT, linewidth=0.8)
-        below.plot(mean, share, "o", color="#b4531f", markersize=4)
+        below.plot(mean, frequency, "o", color="#b4531f", markersize=4)
         below.set_xlabel("reward")
-        for each, label in ((above, "reward"), (below, "share that reaches")):
-            each.set_ylim(-0.05, 1.05)
+        for panel, label in ((above, "reward"), (below, "share that reaches")):
+            panel.set_ylim(-0.05, 1.05)
             if column == 0:
-                each.set_ylabel(label)
+                panel.set_ylabel(label)
     for column in range(len(names), axes.shape[1]):
         for row in axes:
             row[column].set_axis_off()

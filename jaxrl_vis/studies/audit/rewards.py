@@ -21,13 +21,13 @@ BUILT_IN = ("indicator", "indicator_tolerance", "features")
 """Built-in rewards, which need neither true states nor a run."""
 
 
-def _as_batch(images: jax.Array, goals: jax.Array) -> Batch:
+def _make_batch(images: jax.Array, goals: jax.Array) -> Batch:
     """Return a batch with ``images`` [B, ...] as achieved observations, and placeholders for actions and true states."""
     nothing = jnp.zeros((len(images), 1))
     return Batch(jnp.stack([images, goals, images]), nothing, nothing, nothing)
 
 
-def _of_run(run_dir: Path, trust: bool) -> Reward:
+def _reward_of_run(run_dir: Path, trust: bool) -> Reward:
     """Return the reward of the model that the first seed of a run has trained, scaled to [0, 1].
 
     Raises:
@@ -45,16 +45,16 @@ def _of_run(run_dir: Path, trust: bool) -> Reward:
     model = make_learned_reward(networks, trainer.config, resolved)
     assert model is not None
     scaling = networks.batch_scaling(train.statistics)
-    least, most = resolved.reward_negative, resolved.reward_positive
+    low, high = resolved.reward_negative, resolved.reward_positive
 
     shape = networks.observation_spec.shape
 
     def reward(images: jax.Array, goals: jax.Array) -> jax.Array:
         if images.shape[1:] != shape:
             raise RequestError(f"the run in {run_dir} sees images of {shape}, and these are of {images.shape[1:]}: audit those")
-        batch = _as_batch(images, goals)
+        batch = _make_batch(images, goals)
         inputs = networks.prepare_batch(scaling, batch)
-        return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - least) / (most - least)
+        return (model.of_batch(train.agent.reward_model, scaling.observations, inputs, batch).reward - low) / (high - low)
 
     return reward
 
@@ -72,14 +72,14 @@ def find_reward(name: str, config: Config, trust: bool = False) -> Reward:
     """
     if name in BUILT_IN:
         function = make_reward(config, METHODS[name])
-        return lambda images, goals: function(_as_batch(images, goals), images, 1.0, 0.0)
+        return lambda images, goals: function(_make_batch(images, goals), images, 1.0, 0.0)
     if (Path(name) / "config.json").exists():
-        return _of_run(Path(name), trust)
+        return _reward_of_run(Path(name), trust)
     if ":" not in name:
         others = "run folders and module:function are rewards, too"
         raise RequestError(f"unknown reward {name!r}{nearest(name, BUILT_IN)} ({others})")
-    found: Any = plugins.find("reward", name, {}, config.environment.env_folder)
-    if not callable(found):
+    plugin: Any = plugins.find("reward", name, {}, config.environment.env_folder)
+    if not callable(plugin):
         raise RequestError(f"{name} is no reward: it must be a function of images and goal images")
-    own: Any = found
+    own: Any = plugin
     return own

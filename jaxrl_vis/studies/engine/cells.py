@@ -71,7 +71,7 @@ def split_seeds(cell: Cell, count: int) -> list[Cell]:
 def find_folder(cell: Cell, runs: Path) -> Path:
     """Find the folder of a cell: its own, unless only a longer run of its family has reached the cell's steps."""
     own = runs / cell.name
-    if _reached(own, cell) is not None or not runs.is_dir():
+    if _last_iteration(own, cell) is not None or not runs.is_dir():
         return own
     for folder in sorted(runs.glob(f"{cell.family}-*/")):
         try:
@@ -80,12 +80,12 @@ def find_folder(cell: Cell, runs: Path) -> Path:
             continue
         if contradictions(config, cell.config, UNMEASURED) or config.run.env_steps < cell.config.run.env_steps:
             continue
-        if _reached(folder, cell) is not None:
+        if _last_iteration(folder, cell) is not None:
             return folder
     return own
 
 
-def _reached(folder: Path, cell: Cell) -> int | None:
+def _last_iteration(folder: Path, cell: Cell) -> int | None:
     """Return the steps of the first evaluation of all seeds at or after the cell's environment steps; None without one.
 
     For a run that stops early, the evaluation at which it stops is sufficient.
@@ -112,17 +112,17 @@ def differences(cell: Cell, runs: Path) -> list[str]:
 
 def contradiction(cell: Cell, runs: Path) -> str | None:
     """Return the reason why a cell's folder cannot be used, in one line; None if it can, or does not exist yet."""
-    folder, mend = find_folder(cell, runs), "move it away, or choose another --runs"
+    folder, hint = find_folder(cell, runs), "move it away, or choose another --runs"
     try:
         changes = differences(cell, runs)
     except RequestError:  # its remedy names options of `train` that studies and sweeps do not have
-        return f"{folder} holds a config.json that is damaged, or of another version: {mend}"
-    return f"{folder} holds another run, with {'; '.join(changes)}: {mend}" if changes else None
+        return f"{folder} holds a config.json that is damaged, or of another version: {hint}"
+    return f"{folder} holds another run, with {'; '.join(changes)}: {hint}" if changes else None
 
 
 def is_finished(cell: Cell, runs: Path) -> bool:
     """Return True if a cell is completely trained and evaluated."""
-    return _reached(find_folder(cell, runs), cell) is not None and contradiction(cell, runs) is None
+    return _last_iteration(find_folder(cell, runs), cell) is not None and contradiction(cell, runs) is None
 
 
 def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, Any]]:
@@ -134,7 +134,7 @@ def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[s
         as_it_is: Whether to accept a run with other settings, such as those of a preset in an earlier version.
     """
     folder = find_folder(cell, runs)
-    end = _reached(folder, cell)
+    end = _last_iteration(folder, cell)
     if end is None or not (as_it_is or contradiction(cell, runs) is None):
         return []
     return [row for row in RunFolder(folder).rows() if row["env_steps"] <= end]

@@ -74,7 +74,7 @@ def run_cells(
     find_devices: Callable[[], Sequence[Device]],
     seconds: float | None = None,
     command: Command = train_command,
-    say: Callable[[str], None] = streams.say,
+    echo: Callable[[str], None] = streams.echo,
     start: Start = start_process,
 ) -> list[str]:
     """Train unfinished cells; resume those already started.
@@ -86,7 +86,7 @@ def run_cells(
             unfinished cells.
         seconds: Time in seconds after which to save and stop; None to run to completion.
         command: Function that returns the command to train a cell.
-        say: Function called with each line of output.
+        echo: Function called with each line of output.
         start: Function that starts a command.
 
     Returns:
@@ -104,7 +104,7 @@ def run_cells(
     missing = [cell for cell in missing if contradiction(cell, runs) is None]
     missing.sort(key=_work, reverse=True)
     for line in failures:
-        say(line)
+        echo(line)
     if not missing:
         return failures
     devices = list(find_devices())
@@ -113,9 +113,9 @@ def run_cells(
     except OSError as error:
         raise RequestError(f"cannot write to {runs} ({error.strerror}): choose another --runs") from error
     where = devices[0].name if len(devices) == 1 else f"{len(devices)} devices"
-    say(f"{len(missing)} of {len(cells)} cells to train on {where}; run folders and logs go to {runs}")
+    echo(f"{len(missing)} of {len(cells)} cells to train on {where}; run folders and logs go to {runs}")
     with Interruption() as interruption:
-        failures += _Grid(missing, runs, devices, command, say, interruption, start).run(seconds)
+        failures += _Grid(missing, runs, devices, command, echo, interruption, start).run(seconds)
     if interruption:
         interruption.end()
     return failures
@@ -135,12 +135,12 @@ class _Grid:
         runs: Path,
         devices: Sequence[Device],
         command: Command,
-        say: Callable[[str], None],
+        echo: Callable[[str], None],
         interruption: Interruption,
         start: Start,
     ):
         self._waiting, self._free = list(cells), list(devices)
-        self._total, self._runs, self._command, self._say = len(cells), runs, command, say
+        self._total, self._runs, self._command, self._echo = len(cells), runs, command, echo
         self._interruption, self._start_command = interruption, start
         self._running: list[_Running] = []
         self._failures: list[str] = []
@@ -160,7 +160,7 @@ class _Grid:
                     self._end(ended)
                 if time.monotonic() - reported >= _STATUS_S and self._running:
                     reported = time.monotonic()
-                    self._say("  " + "; ".join(map(self._describe, self._running)))
+                    self._echo("  " + "; ".join(map(self._describe, self._running)))
         finally:
             self._end_at_once()
         return self._failures
@@ -171,23 +171,23 @@ class _Grid:
         place = f"[{self._total - len(self._waiting)}/{self._total}] {cell.name}"
         process = self._start_command(words, log, device.environment)
         self._running.append(_Running(cell, device, process, log, time.monotonic()))
-        self._say(f"{place}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
+        self._echo(f"{place}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
 
     def _end(self, done: _Running) -> None:
         self._running.remove(done)
         self._free.append(done.device)
         status, took = done.process.wait(), show_seconds(time.monotonic() - done.started)
         if status == 0 and is_finished(done.cell, self._runs):
-            self._say(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
+            self._echo(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
         elif self._is_stopping and (-status in SIGNALS or status - 128 in SIGNALS):
-            self._say(f"{done.cell.name}: stopped after {took}; start again to resume")
+            self._echo(f"{done.cell.name}: stopped after {took}; start again to resume")
         else:
             outcome = "ended before it was finished" if status == 0 else f"failed with exit status {status}"
             # The log shows no error if settings differ, for example because another version was installed meanwhile.
             cause = (contradiction(done.cell, self._runs) if status == 0 else None) or _last_line(done.log)
             line = f"{done.cell.name}: {outcome} after {took}: {cause} (log: {done.log})"
             self._failures.append(line)
-            self._say(line)
+            self._echo(line)
 
     def _describe(self, running: _Running) -> str:
         latest = latest_rows(self._runs / running.cell.name)
@@ -198,7 +198,7 @@ class _Grid:
     def _stop(self, reason: str) -> None:
         self._is_stopping = True
         if self._running:
-            self._say(f"{reason}: waiting for {len(self._running)} to save; a second Ctrl-C does not wait")
+            self._echo(f"{reason}: waiting for {len(self._running)} to save; a second Ctrl-C does not wait")
         self._signal()
 
     def _signal(self) -> None:

@@ -119,7 +119,7 @@ class Request:
 
 def run_search(
     request: Request,
-    say: Callable[[str], None] = streams.say,
+    echo: Callable[[str], None] = streams.echo,
     find_devices: Callable[[], Sequence[Device]] = list_devices,
     command: Command = train_command,
 ) -> bool:
@@ -138,7 +138,7 @@ def run_search(
         raise RequestError("--vary names an option twice: name it once")
     optuna = _optuna()
     study = _open(optuna, request)
-    search = _Search(optuna, study, request, say, command)
+    search = _Search(optuna, study, request, echo, command)
     try:
         is_done = search.run(find_devices)
     finally:
@@ -163,7 +163,7 @@ def _open(optuna: Any, request: Request) -> Any:
         RequestError: The journal cannot be read or written, or belongs to another search.
     """
     file = request.runs / JOURNAL
-    asked = _described(request)
+    asked = _request_record(request)
     try:
         request.runs.mkdir(parents=True, exist_ok=True)
         storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(file)))
@@ -189,7 +189,7 @@ def _open(optuna: Any, request: Request) -> Any:
     return study
 
 
-def _described(request: Request) -> dict[str, Any]:
+def _request_record(request: Request) -> dict[str, Any]:
     """Describe the settings common to all trials of a search, as a JSON value."""
     varied = {part.name for part in request.ranges}
     values = {name: value for name, value in request.config.flat().items() if name not in varied}
@@ -198,8 +198,8 @@ def _described(request: Request) -> dict[str, Any]:
 
 
 class _Search:
-    def __init__(self, optuna: Any, study: Any, request: Request, say: Callable[[str], None], command: Command):
-        self._optuna, self._study, self._request, self._say = optuna, study, request, say
+    def __init__(self, optuna: Any, study: Any, request: Request, echo: Callable[[str], None], command: Command):
+        self._optuna, self._study, self._request, self._echo = optuna, study, request, echo
         self._command = command
         self._state = optuna.trial.TrialState
 
@@ -221,7 +221,7 @@ class _Search:
             left = None if deadline is None else deadline - time.monotonic()
             if left is not None and left <= 0:
                 return False
-            failures = run_cells(list(cells.values()), request.runs, find_once, left, self._command, self._say)
+            failures = run_cells(list(cells.values()), request.runs, find_once, left, self._command, self._echo)
             if not self._tell(cells, failures):
                 return False
 
@@ -236,7 +236,7 @@ class _Search:
             try:
                 cells[number] = Cell(f"trial-{number}", validate(self._request.config.replace(**values)))
             except RequestError as error:
-                self._say(f"trial-{number}: {error}")
+                self._echo(f"trial-{number}: {error}")
                 self._study.tell(number, state=self._state.FAIL)
         return cells
 
@@ -250,7 +250,7 @@ class _Search:
             elif any(line.startswith((f"{cell.name}:", str(self._request.runs / cell.name))) for line in failures):
                 self._study.tell(number, state=self._state.FAIL)
             else:
-                self._say("start again to go on")
+                self._echo("start again to go on")
                 return False
         return True
 
@@ -260,13 +260,13 @@ class _Search:
         done = [trial for trial in self._study.trials if trial.state == self._state.COMPLETE]
         done.sort(key=lambda trial: (trial.value if lower else -trial.value, trial.number))
         failed = sum(trial.state == self._state.FAIL for trial in self._study.trials)
-        self._say(f"{len(done)} of {self._request.trials} trials done{f', {failed} failed' if failed else ''}")
+        self._echo(f"{len(done)} of {self._request.trials} trials done{f', {failed} failed' if failed else ''}")
         for trial in done[:_SHOWN]:
             shown = "  ".join(f"{name} {_shown(value)}" for name, value in trial.params.items())
-            self._say(f"{f'trial-{trial.number}':10} {scores.metric(self._request.config)} {trial.value:.3f}  {shown}")
+            self._echo(f"{f'trial-{trial.number}':10} {scores.metric(self._request.config)} {trial.value:.3f}  {shown}")
         if done:
             (cell,) = self._cells({done[0].number: done[0].params}).values()
-            self._say(f"the best one: {training_command(cell.config)}")
+            self._echo(f"the best one: {training_command(cell.config)}")
 
 
 def _score(cell: Cell, rows: Sequence[Mapping[str, Any]]) -> float | None:

@@ -98,7 +98,7 @@ Cells = dict[tuple[str, str], list[Cell]]
 
 # `debug` takes 4 gradient steps per iteration, which is not a multiple of OL-AUX-5's 5; 5 would not be one of TD3's 2.
 _OF_PRESET: dict[str, dict[str, Any]] = {"debug": {"updates_per_iteration": 10}}
-_LONGEST = 1_500_000  # environment steps of a task without a budget in the study
+_DEFAULT_BUDGET = 1_500_000  # environment steps of a task without a budget in the study
 
 
 def make_cells(study: Study, tasks: Sequence[str], variants: Sequence[str], scope: Scope) -> Cells:
@@ -131,7 +131,7 @@ def _cells(study: Study, task: str, variant: str, scope: Scope) -> list[Cell]:
 def _budget(study: Study, task: str, variant: str, scope: Scope, config: Config) -> int:
     if scope.env_steps is not None:
         return scope.env_steps
-    steps = study.shorter.get((task, variant), {**study.others, **study.steps}.get(task, _LONGEST))
+    steps = study.shorter.get((task, variant), {**study.others, **study.steps}.get(task, _DEFAULT_BUDGET))
     if scope.preset == study.family.preset:
         return steps
     return min(steps, study.family.longest.get(scope.preset, {}).get(task, config.run.env_steps))

@@ -64,7 +64,7 @@ def make_cells(request: Request) -> list[Cell]:
     return cells
 
 
-def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> bool:
+def run_sweep(request: Request, echo: Callable[[str], None] = streams.echo) -> bool:
     """Train missing cells, resume unfinished ones, and print a table.
 
     Returns:
@@ -81,10 +81,10 @@ def run_sweep(request: Request, say: Callable[[str], None] = streams.say) -> boo
     if request.executor == "slurm":
         devices = [Device("Slurm", {})] * min(request.jobs, len(cells))
         find_devices = lambda: devices  # noqa: E731
-    run_cells(cells, request.runs, find_devices, request.seconds, say=say, start=start)
+    run_cells(cells, request.runs, find_devices, request.seconds, echo=echo, start=start)
     lines, unfinished = _table(cells, request.runs)
     for line in [*lines, *unfinished]:
-        say(line)
+        echo(line)
     return not unfinished
 
 

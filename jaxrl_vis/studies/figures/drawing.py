@@ -126,12 +126,12 @@ def compose(rows: Sequence[Sequence[Panel]], title: str, subtitle: str) -> Figur
     return figure
 
 
-def _break_lines(text: str, letters: int) -> list[str]:
-    """Break a text after semicolons into lines of at most ``letters`` characters, except for longer clauses."""
+def _break_lines(text: str, max_characters: int) -> list[str]:
+    """Break a text after semicolons into lines of at most ``max_characters`` characters, except for longer clauses."""
     lines = [""]
     for clause in text.split("; "):
         longer = f"{lines[-1]}; {clause}" if lines[-1] else clause
-        if len(longer) <= letters or not lines[-1]:
+        if len(longer) <= max_characters or not lines[-1]:
             lines[-1] = longer
         else:
             lines[-1] += ";"

@@ -32,7 +32,7 @@ _SHOW: dict[str, Callable[..., FigureContent]] = {
 }
 
 
-def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> bool:
+def make_figure(request: Request, echo: Callable[[str], None] = streams.echo) -> bool:
     """Train missing cells and draw finished ones.
 
     Returns:
@@ -51,16 +51,16 @@ def make_figure(request: Request, say: Callable[[str], None] = streams.say) -> b
         # A cell requested by several figures or methods is trained once.
         wanted = {cell.name: cell for parts in cells.values() for cell in parts}
         run_cells(
-            list(wanted.values()), request.runs, lambda: shared(list_devices(), request.per_device), request.seconds, say=say
+            list(wanted.values()), request.runs, lambda: shared(list_devices(), request.per_device), request.seconds, echo=echo
         )
     lines, unfinished = read_lines(cells, request.runs, as_they_are=request.draw_only)
     for text in unfinished:
-        say(f"not drawn: {text}")
+        echo(f"not drawn: {text}")
     if not any(variant in variants for _, variant in lines):
-        say("nothing to draw yet")
+        echo("nothing to draw yet")
         return False
     for path in _write(request, lines, variants, unfinished):
-        say(str(path))
+        echo(str(path))
     return not unfinished
 
 

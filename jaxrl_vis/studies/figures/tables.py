@@ -129,8 +129,8 @@ def _gain(alone: Line | None, base: Line | None) -> float | None:
     return mean_success(alone, common) - mean_success(base, common)
 
 
-def _correlation(weights: Sequence[float], gains: Sequence[float], wanted: int) -> str:
-    if len(gains) < wanted:
+def _correlation(weights: Sequence[float], gains: Sequence[float], minimum: int) -> str:
+    if len(gains) < minimum:
         return "Rank correlation of mean weight and gain alone: not known before all runs of figure 5.5 are there."
     if len(set(weights)) < 2 or len(set(gains)) < 2:
         return "Rank correlation of mean weight and gain alone: not defined, since all are equal."

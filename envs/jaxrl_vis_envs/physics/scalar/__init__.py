@@ -43,10 +43,12 @@ def simulate(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = 
         body poses included, are unchanged and thus stale. ``qpos`` is NaN if ``xfrc_applied`` is not 0 or a weld is inactive.
     """
     take = steps_kernel.simulate if use_gpu_kernels(probe) else steps.simulate_arrays
-    return _simulate_by(take, model, data, count, exact)
+    return _simulate_with(take, model, data, count, exact)
 
 
-def _simulate_by(take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int, exact: bool | None) -> mjx.Data:
+def _simulate_with(
+    take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int, exact: bool | None
+) -> mjx.Data:
     """Implement `simulate` with ``take``, a function with the arguments of `steps.simulate_arrays`."""
     constants, timestep = scalar_model.build_scalar_model(model), float(model.opt.timestep)
     state = JointState(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)

@@ -37,22 +37,22 @@ class Softness(NamedTuple):
         """Return the constraint's impedance, in (0, 1), at a violation (m or rad) of either sign."""
         if self.min_impedance == self.max_impedance or isinstance(violation, float):
             return self._known_impedance(abs(violation) if isinstance(violation, float) else 0.0)
-        share = jnp.minimum(jnp.abs(violation) * (1.0 / self.width), 1.0)
+        fraction = jnp.minimum(jnp.abs(violation) * (1.0 / self.width), 1.0)
         if self.power > 1:
             power = int(self.power)
-            below = times(*[share] * power, self.midpoint ** (1 - power))
-            rest = 1.0 - share
+            below = times(*[fraction] * power, self.midpoint ** (1 - power))
+            rest = 1.0 - fraction
             above = minus(1.0, times(*[rest] * power, (1.0 - self.midpoint) ** (1 - power)))
-            share = jnp.where(share < self.midpoint, below, above)
-        return plus(self.min_impedance, times(share, self.max_impedance - self.min_impedance))
+            fraction = jnp.where(fraction < self.midpoint, below, above)
+        return plus(self.min_impedance, times(fraction, self.max_impedance - self.min_impedance))
 
     def _known_impedance(self, violation: float) -> float:
-        share = min(violation / self.width, 1.0)
-        if share < self.midpoint:
-            share = share**self.power * self.midpoint ** (1 - self.power)
+        fraction = min(violation / self.width, 1.0)
+        if fraction < self.midpoint:
+            fraction = fraction**self.power * self.midpoint ** (1 - self.power)
         else:
-            share = 1.0 - (1.0 - share) ** self.power * (1.0 - self.midpoint) ** (1 - self.power)
-        return self.min_impedance + share * (self.max_impedance - self.min_impedance)
+            fraction = 1.0 - (1.0 - fraction) ** self.power * (1.0 - self.midpoint) ** (1 - self.power)
+        return self.min_impedance + fraction * (self.max_impedance - self.min_impedance)
 
     def row_stiffness(self, inverse_weight: float, impedance: Any) -> Any:
         """Return MuJoCo's ``efc_D``: the inverse of the regularized part of the constraint's inverse inertia.

@@ -233,9 +233,9 @@ def _wrench_to_parent(link: Link, joint: JointTransform, force: Vector, torque: 
     return force, add(torque, cross(_origin_in_parent(link, joint), force))
 
 
-def _sum_inertias(one: _CompositeInertia, other: _CompositeInertia) -> _CompositeInertia:
-    inertia = {key: plus(one.inertia[key], other.inertia[key]) for key in one.inertia}
-    return _CompositeInertia(one.mass + other.mass, add(one.moment, other.moment), inertia)
+def _sum_inertias(first: _CompositeInertia, other: _CompositeInertia) -> _CompositeInertia:
+    inertia = {key: plus(first.inertia[key], other.inertia[key]) for key in first.inertia}
+    return _CompositeInertia(first.mass + other.mass, add(first.moment, other.moment), inertia)
 
 
 def _inertia_to_parent(link: Link, joint: JointTransform, body: _CompositeInertia) -> _CompositeInertia:

@@ -74,7 +74,7 @@ def build_links(model: mjx.Model) -> tuple[list[Link], list[FixedFrame]]:
             slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
             massless = (0.0, np.zeros(3), np.zeros((3, 3)))
             tree.append(Link(joint_frame.link, joint_frame.rotation, joint_frame.position, axis, bool(slides), *massless))
-            frame = FixedFrame(joint, alignment.T, _tidy(-alignment.T @ anchor[joint]))
+            frame = FixedFrame(joint, alignment.T, _round_entries(-alignment.T @ anchor[joint]))
         frames.append(frame)
     _add_masses(model, tree, frames)
     return tree, frames
@@ -91,8 +91,8 @@ def _add_masses(model: mjx.Model, tree: list[Link], frames: list[FixedFrame]) ->
             away = mass[body] * (frame.position @ frame.position * np.eye(3) - np.outer(frame.position, frame.position))
             tree[frame.link] = link._replace(
                 mass=link.mass + float(mass[body]),
-                moment=_tidy(link.moment + mass[body] * frame.position),
-                inertia=_tidy(link.inertia + own + away),
+                moment=_round_entries(link.moment + mass[body] * frame.position),
+                inertia=_round_entries(link.inertia + own + away),
             )
 
 
@@ -117,7 +117,9 @@ def ancestor_joints(tree: list[Link], link: int) -> list[int]:
 
 
 def _compose(frame: FixedFrame, rotation: np.ndarray, position: np.ndarray) -> FixedFrame:
-    return FixedFrame(frame.link, _tidy(frame.rotation @ rotation), _tidy(frame.position + frame.rotation @ position))
+    return FixedFrame(
+        frame.link, _round_entries(frame.rotation @ rotation), _round_entries(frame.position + frame.rotation @ position)
+    )
 
 
 def _align_axis(axis: np.ndarray) -> tuple[int, np.ndarray]:
@@ -130,10 +132,10 @@ def _align_axis(axis: np.ndarray) -> tuple[int, np.ndarray]:
         half_turn = -np.eye(3)
         half_turn[(index + 1) % 3, (index + 1) % 3] = 1.0
         _, rest = _align_axis(half_turn @ axis)
-        return index, _tidy(half_turn @ rest)
+        return index, _round_entries(half_turn @ rest)
     x, y, z = np.cross(start, axis)
     skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return index, _tidy(np.eye(3) + skew + skew @ skew / (1.0 + axis[index]))
+    return index, _round_entries(np.eye(3) + skew + skew @ skew / (1.0 + axis[index]))
 
 
 def _array(numbers: object) -> np.ndarray:
@@ -146,12 +148,12 @@ def _rotations(quaternions: object) -> np.ndarray:
     for quaternion in _array(quaternions).reshape(-1, 4):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, quaternion / np.linalg.norm(quaternion))
-        matrices.append(_tidy(matrix.reshape(3, 3)))
+        matrices.append(_round_entries(matrix.reshape(3, 3)))
     return np.array(matrices)
 
 
-def _tidy(array: np.ndarray) -> np.ndarray:
+def _round_entries(array: np.ndarray) -> np.ndarray:
     """Round entries within rounding errors of 0 and, in arrays with entries above 0.5, of whole numbers."""
     array = np.where(np.abs(array) < _ROUNDING * max(np.abs(array).max(), 1e-30), 0.0, array)
-    whole = np.round(array)
-    return np.where(np.abs(array - whole) < _ROUNDING, whole, array) if np.abs(array).max() > 0.5 else array
+    rounded = np.round(array)
+    return np.where(np.abs(array - rounded) < _ROUNDING, rounded, array) if np.abs(array).max() > 0.5 else array

@@ -260,10 +260,10 @@ def _add_tendon(mass: Matrix, coefficients: dict[int, float], armature: float) -
     """Add the armature of a tendon to the mass matrix."""
     if armature == 0.0:
         return
-    for one, share in coefficients.items():
+    for one, coefficient in coefficients.items():
         for other, factor in coefficients.items():
             if other <= one:
-                mass[one, other] = plus(mass.get((one, other), 0.0), armature * share * factor)
+                mass[one, other] = plus(mass.get((one, other), 0.0), armature * coefficient * factor)
 
 
 def _smooth_forces(constants: ScalarModel, state: JointState, joints: list[JointTransform], inputs: StepInputs) -> Column:
@@ -297,12 +297,12 @@ def _friction_row(friction: FrictionConstraint, state: JointState) -> _Constrain
 def _limit_row(limit: LimitConstraint, state: JointState) -> _ConstraintRow:
     """Return the row of the nearer bound."""
     low, high = limit.bounds
-    length = plus(*(times(share, state.position[joint]) for joint, share in limit.joints.items()))
-    speed = plus(*(times(share, state.velocity[joint]) for joint, share in limit.joints.items()))
+    length = plus(*(times(coefficient, state.position[joint]) for joint, coefficient in limit.joints.items()))
+    speed = plus(*(times(coefficient, state.velocity[joint]) for joint, coefficient in limit.joints.items()))
     above, below = minus(length, low), minus(high, length)
     is_low = above < below
     distance = minus(jnp.minimum(above, below), limit.margin)
-    entries = {joint: jnp.where(is_low, share, -share) for joint, share in limit.joints.items()}
+    entries = {joint: jnp.where(is_low, coefficient, -coefficient) for joint, coefficient in limit.joints.items()}
     softness, speed = limit.softness, jnp.where(is_low, speed, -speed)
     impedance = softness.impedance(distance)
     stiffness = jnp.where(distance < 0, softness.row_stiffness(limit.inverse_weight, impedance), 0.0)

@@ -70,14 +70,14 @@ class _KernelConstants:
     may_be_exact: bool
 
 
-def _simulate_episode(known: _KernelConstants, rows: list[jax.Array]) -> list[jax.Array]:
+def _simulate_episode(kernel_constants: _KernelConstants, rows: list[jax.Array]) -> list[jax.Array]:
     """Compute the final `JointState` of an episode from its inputs, both as flat lists of scalars."""
-    constants = known.constants
+    constants = kernel_constants.constants
     joints = len(constants.links)
     (timestep, *loops), rows = rows[:3], rows[3:]
     # Equal in all threads of a warp, which execute the same loops.
     count, is_exact = (jnp.max(number).astype(jnp.int32) for number in loops)
-    exact = is_exact if known.may_be_exact else False
+    exact = is_exact if kernel_constants.may_be_exact else False
     position, velocity, acceleration, applied = (rows[first * joints :][:joints] for first in range(4))
     start = JointState(position, velocity, acceleration, [0.0 * number for number in position])
     controls = len(constants.actuators)

@@ -27,17 +27,17 @@ Compute = Callable[[Any, list[jax.Array]], Iterable[Any]]
 
 
 def episode_kernel(
-    name: str, compute: Compute, known: Hashable, outputs: int, interpret: bool
+    name: str, compute: Compute, constants: Hashable, outputs: int, interpret: bool
 ) -> Callable[[jax.Array], jax.Array]:
     """Wrap a function of one episode as a GPU kernel with one thread per episode, 32 threads per program.
 
-    Calls within one program with the same ``compute``, ``known`` and batch size share one kernel, compiled once.
+    Calls within one program with the same ``compute``, ``constants`` and batch size share one kernel, compiled once.
 
     Args:
         name: Name of the kernel.
-        compute: Function from ``known`` and an episode's inputs to its outputs; scalars are [32] float32, one per thread. It is
-            traced once for all batch sizes.
-        known: Constants of the kernel.
+        compute: Function from ``constants`` and an episode's inputs to its outputs; scalars are [32] float32, one per thread.
+            It is traced once for all batch sizes.
+        constants: Constants of the kernel.
         outputs: Number of outputs.
         interpret: Run the kernel without a GPU, slowly.
 
@@ -51,7 +51,7 @@ def episode_kernel(
         programs = pl.cdiv(batch, WARP_SIZE)
         # Threads beyond the last episode repeat it: zeros might be invalid inputs.
         inputs = jnp.pad(inputs, ((0, programs * WARP_SIZE - batch), (0, 0)), mode="edge")
-        launch = _traced(name, compute, known, outputs, interpret, inputs.T.shape, jax.sharding.get_abstract_mesh())
+        launch = _trace_kernel(name, compute, constants, outputs, interpret, inputs.T.shape, jax.sharding.get_abstract_mesh())
         results, _ = launch(inputs.T)
         return results.T[:batch]
 
@@ -65,8 +65,8 @@ def episode_kernel(
 
 
 @functools.lru_cache(maxsize=16)
-def _traced(
-    name: str, compute: Compute, known: Hashable, outputs: int, interpret: bool, shape: tuple[int, int], mesh: Any
+def _trace_kernel(
+    name: str, compute: Compute, constants: Hashable, outputs: int, interpret: bool, shape: tuple[int, int], mesh: Any
 ) -> Callable[[jax.Array], list[jax.Array]]:
     """Trace the kernel for inputs of a ``shape`` [I, 32 * programs]; a trace is reused only within its ``mesh``.
 
@@ -75,7 +75,7 @@ def _traced(
     del mesh
     programs = shape[1] // WARP_SIZE
     launch = kernel_call(
-        functools.partial(_kernel, compute=compute, known=known, interpret=interpret),
+        functools.partial(_kernel, compute=compute, constants=constants, interpret=interpret),
         grid=(programs,),
         out_shape=[
             jax.ShapeDtypeStruct((outputs, programs * WARP_SIZE), jnp.float32),
@@ -88,11 +88,11 @@ def _traced(
     return jaxpr_as_fun(jax.make_jaxpr(launch)(jax.ShapeDtypeStruct(shape, jnp.float32)))
 
 
-def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, known: Hashable, interpret: bool) -> None:
+def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, constants: Hashable, interpret: bool) -> None:
     program = pl.program_id(0)
     own = pl.ds(program * WARP_SIZE, WARP_SIZE)
     rows = [inputs[row, own] for row in range(inputs.shape[0])] if interpret else load_rows(inputs)
-    computed = jax.jit(compute, static_argnums=0)(known, rows)
+    computed = jax.jit(compute, static_argnums=0)(constants, rows)
     numbers = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), (WARP_SIZE,)) for number in computed]
     if interpret:
         for row, number in enumerate(numbers):

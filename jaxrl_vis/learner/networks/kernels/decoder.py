@@ -28,7 +28,7 @@ from jax.experimental.pallas import triton as plgpu
 
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.kernels.passes import (
-    LEAST_ROWS,
+    MIN_ROWS,
     before,
     dispatch,
     dot,
@@ -36,12 +36,12 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     rectified,
     rows,
     tiles_of_program,
-    whole,
+    whole_block,
 )
 from jaxrl_vis.learner.networks.kernels.patches import divisor, padded_channels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
-_MOST_CHANNELS = 4  # with more, the weights' gradients do not fit into registers
+_MAX_CHANNELS = 4  # with more, the weights' gradients do not fit into registers
 # Cells in a tile, maximum number of tiles per program, and compiler parameters.
 _CELLS, _TILES, _PARAMS = 64, 32, plgpu.CompilerParams(num_warps=4, num_stages=1)
 
@@ -67,7 +67,7 @@ class Weights(NamedTuple):
 def supports(channels: int, cell_features: int, quarter_features: int) -> bool:
     """Return True if the kernel supports decoders of images with these channels, and layers of these sizes."""
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in (cell_features, 4 * quarter_features))
-    return channels <= _MOST_CHANNELS and powers
+    return channels <= _MAX_CHANNELS and powers
 
 
 def make_weights(bias_in: jax.Array, finer: dict[str, jax.Array], finest: dict[str, jax.Array]) -> Weights:
@@ -114,7 +114,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
 
     def add_rows(values):
         """As in `kernels.passes`."""
-        return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
+        return dot(jnp.ones((MIN_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(number, carry):
         sums, squares = carry
@@ -135,18 +135,18 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
         )
         return sums, squares
 
-    zeros = [jnp.zeros(value.shape if value.ndim > 1 else (LEAST_ROWS, value.shape[0]), jnp.float32) for value in weights]
+    zeros = [jnp.zeros(value.shape if value.ndim > 1 else (MIN_ROWS, value.shape[0]), jnp.float32) for value in weights]
     start = Weights(*zeros), jnp.zeros(weights.bias_2.shape, jnp.float32)
     sums, squares = jax.lax.fori_loop(0, cells_ref.shape[0] // tile, one_tile, start)
     first = 0
     for like, value in zip((*weights, weights.bias_2), (*sums, squares), strict=True):
         if value.shape != like.shape:  # sixteen copies of the same sum
-            value = jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS)
+            value = jnp.sum(value, axis=0) * (1.0 / MIN_ROWS)
         sums_ref[pl.ds(first, like.size)] = value.reshape(-1)
         first += like.size
 
 
-def _on_gpu(
+def _squared_error_on_gpu(
     cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array, Weights]:
     """Compute the scaled sum of squared errors, and its gradients with respect to cells and weights."""
@@ -163,7 +163,7 @@ def _on_gpu(
             jax.ShapeDtypeStruct((programs, total), jnp.float32),
         ),
         grid=(programs,),
-        in_specs=[rows(block, features), rows(block, target.shape[1]), *map(whole, cast)],
+        in_specs=[rows(block, features), rows(block, target.shape[1]), *map(whole_block, cast)],
         out_specs=(rows(block, features), pl.BlockSpec((None, total), lambda program: (program, 0))),
         compiler_params=_PARAMS,
         interpret=interpret,
@@ -175,26 +175,26 @@ def _on_gpu(
     return scale * jnp.sum(squares), gradient, weight_gradients
 
 
-def _plainly(cells: jax.Array, target: jax.Array, weights: Weights, scale: float) -> jax.Array:
+def _plain_squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: float) -> jax.Array:
     pixels = _forward(cells, _cast(weights, cells.dtype))[2]
     return scale * jnp.sum(jnp.square(pixels - target[: cells.shape[0]].astype(jnp.float32)))
 
 
-def _plainly_with_gradients(
+def _plain_squared_error_and_gradients(
     cells: jax.Array, target: jax.Array, weights: Weights, scale: float
 ) -> tuple[jax.Array, jax.Array, Weights]:
-    error, gradients = jax.value_and_grad(_plainly, (0, 2))(cells, target, weights, scale)
+    error, gradients = jax.value_and_grad(_plain_squared_error, (0, 2))(cells, target, weights, scale)
     return error, *gradients
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
 def _squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool) -> jax.Array:
-    return _plainly(cells, target, weights, scale)
+    return _plain_squared_error(cells, target, weights, scale)
 
 
 def _squared_error_forward(cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool):
-    on_gpu = functools.partial(_on_gpu, scale=scale, interpret=interpret)
-    plainly = functools.partial(_plainly_with_gradients, scale=scale)
+    on_gpu = functools.partial(_squared_error_on_gpu, scale=scale, interpret=interpret)
+    plainly = functools.partial(_plain_squared_error_and_gradients, scale=scale)
     error, *gradients = dispatch(on_gpu, plainly, cells, target, weights, interpret=interpret)
     return error, (gradients, target)
 
@@ -221,8 +221,8 @@ def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: 
     Raises:
         ValueError: M is not a multiple of 16.
     """
-    if cells.shape[0] % LEAST_ROWS:
-        raise ValueError(f"{cells.shape[0]} cells are not a multiple of {LEAST_ROWS}")
+    if cells.shape[0] % MIN_ROWS:
+        raise ValueError(f"{cells.shape[0]} cells are not a multiple of {MIN_ROWS}")
     if forward_mode.are_wanted():
-        return _plainly(cells, target, weights, scale)
+        return _plain_squared_error(cells, target, weights, scale)
     return _squared_error(cells, target, weights, scale, interpret)

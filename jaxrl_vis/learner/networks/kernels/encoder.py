@@ -29,17 +29,17 @@ import jax.numpy as jnp
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.kernels.jvp import apply_forwards
 from jaxrl_vis.learner.networks.kernels.passes import TILE, Weights, apply, dispatch, is_available
-from jaxrl_vis.learner.networks.kernels.patches import LEVELS, padded_channels, prepare_on_gpu, prepare_plainly
+from jaxrl_vis.learner.networks.kernels.patches import LEVELS, padded_channels, prepare_on_gpu, prepare_plain
 
 __all__ = ["LEVELS", "encode", "is_available", "make_weights", "prepare", "supports"]
 
-_MOST_CHANNELS = 16
+_MAX_CHANNELS = 16
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
     """Return True if the kernel supports encoders with these output channels, and images [C, H, W] of this shape."""
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
-    return len(filters) >= LEVELS and powers and shape[0] <= _MOST_CHANNELS
+    return len(filters) >= LEVELS and powers and shape[0] <= _MAX_CHANNELS
 
 
 def make_weights(params: dict[str, Any], channels: int) -> Weights:
@@ -85,7 +85,7 @@ def prepare(
     """
     settings = {"levels": levels, "limit": limit, "dtype": dtype}
     on_gpu = functools.partial(prepare_on_gpu, **settings, interpret=interpret)
-    return dispatch(on_gpu, functools.partial(prepare_plainly, **settings), images, mean, scale, shift, interpret=interpret)
+    return dispatch(on_gpu, functools.partial(prepare_plain, **settings), images, mean, scale, shift, interpret=interpret)
 
 
 # -- Images to features

@@ -16,7 +16,7 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     TILE,
     Weights,
     apply,
-    apply_plainly,
+    apply_plain,
     as_quarters,
     before,
     cast_kernels,
@@ -28,7 +28,7 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     rows,
     tile_quarters,
     tile_rows,
-    whole,
+    whole_block,
 )
 from jaxrl_vis.learner.networks.kernels.patches import divisor
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
@@ -36,20 +36,20 @@ from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 def _tangent_kernel(x_ref, *refs):
     inputs, (out_ref, tangent_ref) = refs[:-2], refs[-2:]
-    weights, along = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
+    weights, tangent_weights = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
 
     def one_tile(tile, _):
         values, tangents = x_ref[tile_quarters(tile), :], None
-        for level, parameters in enumerate(zip(*weights, *along, strict=True)):
+        for level, parameters in enumerate(zip(*weights, *tangent_weights, strict=True)):
             tangents = None if tangents is None else joined(tangents, level)
-            values, tangents = _layer_along(joined(values, level), tangents, *parameters)
+            values, tangents = _layer_jvp(joined(values, level), tangents, *parameters)
         assert tangents is not None  # there is a layer
         out_ref[tile_rows(tile), :], tangent_ref[tile_rows(tile), :] = values, tangents
 
     jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
 
 
-def _layer_along(
+def _layer_jvp(
     values: jax.Array,
     tangents: jax.Array | None,
     kernel: jax.Array,
@@ -74,25 +74,25 @@ def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int,
 def _apply_along(first: int, count: int, interpret: bool, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     patches, weights = primals
     place = {"first": first, "count": count}
-    on_gpu = functools.partial(_along_on_gpu, **place, interpret=interpret)
-    plainly = functools.partial(_along_plainly, **place)
+    on_gpu = functools.partial(_gpu_jvp, **place, interpret=interpret)
+    plainly = functools.partial(_plain_jvp, **place)
     return dispatch(on_gpu, plainly, patches, weights, tangents[1], interpret=interpret)
 
 
-def _along_on_gpu(
-    patches: jax.Array, weights: Weights, along: Weights, first: int, count: int, interpret: bool = False
+def _gpu_jvp(
+    patches: jax.Array, weights: Weights, tangent_weights: Weights, first: int, count: int, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array]:
     """Return the result of `apply` for patches, and its tangent along a direction of the weights, [count, F] each."""
     outputs = weights.biases[-1].shape[0]
     block = TILE * divisor(math.gcd(first, count) // TILE, FORWARD_TILES)
     data, data_spec = as_quarters(patches, first, block)
-    cast = jax.tree.leaves([cast_kernels(tree, patches.dtype) for tree in (weights, along)])
+    cast = jax.tree.leaves([cast_kernels(tree, patches.dtype) for tree in (weights, tangent_weights)])
     out = jax.ShapeDtypeStruct((count, outputs), patches.dtype)
     return kernel_call(
         _tangent_kernel,
         out_shape=(out, out),
         grid=(count // block,),
-        in_specs=[data_spec, *map(whole, cast)],
+        in_specs=[data_spec, *map(whole_block, cast)],
         out_specs=(rows(block, outputs), rows(block, outputs)),
         compiler_params=FORWARD,
         interpret=interpret,
@@ -100,5 +100,7 @@ def _along_on_gpu(
     )(data, *cast)
 
 
-def _along_plainly(patches: jax.Array, weights: Weights, along: Weights, first: int, count: int) -> tuple[jax.Array, jax.Array]:
-    return jax.jvp(lambda weights: apply_plainly(patches, weights, first, count), (weights,), (along,))
+def _plain_jvp(
+    patches: jax.Array, weights: Weights, tangent_weights: Weights, first: int, count: int
+) -> tuple[jax.Array, jax.Array]:
+    return jax.jvp(lambda weights: apply_plain(patches, weights, first, count), (weights,), (tangent_weights,))

@@ -17,7 +17,7 @@ from jaxrl_vis.learner.networks.kernels.patches import LEVELS, divisor, prepare_
 from jaxrl_vis_envs.compiling.compilation import accelerator, dispatch_by_platform, tracing_for, use_gpu_kernels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
-LEAST_ROWS = 16
+MIN_ROWS = 16
 """Minimum number of rows of a product in a kernel."""
 TILE = 16
 """Patches in a tile."""
@@ -25,8 +25,8 @@ TILE = 16
 FORWARD_TILES, FORWARD = 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
 _BACKWARD_TILES, _BACKWARD = 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
 # Maximum number of sums that fit into the registers of four warps; more need eight.
-_MOST_SUMS, _BACKWARD_WITH_MORE = 16_384, plgpu.CompilerParams(num_warps=8, num_stages=1)
-_LEAST_PROGRAMS = 256  # about two for each of a large GPU's processors
+_MAX_SUMS, _BACKWARD_WITH_MORE = 16_384, plgpu.CompilerParams(num_warps=8, num_stages=1)
+_MIN_PROGRAMS = 256  # about two for each of a large GPU's processors
 
 
 class Weights(NamedTuple):
@@ -60,7 +60,7 @@ def probe() -> None:
 def probe_program() -> Any:
     """Trace small instances of all three kernels in one program (`jax.stages.Traced`)."""
     shape, levels = (4, 16, 16), LEVELS + 1
-    images, of_pixels = jnp.zeros((LEAST_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
+    images, of_pixels = jnp.zeros((MIN_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
     sizes = (64, 64), (64, 16), (64, 16)
     weights = Weights(tuple(map(jnp.zeros, sizes)), tuple(jnp.zeros(columns) for _, columns in sizes))
 
@@ -68,7 +68,7 @@ def probe_program() -> Any:
         patches = prepare_on_gpu(images, mean, scale, None, levels, 5.0, jnp.bfloat16)
         patches = patches.reshape(-1, patches.shape[-1])
         out = _apply_on_gpu(patches, weights, 0, patches.shape[0])
-        return _backward_on_gpu(patches, weights, out, out, 0, patches.shape[0])
+        return _gpu_backward(patches, weights, out, out, 0, patches.shape[0])
 
     return jax.jit(all_three).trace(images, of_pixels, of_pixels, weights)
 
@@ -77,7 +77,7 @@ def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
     """Call the kernel if the program is compiled for a GPU that runs it, else its equivalent in plain JAX."""
     if interpret:
         return on_gpu(*arguments)
-    return dispatch_by_platform(lambda *given: (on_gpu if use_gpu_kernels(probe) else plain)(*given), *arguments)
+    return dispatch_by_platform(lambda *args: (on_gpu if use_gpu_kernels(probe) else plain)(*args), *arguments)
 
 
 # -- Layers
@@ -149,7 +149,7 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
 
     def add_rows(values):
         """Sum over rows, repeated in every row of the result: as a matrix product, this takes half the time of a reduction."""
-        return dot(jnp.ones((LEAST_ROWS, values.shape[0]), values.dtype), values)
+        return dot(jnp.ones((MIN_ROWS, values.shape[0]), values.dtype), values)
 
     def one_tile(tile, sums):
         values = [x_ref[tile_quarters(tile), :]]
@@ -165,16 +165,16 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
 
     start = Weights(
         tuple(jnp.zeros(kernel.shape, jnp.float32) for kernel in weights.kernels),
-        tuple(jnp.zeros((LEAST_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
+        tuple(jnp.zeros((MIN_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
     )
     sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, start), 0
     # Sums of biases are sixteen copies of the same row.
-    for value in (*sums.kernels, *(jnp.sum(value, axis=0) * (1.0 / LEAST_ROWS) for value in sums.biases)):
+    for value in (*sums.kernels, *(jnp.sum(value, axis=0) * (1.0 / MIN_ROWS) for value in sums.biases)):
         sums_ref[pl.ds(first, value.size)] = value.reshape(-1)
         first += value.size
 
 
-def whole(array: jax.Array) -> pl.BlockSpec:
+def whole_block(array: jax.Array) -> pl.BlockSpec:
     """Return a block that gives every program the whole array."""
     return pl.BlockSpec(array.shape, lambda program: (0,) * array.ndim)
 
@@ -192,10 +192,10 @@ def tiles_of_program(tiles: int, total: int, limit: int) -> int:
         total: Number of tiles of all programs.
         limit: Maximum of the result.
     """
-    most = divisor(tiles, limit)
-    while most > 1 and total < most * _LEAST_PROGRAMS:
-        most //= 2
-    return most
+    block = divisor(tiles, limit)
+    while block > 1 and total < block * _MIN_PROGRAMS:
+        block //= 2
+    return block
 
 
 def cast_kernels(weights: Weights, dtype: Any) -> Weights:
@@ -217,7 +217,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
     """
     place = {"first": first, "count": count}
     on_gpu = functools.partial(_apply_on_gpu, **place, interpret=interpret)
-    return dispatch(on_gpu, functools.partial(apply_plainly, **place), patches, weights, interpret=interpret)
+    return dispatch(on_gpu, functools.partial(apply_plain, **place), patches, weights, interpret=interpret)
 
 
 def as_quarters(patches: jax.Array, first: int, block: int) -> tuple[jax.Array, pl.BlockSpec]:
@@ -235,7 +235,7 @@ def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, 
         _forward_kernel,
         out_shape=jax.ShapeDtypeStruct((count, outputs), patches.dtype),
         grid=(count // block,),
-        in_specs=[data_spec, *map(whole, cast)],
+        in_specs=[data_spec, *map(whole_block, cast)],
         out_specs=rows(block, outputs),
         compiler_params=FORWARD,
         interpret=interpret,
@@ -243,7 +243,7 @@ def _apply_on_gpu(patches: jax.Array, weights: Weights, first: int, count: int, 
     )(data, *cast)
 
 
-def apply_plainly(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
+def apply_plain(patches: jax.Array, weights: Weights, first: int, count: int) -> jax.Array:
     """Compute `apply` in plain JAX."""
     chosen = patches[first : first + count].reshape(-1, patches.shape[1] // 4)
     return _layers(chosen, cast_kernels(weights, patches.dtype))[-1]
@@ -257,12 +257,12 @@ def _apply_forward(patches: jax.Array, weights: Weights, first: int, count: int,
 def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gradient: jax.Array):
     patches, weights, out = residuals
     place = {"first": first, "count": count}
-    on_gpu = functools.partial(_backward_on_gpu, **place, interpret=interpret)
-    plainly = functools.partial(_backward_plainly, **place)
+    on_gpu = functools.partial(_gpu_backward, **place, interpret=interpret)
+    plainly = functools.partial(_plain_backward, **place)
     return jnp.zeros_like(patches), dispatch(on_gpu, plainly, patches, weights, out, gradient, interpret=interpret)
 
 
-def _backward_on_gpu(
+def _gpu_backward(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int, interpret: bool = False
 ) -> Weights:
     """Compute the gradients of the weights, float32."""
@@ -277,9 +277,9 @@ def _backward_on_gpu(
         # All weights in one row, so that one reduction adds up the programs.
         out_shape=jax.ShapeDtypeStruct((programs, total), jnp.float32),
         grid=(programs,),
-        in_specs=[data_spec, rows(block, outputs), rows(block, outputs), *map(whole, cast)],
+        in_specs=[data_spec, rows(block, outputs), rows(block, outputs), *map(whole_block, cast)],
         out_specs=pl.BlockSpec((None, total), lambda program: (program, 0)),
-        compiler_params=_BACKWARD if total <= _MOST_SUMS else _BACKWARD_WITH_MORE,
+        compiler_params=_BACKWARD if total <= _MAX_SUMS else _BACKWARD_WITH_MORE,
         interpret=interpret,
         name="encode_patches_backward",
     )(data, out, gradient, *cast)
@@ -288,10 +288,10 @@ def _backward_on_gpu(
     return jax.tree.unflatten(jax.tree.structure(weights), sums)
 
 
-def _backward_plainly(
+def _plain_backward(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int
 ) -> Weights:
-    return jax.vjp(lambda weights: apply_plainly(patches, weights, first, count), weights)[1](gradient)[0]
+    return jax.vjp(lambda weights: apply_plain(patches, weights, first, count), weights)[1](gradient)[0]
 
 
 apply.defvjp(_apply_forward, _apply_backward)

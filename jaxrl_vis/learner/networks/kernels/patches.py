@@ -94,15 +94,15 @@ def prepare_on_gpu(
     patches, pixels = rows * columns * of_block, math.prod(shape)
     moves = () if shift is None else (shift,)
 
-    def of_images(numbers: int) -> pl.BlockSpec:
+    def image_block(numbers: int) -> pl.BlockSpec:
         return pl.BlockSpec((together, numbers), lambda _, image: (image, 0))
 
-    whole = pl.BlockSpec((pixels,), lambda patch, image: (0,))
+    all_pixels = pl.BlockSpec((pixels,), lambda patch, image: (0,))
     return kernel_call(
         functools.partial(_prepare_kernel, shape=tuple(shape), levels=levels, limit=limit),
         out_shape=jax.ShapeDtypeStruct((batch, patches, size), dtype),
         grid=(patches // tile, batch // together),
-        in_specs=[of_images(pixels), whole, whole, *(of_images(2) for _ in moves)],
+        in_specs=[image_block(pixels), all_pixels, all_pixels, *(image_block(2) for _ in moves)],
         out_specs=pl.BlockSpec((together, tile, size), lambda patch, image: (image, patch, 0)),
         compiler_params=_PREPARE,
         interpret=interpret,
@@ -110,7 +110,7 @@ def prepare_on_gpu(
     )(images.reshape(batch, pixels), mean.reshape(pixels), scale.reshape(pixels), *moves)
 
 
-def prepare_plainly(
+def prepare_plain(
     images: jax.Array, mean: jax.Array, scale: jax.Array, shift: jax.Array | None, levels: int, limit: float, dtype: Any
 ) -> jax.Array:
     """Compute `kernels.encoder.prepare` in plain JAX."""

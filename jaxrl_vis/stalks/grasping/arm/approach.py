@@ -116,10 +116,10 @@ def best_approach(
     return Approach(int(stop), (1, -1)[int(column)], float(rooms[stop, column]))
 
 
-def _to_box(aside: np.ndarray, ahead: np.ndarray, half_width: float, back: float, front: float) -> np.ndarray:
+def _to_box(offset: np.ndarray, ahead: np.ndarray, half_width: float, back: float, front: float) -> np.ndarray:
     """Return signed distances (m) of points from a rectangle, negative inside.
 
-    Points are ``aside`` of the rectangle's centre line and ``ahead`` along it, on which it extends from ``back`` to ``front``.
+    Points are ``offset`` of the rectangle's centre line and ``ahead`` along it, on which it extends from ``back`` to ``front``.
     """
-    outside = np.stack([aside - half_width, np.maximum(back - ahead, ahead - front)])
+    outside = np.stack([offset - half_width, np.maximum(back - ahead, ahead - front)])
     return np.linalg.norm(np.maximum(outside, 0.0), axis=0) + np.minimum(outside.max(axis=0), 0.0)

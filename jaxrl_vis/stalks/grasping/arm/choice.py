@@ -85,8 +85,10 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
 def _approach_at(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndarray, height: float) -> approach.Approach:
     """Return the best approach to one of the points at a height, with all others as obstacles at this height."""
     others = [other for other in points if other is not point]
-    beside = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
-    return approach.best_approach(stops, point.at_height(height), beside[:, :2], stalk_radii(others, height), _ENOUGH_ROOM)
+    other_points = np.array([other.at_height(height) for other in others]).reshape(-1, 3)
+    return approach.best_approach(
+        stops, point.at_height(height), other_points[:, :2], stalk_radii(others, height), _ENOUGH_ROOM
+    )
 
 
 def stalk_radii(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:

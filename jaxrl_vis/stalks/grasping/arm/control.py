@@ -72,10 +72,10 @@ class Drive(NamedTuple):
     error: jax.Array
 
 
-def smooth(share: Any) -> Any:
-    """Return the fraction of a minimum-jerk movement done after the fraction ``share`` of its time, clipped to 0 to 1."""
-    share = jnp.clip(share, 0.0, 1.0)
-    return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+def smooth(fraction: Any) -> Any:
+    """Return the fraction of a minimum-jerk movement done after a ``fraction`` of its time, clipped to 0 to 1."""
+    fraction = jnp.clip(fraction, 0.0, 1.0)
+    return fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)
 
 
 def better_side(target: Any, numeric: Any = jnp) -> Any:
@@ -88,7 +88,7 @@ def better_side(target: Any, numeric: Any = jnp) -> Any:
     return numeric.where(target[..., 0] > stalk_arm.SHOULDER[0], 1.0, -1.0)
 
 
-def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> jax.Array:
+def plan_movement(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> jax.Array:
     """Return the planned position [3] of the grip at a time, on its path from ``start`` to ``target``, m.
 
     Args:
@@ -103,8 +103,8 @@ def planned(target: jax.Array, start: jax.Array, time: Any, timing: Timing) -> j
     bearings = [jnp.arctan2(-(place - shoulder)[0], (place - shoulder)[1]) for place in (start[:2], target[:2])]
     radii = [jnp.linalg.norm(place - shoulder) for place in (start[:2], target[:2])]
     bearing = bearings[0] + turned * (bearings[1] - bearings[0])
-    folded = radii[0] + turned * (FOLDED - radii[0])
-    radius = folded + extended * (radii[1] - FOLDED)
+    fold_replay = radii[0] + turned * (FOLDED - radii[0])
+    radius = fold_replay + extended * (radii[1] - FOLDED)
     height = start[2] + turned * (target[2] - start[2])
     return jnp.stack([shoulder[0] - radius * jnp.sin(bearing), shoulder[1] + radius * jnp.cos(bearing), height])
 
@@ -114,29 +114,29 @@ def start_drive(joints: jax.Array) -> Drive:
     return Drive(jnp.zeros(3, jnp.float32), joints[1:3], jnp.zeros(2, jnp.float32))
 
 
-def drive(state: Drive, joints: jax.Array, velocity: jax.Array, wanted: jax.Array, gains: Gains) -> tuple[Drive, jax.Array]:
+def drive(state: Drive, joints: jax.Array, velocity: jax.Array, targets: jax.Array, gains: Gains) -> tuple[Drive, jax.Array]:
     """Advance the controllers by one period.
 
     Args:
         state: State of the controllers.
         joints: [3], positions of slide, shoulder and elbow, m and rad.
         velocity: [3], their velocities, m/s and rad/s.
-        wanted: [3], their setpoints, m and rad.
+        targets: [3], their setpoints, m and rad.
         gains: Gains of the controllers.
 
     Returns:
         The new state, and the generalised forces [3] on the joints, N and N m.
     """
     period = 1.0 / RATE
-    error = wanted - joints
+    error = targets - joints
     integral = jnp.clip(state.integral + period * error, -0.05, 0.05)
     parts = [jnp.asarray(part, jnp.float32) for part in gains[:5]]
-    proportional, integrating, derivative, spring, most = parts
+    proportional, integrating, derivative, spring, max_torque = parts
     slope = (error[1:] - state.error) / period
-    wish = jnp.clip(proportional * error[1:] + integrating * integral[1:] + derivative * slope, -most, most)
+    wish = jnp.clip(proportional * error[1:] + integrating * integral[1:] + derivative * slope, -max_torque, max_torque)
     # Series elastic actuators: torque is the deflection of the spring between motor and joint.
     motor = state.motor + period * gains.motor * (joints[1:] + wish / spring - state.motor)
-    torque = jnp.clip(spring * (motor - joints[1:]), -most, most)
+    torque = jnp.clip(spring * (motor - joints[1:]), -max_torque, max_torque)
     speed = gains.slide_proportional * error[0] + gains.slide_integral * integral[0]
     force = gains.slide_drive * (jnp.clip(speed, -gains.slide_speed, gains.slide_speed) - velocity[0])
     return Drive(integral, motor, error[1:]), jnp.concatenate([force[None], torque])

@@ -81,7 +81,7 @@ def reach_by_policy(
     result = jax.tree.map(lambda part: np.asarray(part)[:count], episode(*shapes[:1], goals, key[fill], winds))
     steps = round(Timing().reach / policy.env.control_period)
     error = np.linalg.norm(result["taken"][:, steps - 1] - (targets - stands.origin), axis=-1)
-    mine = can[:, None] & stands.present
+    mine = can[:, None] & stands.is_present
     return ReachResult(
         held=result["held"] & mine,
         path=result["path"] + stands.origin[:, None],
@@ -111,7 +111,7 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
 
     def draw(shape: Shape, target: jax.Array) -> jax.Array:
         model = bending.fit(arms.model, arms.layout, shape)
-        data = bending.placed(arms.rest, arms.layout, shape)
+        data = bending.place_stands(arms.rest, arms.layout, shape)
         joints = stalk_arm.joints_at(target, 1.0)
         return image(model, mjx_model.kinematics(model, data.replace(qpos=data.qpos.at[: stalk_arm.ARM_JOINTS].set(joints))))
 
@@ -125,8 +125,8 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
             wanted = within_reach(place + env.config.action_scale * action)
             is_closing = reaching.data.time > timing.reach - 0.5 / control.RATE
 
-            def one(reaching: Reaching, share: jax.Array) -> tuple[Reaching, None]:
-                return period(arms, model, scene, reaching, place + share * (wanted - place), is_closing, gains), None
+            def one(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:
+                return period(arms, model, scene, reaching, place + fraction * (wanted - place), is_closing, gains), None
 
             reaching, _ = jax.lax.scan(one, reaching, jnp.arange(1, substeps + 1) / substeps)
             reaching = reaching._replace(data=mjx_model.kinematics(model, reaching.data))

@@ -34,7 +34,7 @@ _POINTS_A_CALL = 5
 INTERVAL = _STEPS_A_POINT / control.RATE
 """Time between two points of a path, s."""
 LOOK = _POINTS_A_CALL * INTERVAL
-"""Time between two calls of ``look``, s."""
+"""Time between two calls of ``observer``, s."""
 _MIN_ARMS = 8  # minimum batch size of a compiled program
 _TOUCH = 0.0015  # m, a jaw nearer to a stalk presses on it: soft contacts give way by some tenths of a millimetre
 
@@ -67,7 +67,7 @@ class ReachResult:
 
 
 class ArmView(NamedTuple):
-    """True state of B reaches at one time, from which a ``look`` function may simulate detections.
+    """True state of B reaches at one time, from which a ``observer`` function may simulate detections.
 
     Attributes:
         time: Time since the start, s.
@@ -147,7 +147,7 @@ def reach(
     timing: Timing | None = None,
     gains: Gains | None = None,
     sides: np.ndarray | None = None,
-    look: Callable[[ArmView], np.ndarray] | None = None,
+    observer: Callable[[ArmView], np.ndarray] | None = None,
 ) -> ReachResult:
     """Simulate reaches: each arm moves to its target and closes its jaws there.
 
@@ -161,8 +161,8 @@ def reach(
         gains: Gains of the controllers; None for the default.
         sides: [B], 1 or -1, solution of the inverse kinematics of each arm (see `approach.room`); None for
             `control.better_side`.
-        look: Function called every `LOOK` s during the reach and while the jaws close, which returns new targets [B, 3], m in
-            the plot's frame, with NaN to keep the old one; None for an open loop.
+        observer: Function called every `LOOK` s during the reach and while the jaws close, which returns new targets [B, 3],
+            m in the plot's frame, with NaN to keep the old one; None for an open loop.
 
     Returns:
         Results of the reaches. Arms whose target is out of reach are not sent: they hold and touch nothing.
@@ -197,8 +197,8 @@ def reach(
     scene, reaching = start(shape, keys, winds, side[fill])
     parts, aimed_at = [], targets
     for call in range(_calls(timing.reach) + _calls(timing.close)):
-        if look is not None and call:
-            targets = _looked(look, stands, targets, can, call * LOOK, parts[-1])
+        if observer is not None and call:
+            targets = _observe_targets(observer, stands, targets, can, call * LOOK, parts[-1])
         if call < _calls(timing.reach):
             aimed_at = targets
         reaching, report = advance(scene, reaching, (targets - stands.origin)[fill])
@@ -206,7 +206,7 @@ def reach(
     paths = {name: np.concatenate([part[name] for part in parts], axis=1) for name in ("path", "taken", "poses")}
     closing = parts[_calls(timing.reach) - 1]
     error = np.linalg.norm(closing["taken"][:, -1] - (aimed_at - stands.origin), axis=-1)
-    mine = can[:, None] & stands.present
+    mine = can[:, None] & stands.is_present
     return ReachResult(
         held=parts[-1]["held"] & mine,
         path=paths["path"] + stands.origin[:, None],
@@ -219,12 +219,12 @@ def reach(
     )
 
 
-def _looked(
-    look: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
+def _observe_targets(
+    observer: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
     """Return the targets [B, 3] after another look, unchanged where it gives none or one that is out of reach."""
-    places = np.where(stands.present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
-    updated = np.asarray(look(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
+    places = np.where(stands.is_present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
+    updated = np.asarray(observer(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
     if updated.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
     there = np.all(np.isfinite(updated), axis=-1)
@@ -262,7 +262,7 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
 def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
     """Return the initial state of an arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
     model = bending.fit(arms.model, arms.layout, scene.shape)
-    data = bending.placed(arms.rest, arms.layout, scene.shape)
+    data = bending.place_stands(arms.rest, arms.layout, scene.shape)
     swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
     joints = stalk_arm.joints_at(jnp.asarray(home, jnp.float32), scene.side)
     data = mjx_model.kinematics(model, data.replace(qpos=(data.qpos + swayed).at[: stalk_arm.ARM_JOINTS].set(joints)))
@@ -283,13 +283,13 @@ def _advance(
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
         time = reaching.data.time
-        wanted = control.planned(target, reaching.start, time + 1.0 / control.RATE, timing)
+        wanted = control.plan_movement(target, reaching.start, time + 1.0 / control.RATE, timing)
         return period(arms, model, scene, reaching, wanted, time > timing.reach - 0.5 / control.RATE, gains), None
 
     def point(reaching: Reaching, _: None) -> tuple[Reaching, dict[str, jax.Array]]:
         reaching = jax.lax.scan(step, reaching, length=_STEPS_A_POINT)[0]
         data = reaching.data
-        path = control.planned(target, reaching.start, data.time, timing)
+        path = control.plan_movement(target, reaching.start, data.time, timing)
         return reaching, {"path": path, "taken": stalk_arm.grip_at(data.qpos[:3]), "poses": data.qpos}
 
     with jax.default_matmul_precision("highest"):
@@ -305,7 +305,7 @@ def _advance(
 
 
 def period(
-    arms: Arms, model: Any, scene: Scene, reaching: Reaching, wanted: jax.Array, is_closing: jax.Array, gains: Gains
+    arms: Arms, model: Any, scene: Scene, reaching: Reaching, targets: jax.Array, is_closing: jax.Array, gains: Gains
 ) -> Reaching:
     """Advance controllers and physics by one control period.
 
@@ -314,12 +314,14 @@ def period(
         model: Model with the stalks of the scene (`bending.fit`).
         scene: Constants of the reach.
         reaching: State of the arm.
-        wanted: [3], setpoint of the grip, m in the frame of the stand.
+        targets: [3], setpoint of the grip, m in the frame of the stand.
         is_closing: [] bool, whether the jaws close.
         gains: Gains of the controllers.
     """
     data = reaching.data
-    memory, forces = control.drive(reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(wanted, scene.side), gains)
+    memory, forces = control.drive(
+        reaching.drive, data.qpos[:3], data.qvel[:3], stalk_arm.joints_at(targets, scene.side), gains
+    )
     jaws = jnp.where(is_closing, gains.jaw_force, -gains.jaw_force) * jnp.ones(2, jnp.float32)
     wind = bending.wind_torque(model, arms.layout, scene.gusts, scene.shape.foot, data.time)
     none = jnp.zeros(model.nv - stalk_arm.JOINTS, jnp.float32)

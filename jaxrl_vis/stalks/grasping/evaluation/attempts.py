@@ -29,7 +29,15 @@ from jaxrl_vis.stalks.grasping.perception.perceive import Perception
 from jaxrl_vis.stalks.grasping.perception.stalk_segments import StalkSegments, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import Motion
 from jaxrl_vis_envs.plants import Plot
-from jaxrl_vis_envs.plants.stand import MAST_DISTANCE, STALKS, Stands, concatenated, stand_of_lines, stand_origin, stands_at
+from jaxrl_vis_envs.plants.stand import (
+    MAST_DISTANCE,
+    STALKS,
+    Stands,
+    concatenate_stands,
+    stand_of_lines,
+    stand_origin,
+    stands_at,
+)
 
 Loop = Literal["open", "again", "policy"]
 
@@ -87,27 +95,27 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
     low, high = driven_stretch(plot)
     masts, points = mast_positions(perception), perception.points
     chosen = choose_nearest(points, masts, POLICY_HEIGHTS) if for_policy else choose(points, masts)
-    targets = np.array([_from_stop(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
+    targets = np.array([_to_plot_frame(choice, scene, perception) for choice in chosen]).reshape(-1, 3)
     places = np.array([[stalk.at_height(target[2])[0][:2] for stalk in plot.measured] for target in targets])
     places = places.reshape(len(targets), len(plot.measured), 2)
     stalks = match(targets[:, :2], places, RADIUS)
     origins = np.array([stand_origin(pose.position[0]) for pose in poses])
-    standing = _standing(plot, origins, number)
+    standing = _true_stalks(plot, origins, number)
     known = {stalk.stalk for stalk in standing}
     scored = [
         place
         for place, (target, stalk) in enumerate(zip(targets, stalks))
         if (stalk in known if stalk >= 0 else low <= target[0] <= high)
     ]
-    off = np.array([_off(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
-    chords = {
+    off = np.array([_offset_from_stalk(targets[place], places[place], stalks[place]) for place in scored]).reshape(-1, 2)
+    segments = {
         stop: stalk_segments(perception.clouds[stop], scene.drive.stated, scene.mount, stop) for stop in range(len(poses))
     }
     again = [
-        off[index] + _offset_at_stop(chosen[place], points[place], perception, chords) for index, place in enumerate(scored)
+        off[index] + _offset_at_stop(chosen[place], points[place], perception, segments) for index, place in enumerate(scored)
     ]
     at = origins[[chosen[place].stop for place in scored], 0]
-    detected = [_detected_around(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
+    detected = [_detections_around(chosen[place], x, targets[place], scene, perception) for x, place in zip(at, scored)]
     return Plan(
         run=number,
         targets=targets[scored],
@@ -118,7 +126,7 @@ def plan(scene: Scene, perception: Perception, number: int, for_policy: bool = F
         again=np.array(again, float).reshape(-1, 2),
         stands=stands_at(plot, at, targets[scored], POLICY_STALKS if for_policy else STALKS),
         standing=standing,
-        detected=concatenated(detected) if for_policy and detected else None,
+        detected=concatenate_stands(detected) if for_policy and detected else None,
     )
 
 
@@ -127,7 +135,7 @@ def mast_positions(perception: Perception) -> np.ndarray:
     return np.array([motion(np.array([0.0, MAST_DISTANCE, 0.0])) for motion in perception.to_last]) * [1.0, 1.0, 0.0]
 
 
-def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
+def _to_plot_frame(choice: Choice, scene: Scene, perception: Perception, points: np.ndarray | None = None) -> np.ndarray:
     """Map the chosen point, or ``points`` [..., 3], to the plot's frame by the stitches and the true pose at the stop.
 
     Points are in the robot frame of the last pair, m. The result [..., 3] contains the errors of the stitches.
@@ -136,20 +144,22 @@ def _from_stop(choice: Choice, scene: Scene, perception: Perception, points: np.
     return scene.drive.poses[choice.stop].to_world(scene.mount.pose.to_camera(from_there))
 
 
-def _detected_around(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
+def _detections_around(choice: Choice, x: float, target: np.ndarray, scene: Scene, perception: Perception) -> Stands:
     """Return the detected stalks around an arm with its mast ``x`` m along the row, for a target [3] in the plot's frame."""
     height = float(choice.point[2])
     ends = np.array([point.at_height(np.array([height, height + _AROUND])) for point in perception.points])
-    ends = _from_stop(choice, scene, perception, ends)
+    ends = _to_plot_frame(choice, scene, perception, ends)
     return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], stalk_radii(perception.points, height), x, target, POLICY_STALKS)
 
 
-def _off(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
+def _offset_from_stalk(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
     """Return the horizontal offset [2] of a target from its stalk, m; NaN without one."""
     return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
 
 
-def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, chords: dict[int, StalkSegments]) -> np.ndarray:
+def _offset_at_stop(
+    choice: Choice, point: GraspPoint, perception: Perception, segments: dict[int, StalkSegments]
+) -> np.ndarray:
     """Return the horizontal offset [2] m between the stalk as detected by the pair at the stop alone and by all pairs.
 
     NaN if there is no stop or its pair does not show the stalk. Axes are those of the robot at the last pair, which differ
@@ -158,10 +168,10 @@ def _offset_at_stop(choice: Choice, point: GraspPoint, perception: Perception, c
     if choice.stop < 0:
         return np.full(2, np.nan)
     motion: Motion = perception.to_last[choice.stop]
-    middles_here = motion(chords[choice.stop].middle)
-    beside = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
-    near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(beside, axis=1) < _BESIDE)
-    return np.median(beside[near], axis=0) if near.sum() >= _MIN_SEGMENTS else np.full(2, np.nan)
+    middles_here = motion(segments[choice.stop].middle)
+    offsets = (middles_here - point.at_height(middles_here[:, 2]))[:, :2]
+    near = (np.abs(middles_here[:, 2] - choice.point[2]) < _AROUND) & (np.linalg.norm(offsets, axis=1) < _BESIDE)
+    return np.median(offsets[near], axis=0) if near.sum() >= _MIN_SEGMENTS else np.full(2, np.nan)
 
 
 def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
@@ -178,7 +188,7 @@ def from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray:
     return np.asarray(approach.reachable(masts[:, None], points[None]).any(axis=0))
 
 
-def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
+def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
     """Return the true stalks of the stretch, with their reachability and room at the preferred height."""
     low, high = driven_stretch(plot)
     middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)
@@ -189,12 +199,12 @@ def _standing(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, .
             continue
         others = np.arange(len(middles)) != index
         best = approach.best_approach(origins, middle, middles[others, :2], radii[others], enough=np.inf)
-        beside = np.linalg.norm(middles[others, :2] - middle[:2], axis=1)
-        standing.append(Standing(number, index, best.stop >= 0, best.room, float(beside.min(initial=np.inf))))
+        distances = np.linalg.norm(middles[others, :2] - middle[:2], axis=1)
+        standing.append(Standing(number, index, best.stop >= 0, best.room, float(distances.min(initial=np.inf))))
     return tuple(standing)
 
 
-def carry_out(
+def execute_plans(
     plans: Iterable[Plan], wind_mm: float, loop: Loop = "open", policy: Policy | None = None, seed: int = 0
 ) -> list[Attempt]:
     """Simulate an arm for each target of all runs, in batches.
@@ -217,15 +227,15 @@ def carry_out(
             np.concatenate([getattr(plan, name) for plan in block])
             for name in ("targets", "stalks", "errors", "sides", "refused", "again")
         )
-        stands = concatenated([plan.stands for plan in block])
+        stands = concatenate_stands([plan.stands for plan in block])
         keys = wind_keys(numbers, places, seed)
         if loop == "policy":
             detected = [plan.detected for plan in block if plan.detected is not None]
             assert policy is not None and len(detected) == len(block)
-            result = reach_by_policy(stands, concatenated(detected), targets, policy, keys, wind_mm)
+            result = reach_by_policy(stands, concatenate_stands(detected), targets, policy, keys, wind_mm)
         else:
             look = follow(stands, stalks, again) if loop == "again" else None
-            result = reach(stands, targets, keys, wind_mm, sides=sides, look=look)
+            result = reach(stands, targets, keys, wind_mm, sides=sides, observer=look)
         attempts += to_attempts(stands, result, numbers, stalks, errors, refused)
     return attempts
 
@@ -247,25 +257,25 @@ def to_attempts(
         runs, stalks, errors, refused: [B] each, see `Plan`.
     """
     attempts = []
-    for place in range(len(stands)):
-        sent = not refused[place]
-        others = (stands.stalk[place] != stalks[place]) & sent
+    for index in range(len(stands)):
+        sent = not refused[index]
+        others = (stands.stalk[index] != stalks[index]) & sent
         attempts.append(
             Attempt(
-                run=int(runs[place]),
-                stalk=int(stalks[place]) if stalks[place] >= 0 else None,
-                held=frozenset(stands.stalk[place][result.held[place] & sent].tolist()),
-                reachable=bool(result.reachable[place]),
-                refused=bool(refused[place]),
-                collided=bool((result.touched[place] & others).any()),
-                brushed=bool((result.brushed[place] & others).any()),
-                aim_error=float(errors[place]),
+                run=int(runs[index]),
+                stalk=int(stalks[index]) if stalks[index] >= 0 else None,
+                held=frozenset(stands.stalk[index][result.held[index] & sent].tolist()),
+                reachable=bool(result.reachable[index]),
+                refused=bool(refused[index]),
+                collided=bool((result.touched[index] & others).any()),
+                brushed=bool((result.brushed[index] & others).any()),
+                aim_error=float(errors[index]),
             )
         )
     return attempts
 
 
-def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[ArmView], np.ndarray]:
+def follow(stands: Stands, stalks: np.ndarray, redetected: np.ndarray) -> Callable[[ArmView], np.ndarray]:
     """Return a ``look`` function for `reach` that simulates detecting the targets [B, 3] again on the way.
 
     The pair at the stop does not move. It detects the stalk at its true position plus the error that the pair alone makes with
@@ -276,11 +286,11 @@ def follow(stands: Stands, stalks: np.ndarray, again: np.ndarray) -> Callable[[A
     Args:
         stands: True stalks around each arm.
         stalks: [B] int, index of the stalk that each arm reaches for; -1 for none.
-        again: [B, 2], see `Plan`.
+        redetected: [B, 2], see `Plan`.
     """
     known = (stands.stalk == stalks[:, None]) & (stalks >= 0)[:, None]
     slot = known.argmax(axis=1)
-    error = np.where(known.any(axis=1)[:, None], again, np.nan)
+    error = np.where(known.any(axis=1)[:, None], redetected, np.nan)
     places: list[np.ndarray] = []
 
     def look(sight: ArmView) -> np.ndarray:

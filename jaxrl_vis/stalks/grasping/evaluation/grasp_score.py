@@ -90,7 +90,7 @@ class Standing:
 
 
 @dataclasses.dataclass(frozen=True)
-class Share:
+class Proportion:
     """Proportion with its Wilson interval of 95 %; NaN if the total is 0.
 
     Attributes:
@@ -104,7 +104,7 @@ class Share:
     of: int
 
     @property
-    def share(self) -> float:
+    def value(self) -> float:
         """Proportion, 0 to 1."""
         return self.count / self.of if self.of else math.nan
 
@@ -117,7 +117,7 @@ class Share:
         if not self.of:
             return f"{self.name}: none"
         low, high = self.interval
-        return f"{self.name}: {self.share:.1%} ({self.count} of {self.of}; {low:.1%} to {high:.1%})"
+        return f"{self.name}: {self.value:.1%} ({self.count} of {self.of}; {low:.1%} to {high:.1%})"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,24 +142,24 @@ class Score:
         aim_errors: [A] float64, `Attempt.aim_error` of the attempts with a matched stalk, m.
     """
 
-    of_sent: Share
-    with_room: Share
-    crowded: Share
-    of_reachable: Share
-    of_all: Share
-    outcomes: tuple[Share, ...]
-    stages: tuple[Share, ...]
-    false_targets: Share
-    collisions: Share
-    brushes: Share
-    touches: Share
-    by_neighbour: tuple[Share, ...]
+    of_sent: Proportion
+    with_room: Proportion
+    crowded: Proportion
+    of_reachable: Proportion
+    of_all: Proportion
+    outcomes: tuple[Proportion, ...]
+    stages: tuple[Proportion, ...]
+    false_targets: Proportion
+    collisions: Proportion
+    brushes: Proportion
+    touches: Proportion
+    by_neighbour: tuple[Proportion, ...]
     thesis_ratio: float
     runs: int
     aim_errors: np.ndarray
 
     @property
-    def shares(self) -> tuple[Share, ...]:
+    def proportions(self) -> tuple[Proportion, ...]:
         """All proportions, in the order of a table's rows."""
         first = (self.of_sent, self.with_room, self.crowded, self.of_reachable, self.of_all)
         return (
@@ -174,24 +174,24 @@ class Score:
         )
 
 
-def wilson(count: int, of: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson interval of a proportion ``count / of``; (NaN, NaN) if ``of`` is 0.
+def wilson(count: int, total: int, z: float = 1.959964) -> tuple[float, float]:
+    """Return the Wilson interval of a proportion ``count / of``; (NaN, NaN) if ``total`` is 0.
 
     Args:
         count: Number of hits.
-        of: Total number.
+        total: Total number.
         z: Quantile of the standard normal distribution; the default gives 95 % coverage.
 
     Raises:
-        ValueError: ``count`` is not from 0 to ``of``.
+        ValueError: ``count`` is not from 0 to ``total``.
     """
-    if not 0 <= count <= of:
-        raise ValueError(f"a count must be from 0 to what it is of, got {count} of {of}")
-    if not of:
+    if not 0 <= count <= total:
+        raise ValueError(f"a count must be from 0 to what it is of, got {count} of {total}")
+    if not total:
         return math.nan, math.nan
-    share, square = count / of, z * z / of
-    middle = (share + square / 2) / (1 + square)
-    half = z / (1 + square) * math.sqrt(share * (1 - share) / of + square / (4 * of))
+    value, square = count / total, z * z / total
+    middle = (value + square / 2) / (1 + square)
+    half = z / (1 + square) * math.sqrt(value * (1 - value) / total + square / (4 * total))
     return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
@@ -247,24 +247,26 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
     reachable = [(stalk, stage) for stalk, stage in zip(stalks, stage_of) if stalk.reachable]
     sent = [attempt for attempt in attempts if attempt.sent]
 
-    def grasped(name: str, chosen: Sequence[str]) -> Share:
-        return Share(name, sum(stage == "grasped" for stage in chosen), len(chosen))
+    def grasped(name: str, subset: Sequence[str]) -> Proportion:
+        return Proportion(name, sum(stage == "grasped" for stage in subset), len(subset))
 
     outcomes = Counter(attempt.outcome for attempt in attempts)
     stages = Counter(stage for _, stage in reachable)
     ratio, runs = thesis_ratio(attempts)
     return Score(
-        of_sent=Share("attempts: exactly the target held", outcomes["success"], len(sent)),
+        of_sent=Proportion("attempts: exactly the target held", outcomes["success"], len(sent)),
         with_room=grasped("reachable stalks with room", [stage for stalk, stage in reachable if not stalk.crowded]),
         crowded=grasped("reachable stalks, crowded", [stage for stalk, stage in reachable if stalk.crowded]),
         of_reachable=grasped("all reachable stalks", [stage for _, stage in reachable]),
         of_all=grasped("all stalks", stage_of),
-        outcomes=tuple(Share(f"attempts: {name}", outcomes[name], len(attempts)) for name in OUTCOMES),
-        stages=tuple(Share(f"reachable stalks: {name}", stages[name], len(reachable)) for name in STAGES),
-        false_targets=Share("attempts: no stalk there", sum(attempt.stalk is None for attempt in attempts), len(attempts)),
-        collisions=Share("attempts: links touched another stalk", sum(attempt.collided for attempt in sent), len(sent)),
-        brushes=Share("attempts: jaws touched another stalk", sum(attempt.brushed for attempt in sent), len(sent)),
-        touches=Share("attempts: links or jaws did", sum(attempt.collided or attempt.brushed for attempt in sent), len(sent)),
+        outcomes=tuple(Proportion(f"attempts: {name}", outcomes[name], len(attempts)) for name in OUTCOMES),
+        stages=tuple(Proportion(f"reachable stalks: {name}", stages[name], len(reachable)) for name in STAGES),
+        false_targets=Proportion("attempts: no stalk there", sum(attempt.stalk is None for attempt in attempts), len(attempts)),
+        collisions=Proportion("attempts: links touched another stalk", sum(attempt.collided for attempt in sent), len(sent)),
+        brushes=Proportion("attempts: jaws touched another stalk", sum(attempt.brushed for attempt in sent), len(sent)),
+        touches=Proportion(
+            "attempts: links or jaws did", sum(attempt.collided or attempt.brushed for attempt in sent), len(sent)
+        ),
         by_neighbour=tuple(
             grasped(
                 _class_name(low, high),

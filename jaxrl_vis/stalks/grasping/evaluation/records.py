@@ -18,7 +18,7 @@ from jaxrl_vis.host.provenance import device_name
 from jaxrl_vis.host.worker_pool import Record, RecordFile, code_digest, evaluate_all
 from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.digests import value_digest
-from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, carry_out, plan
+from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, execute_plans, plan
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
 from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summary
 from jaxrl_vis.stalks.grasping.masks.loading import load_painter
@@ -133,8 +133,11 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
 
 def score_figures(score: Score) -> dict[str, Any]:
     """Return the thesis's ratio and all proportions of a score, as values for JSON."""
-    shares = {share.name: {"count": share.count, "of": share.of, "interval": share.interval} for share in score.shares}
-    return {"thesis_ratio": score.thesis_ratio, "shares": shares}
+    proportions = {
+        proportion.name: {"count": proportion.count, "of": proportion.of, "interval": proportion.interval}
+        for proportion in score.proportions
+    }
+    return {"thesis_ratio": score.thesis_ratio, "shares": proportions}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,7 +179,7 @@ def reach_all(table: RecordFile, numbers: Iterable[int], reaches: Reaches) -> No
     name = str(reaches)
     missing = [number for number in numbers if name not in table.records[number].get("reaches", {})]
     plans = [read_plan(number, table.records[number], reaches.plan) for number in missing]
-    attempts = carry_out(plans, reaches.wind_mm, reaches.loop, reaches.policy)
+    attempts = execute_plans(plans, reaches.wind_mm, reaches.loop, reaches.policy)
     changed = {}
     for number in missing:
         record = table.records[number]
@@ -222,19 +225,19 @@ def _stands_record(stands: Stands) -> Record:
     return {name: array.astype(float).round(_DIGITS).tolist() for name, array in arrays.items()}
 
 
-def _plan_record(made: Plan) -> Record:
+def _plan_record(plan: Plan) -> Record:
     return {
-        "targets": made.targets.round(_DIGITS).tolist(),
-        "stalks": made.stalks.tolist(),
-        "errors": made.errors.round(_DIGITS).tolist(),
-        "sides": made.sides.tolist(),
-        "refused": made.refused.tolist(),
-        "again": made.again.round(_DIGITS).tolist(),
-        "stands": _stands_record(made.stands),
-        "seen": None if made.detected is None else _stands_record(made.detected),
+        "targets": plan.targets.round(_DIGITS).tolist(),
+        "stalks": plan.stalks.tolist(),
+        "errors": plan.errors.round(_DIGITS).tolist(),
+        "sides": plan.sides.tolist(),
+        "refused": plan.refused.tolist(),
+        "again": plan.again.round(_DIGITS).tolist(),
+        "stands": _stands_record(plan.stands),
+        "seen": None if plan.detected is None else _stands_record(plan.detected),
         "standing": [
             [stalk.stalk, stalk.reachable, round(stalk.room, _DIGITS), round(stalk.neighbour, _DIGITS)]
-            for stalk in made.standing
+            for stalk in plan.standing
         ],
     }
 

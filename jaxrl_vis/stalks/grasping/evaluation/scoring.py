@@ -113,17 +113,17 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
     """
     painted: dict[int, np.ndarray] = {}
 
-    def remembered(image: np.ndarray, number: int) -> np.ndarray:
+    def record_mask(image: np.ndarray, number: int) -> np.ndarray:
         painted[number] = scene.masks[number] if mask is None else mask(image, number)
         return painted[number]
 
-    perception = perceive(scene.views, remembered, scene.drive.stated, scene.mount, variant)
+    perception = perceive(scene.views, record_mask, scene.drive.stated, scene.mount, variant)
     targets = in_world(perception, scene)
     true, detected, errors = match_stalks(targets, scene.plot)
     poses = scene.drive.poses
     errors_of_stitches = [
-        stitch_error(stitch.motion, poses[place], poses[place + 1], scene.mount)
-        for place, stitch in enumerate(perception.stitches)
+        stitch_error(stitch.motion, poses[index], poses[index + 1], scene.mount)
+        for index, stitch in enumerate(perception.stitches)
     ]
     count = len(scene.views)
     score = RunScore(
@@ -177,19 +177,19 @@ def match_stalks(targets: np.ndarray, plot: Plot) -> tuple[int, int, np.ndarray]
     return int(inside.sum()), len(errors) + int(false), np.array(errors)
 
 
-def true_motion(before: Pose, after: Pose, mount: Mount) -> Motion:
+def true_motion(first: Pose, second: Pose, mount: Mount) -> Motion:
     """Return the true motion from the robot frame of one pair to that of another, by the poses of their cameras."""
     nominal = mount.pose
-    rotation = nominal.rotation.T @ after.rotation @ before.rotation.T @ nominal.rotation
-    origin = nominal.to_world(after.to_camera(before.to_world(nominal.to_camera(np.zeros(3)))))
+    rotation = nominal.rotation.T @ second.rotation @ first.rotation.T @ nominal.rotation
+    origin = nominal.to_world(second.to_camera(first.to_world(nominal.to_camera(np.zeros(3)))))
     return Motion(rotation, origin)
 
 
-def stitch_error(motion: Motion, before: Pose, after: Pose, mount: Mount) -> float:
+def stitch_error(motion: Motion, first: Pose, second: Pose, mount: Mount) -> float:
     """Return the mean horizontal error of a stitch over points of the row, m."""
-    away = float(0.5 * (before.position[1] + after.position[1]))
+    away = float(0.5 * (first.position[1] + second.position[1]))
     places = np.array([[x, -away, z] for x in (-0.2, 0.0, 0.2) for z in (0.5, 0.75, 1.0)])
-    difference = motion(places) - true_motion(before, after, mount)(places)
+    difference = motion(places) - true_motion(first, second, mount)(places)
     return float(np.linalg.norm(difference[:, :2], axis=1).mean())
 
 
@@ -254,5 +254,5 @@ def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
     return figures
 
 
-def _quantile(values: np.ndarray, share: float) -> float:
-    return float(np.quantile(values, share)) if values.size else math.nan
+def _quantile(values: np.ndarray, fraction: float) -> float:
+    return float(np.quantile(values, fraction)) if values.size else math.nan

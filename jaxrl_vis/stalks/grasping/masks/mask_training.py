@@ -72,12 +72,12 @@ def crops(examples: list[Example], rng: np.random.Generator, count: int, size: i
     """
     images = np.zeros((count, size, size, 3), np.uint8)
     masks = np.zeros((count, size, size), bool)
-    for place, number in enumerate(rng.integers(len(examples), size=count)):
+    for index, number in enumerate(rng.integers(len(examples), size=count)):
         example = examples[number]
         top, left = (int(rng.integers(max(length - size, 0) + 1)) for length in example.mask.shape)
         part = example.image[top : top + size, left : left + size]
-        images[place, : part.shape[0], : part.shape[1]] = part
-        masks[place, : part.shape[0], : part.shape[1]] = example.mask[top : top + size, left : left + size]
+        images[index, : part.shape[0], : part.shape[1]] = part
+        masks[index, : part.shape[0], : part.shape[1]] = example.mask[top : top + size, left : left + size]
     return images, masks
 
 
@@ -98,7 +98,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
         The new state, and the losses by name.
     """
     generator, average, discriminator, moments = state
-    rate, share = rates
+    rate, decay = rates
     images, masks = vary(batch[0], batch[1], key)
     network, judge, values = settings.generator(dtype), Discriminator(dtype=dtype), normalise(images)
     true = jnp.where(masks[..., None], jnp.array(_RED), values)
@@ -118,7 +118,7 @@ def _update(state: Any, batch: Any, key: jax.Array, rates: tuple[jax.Array, jax.
     gradients, (parts, painted) = jax.grad(of_generator, has_aux=True)(generator)
     updates, first = _optimiser().update(gradients, moments[0], generator)
     generator = jax.tree.map(lambda old, change: old + rate * change, generator, updates)
-    average = jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, average, generator)
+    average = jax.tree.map(lambda old, new: decay * old + (1.0 - decay) * new, average, generator)
     if settings.loss == "segmentation":
         return (generator, average, None, (first, None)), parts
 
@@ -155,7 +155,7 @@ def _initial(settings: Settings, crop: int, key: jax.Array) -> Any:
 
 
 def train(
-    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0
+    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, report_interval: float = 30.0
 ) -> tuple[Any, int]:
     """Train a generator.
 
@@ -164,7 +164,7 @@ def train(
         settings: Settings of the generator, including its loss.
         plan: Schedule of the training.
         report: Callback for reports, see `Report`.
-        every: Interval of reports, s.
+        report_interval: Interval of reports, s.
 
     Returns:
         The averaged parameters of the generator, and the number of updates.
@@ -189,7 +189,7 @@ def train(
     try:
         state = _initial(settings, plan.crop, start_key)
         pool.fill(plan.first)
-        step = repeat(update, pool, plan, started, report, every)
+        step = repeat(update, pool, plan, started, report, report_interval)
     finally:
         pool.close()
     return state[1], step

@@ -140,13 +140,13 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         check_range(path, "channels", settings.channels, 8, 1024, 8)
         if len(settings.channels) > _MAX_LEVELS:
             raise RequestError(f"{path}: its network must have {_MAX_LEVELS} levels at most, not {len(settings.channels)}")
-        return settings, declared(settings)
+        return settings, declare_shapes(settings)
 
     return read_parameters(path, _COMMAND, declare)
 
 
 @functools.lru_cache(maxsize=4)
-def declared(settings: Settings) -> Any:
+def declare_shapes(settings: Settings) -> Any:
     """Return the shapes and dtypes of a generator's parameters as nested dictionaries, without computing any."""
     image = jax.ShapeDtypeStruct((1, settings.multiple, settings.multiple, 3), jnp.float32)
     generator = settings.generator(jnp.float32)

@@ -30,24 +30,24 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
     count = len(images)
     strength = jax.random.uniform(keys["strength"], (count,), minval=0.3)
     strength = jnp.where(jax.random.bernoulli(keys["kept"], _AS_IT_IS, (count,)), 0.0, strength)
-    values, masks = _moved(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
-    share = strength[:, None, None, None]
-    values = values * _textures(values.shape, share, keys["texture"])
-    values = _coloured(values, share, keys["colour"])
-    values = _lit(values, share, keys["light"])
-    values = _blurred(values, strength, keys["blur"])
+    values, masks = _transform(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
+    strengths = strength[:, None, None, None]
+    values = values * _textures(values.shape, strengths, keys["texture"])
+    values = _shift_colours(values, strengths, keys["colour"])
+    values = _lit(values, strengths, keys["light"])
+    values = _blur(values, strength, keys["blur"])
     level, shot = jax.random.split(keys["noise"])
-    amount = 0.06 * share * jax.random.uniform(level, share.shape)
+    amount = 0.06 * strengths * jax.random.uniform(level, strengths.shape)
     values = values + amount * jnp.sqrt(jnp.maximum(values, 0.05)) * jax.random.normal(shot, values.shape)
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0)).astype(jnp.uint8), masks
 
 
-def _moved(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Scale, stretch, shear and mirror crops and masks about their centres, with edge pixels repeated beyond the edges."""
     count, height, width = masks.shape
-    drawn = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
-    size, wide, shear = jnp.exp(0.3 * strength * drawn[0]), jnp.exp(0.25 * strength * drawn[1]), 0.2 * strength * drawn[2]
-    mirror = jnp.where(drawn[3] > 0.0, 1.0, -1.0)
+    draws = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
+    size, wide, shear = jnp.exp(0.3 * strength * draws[0]), jnp.exp(0.25 * strength * draws[1]), 0.2 * strength * draws[2]
+    mirror = jnp.where(draws[3] > 0.0, 1.0, -1.0)
     line, column = jnp.meshgrid(jnp.arange(height) - 0.5 * (height - 1), jnp.arange(width) - 0.5 * (width - 1), indexing="ij")
 
     def one(image: jax.Array, mask: jax.Array, size: jax.Array, wide: jax.Array, shear: jax.Array, mirror: jax.Array):
@@ -85,7 +85,7 @@ def _textures(shape: tuple[int, ...], strength: jax.Array, key: jax.Array) -> ja
     return jnp.exp(grain) * jnp.where(spots, 1.0 - 0.8 * amount[4], 1.0)
 
 
-def _coloured(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
+def _shift_colours(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
     """Vary hue, saturation and colour cast of each crop, and the cast also within it."""
     count = len(values)
     keys = dict(zip(("hue", "grey", "cast", "parts"), jax.random.split(key, 4)))
@@ -105,17 +105,17 @@ def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
     count = len(values)
     gain, gamma, contrast, black, amount, ramp = jax.random.split(key, 6)
 
-    def drawn(key: jax.Array, low: float, high: float) -> jax.Array:
+    def sample_uniform(key: jax.Array, low: float, high: float) -> jax.Array:
         return strength * jax.random.uniform(key, (count, 1, 1, 1), minval=low, maxval=high)
 
-    values = jnp.maximum(values, 1e-4) ** jnp.exp(drawn(gamma, -0.5, 0.5))
+    values = jnp.maximum(values, 1e-4) ** jnp.exp(sample_uniform(gamma, -0.5, 0.5))
     middle = values.mean(axis=(1, 2, 3), keepdims=True)
-    values = middle + (values - middle) * jnp.exp(drawn(contrast, -0.5, 0.4))
-    ramp = drawn(amount, 0.0, 0.6) * _field(ramp, values.shape, 2, 2)
-    return values * jnp.exp(drawn(gain, -1.1, 0.8) + ramp) + drawn(black, 0.0, 0.08)
+    values = middle + (values - middle) * jnp.exp(sample_uniform(contrast, -0.5, 0.4))
+    ramp = sample_uniform(amount, 0.0, 0.6) * _field(ramp, values.shape, 2, 2)
+    return values * jnp.exp(sample_uniform(gain, -1.1, 0.8) + ramp) + sample_uniform(black, 0.0, 0.08)
 
 
-def _blurred(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
+def _blur(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
     """Apply a Gaussian blur with a standard deviation of up to 1.3 pixels."""
     deviation = jnp.maximum(1.3 * strength * jax.random.uniform(key, strength.shape), 0.05)
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation[:, None]) ** 2)

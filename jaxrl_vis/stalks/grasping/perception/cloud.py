@@ -67,13 +67,13 @@ class Cloud:
         return self.points[self.red & np.isfinite(self.depth)]
 
 
-def redness(painted: np.ndarray) -> np.ndarray:
+def redness(image: np.ndarray) -> np.ndarray:
     """Return the redness of RGB pixels [..., 3] uint8: red minus the maximum of green and blue.
 
     Returns:
         [...] float32, 1 for pure red, 0 for grey, negative where green or blue exceed red.
     """
-    values = painted.astype(np.float32) / 255.0
+    values = image.astype(np.float32) / 255.0
     return values[..., 0] - np.maximum(values[..., 1], values[..., 2])
 
 
@@ -114,7 +114,7 @@ _SMALL_STEP, _LARGE_STEP = 4, 24
 """Smoothness penalties for disparity changes of one pixel and of more, per pixel of a block."""
 
 
-def organised(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, mount: Mount) -> Cloud:
+def organise(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, mount: Mount) -> Cloud:
     """Build the organised cloud of a pair; depths outside the mount's range become NaN.
 
     Args:
@@ -135,7 +135,7 @@ def organised(disparity: np.ndarray, red: np.ndarray, calibration: Calibration, 
     return Cloud(points, depth, red)
 
 
-def thinned(points: np.ndarray, size: float) -> np.ndarray:
+def subsample(points: np.ndarray, size: float) -> np.ndarray:
     """Downsample points on a voxel grid: return the mean of the points in each occupied voxel.
 
     Args:

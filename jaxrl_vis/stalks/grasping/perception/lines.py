@@ -57,18 +57,18 @@ _BENT_LENGTH = 0.3  # m: minimum height range of chords for fitting curvature or
 _USUAL_TAPER = -0.01  # m per m: taper of stalks with a smaller height range
 _OPENING = 0.03  # growth of the maximum distance per m beyond the known part of a line
 _MIN_PIECE = 0.03  # m: minimum height range of a seed
-_STEEPEST = 0.6  # m per m: maximum slope of a line against the vertical
+_MAX_SLOPE = 0.6  # m per m: maximum slope of a line against the vertical
 _BIN = 0.02  # m: bin width of heights
 _MIN_SUPPORT = 0.12  # m: minimum visible length, summed over pairs
 _WINDOW = 0.10  # m: half height of the window around the grasp point for the local fit
 _AROUND = 0.2  # m: half height of the range around the grasp point in which visibility is queried
 _MIN_SHOWN = 4  # minimum number of places at which a pair must show a stalk
-_MIN_SHARE = 0.4  # minimum fraction of places that show the stalk among those that show it or see through it
+_MIN_FRACTION = 0.4  # minimum fraction of places that show the stalk among those that show it or see through it
 _APART = 0.012  # m: lines nearer than this are the same stalk
 _BEND = 0.04  # growth of that distance per m between the heights of their grasp points
 _REST_WITHIN, _REST_SPREAD = 0.025, 0.003  # m: nearer lines with a greater spread are leftovers of the other stalk
 _LEVEL = 0.002  # m: chords of one pair that differ less in height are in the same image row
-_MIN_BESIDE, _SHARE_BESIDE = 20, 0.2  # minimum number, and fraction, of chords of two distinct stalks that are side by side
+_MIN_BESIDE, _FRACTION_BESIDE = 20, 0.2  # minimum number, and fraction, of chords of two distinct stalks that are side by side
 _APART_BESIDE = 0.008  # m: minimum median distance of such chords
 
 
@@ -80,40 +80,40 @@ class _Line(NamedTuple):
     shown: int
 
 
-def grasp_points(chords: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
+def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
     """Detect stalks and return their grasp points, from left to right.
 
     Args:
-        chords: Segments of all pairs, in the robot frame of the last one.
+        segments: Segments of all pairs, in the robot frame of the last one.
         visibility: Visibility of points in all pairs.
         heights: Minimum and maximum height of a grasp, m above the ground.
     """
-    free = np.ones(len(chords), bool)
+    free = np.ones(len(segments), bool)
     lines: list[_Line] = []
-    for seed in _seeds(chords):
+    for seed in _seeds(segments):
         members = seed[free[seed]]
-        if np.ptp(chords.middle[members, 2]) < _MIN_PIECE if len(members) else True:
+        if np.ptp(segments.middle[members, 2]) < _MIN_PIECE if len(members) else True:
             continue
-        members = _grow(chords, members, free)
+        members = _grow(segments, members, free)
         if not len(members):
             continue
         free[members] = False
-        point = _grasp(chords, members, min(2, len(visibility.clouds)), heights)
+        point = _grasp(segments, members, min(2, len(visibility.clouds)), heights)
         if point is None:
             continue
-        count = _agreed(point, visibility)
+        count = _count_support(point, visibility)
         if count:
             lines.append(_Line(point, members, count))
     lines.sort(key=lambda line: -line.shown)
-    return sorted((line.point for line in _distinct(lines, chords)), key=lambda point: float(point.point[0]))
+    return sorted((line.point for line in _remove_duplicates(lines, segments)), key=lambda point: float(point.point[0]))
 
 
-def _seeds(chords: StalkSegments) -> list[np.ndarray]:
+def _seeds(segments: StalkSegments) -> list[np.ndarray]:
     """Return the indices of the chords of each piece with at least 5, tall pieces first."""
-    order = np.argsort(chords.piece, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(chords.piece[order])) + 1) if len(order) else []
+    order = np.argsort(segments.piece, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(segments.piece[order])) + 1) if len(order) else []
     parts = [part for part in parts if len(part) >= 5]
-    return sorted(parts, key=lambda part: -float(np.ptp(chords.middle[part, 2])))
+    return sorted(parts, key=lambda part: -float(np.ptp(segments.middle[part, 2])))
 
 
 def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
@@ -153,15 +153,15 @@ def _robust(points: np.ndarray, bent: bool) -> tuple[np.ndarray, float]:
     return coefficients, middle
 
 
-def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.ndarray:
+def _grow(segments: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Return the indices of all free chords along the line through ``members``; none if the line is too steep."""
     candidates = np.flatnonzero(free)
-    points = chords.middle[candidates]
+    points = segments.middle[candidates]
     for _ in range(6):
-        known = chords.middle[members]
+        known = segments.middle[members]
         low, high = known[:, 2].min(), known[:, 2].max()
         coefficients, middle = _robust(known, bent=high - low > _BENT_LENGTH)
-        if np.abs(coefficients[1]).max() > _STEEPEST:
+        if np.abs(coefficients[1]).max() > _MAX_SLOPE:
             return members[:0]
         beyond = np.maximum(np.maximum(low - points[:, 2], points[:, 2] - high), 0.0)
         # Extrapolate by at most the known height range of the line, or 0.15 m.
@@ -174,20 +174,20 @@ def _grow(chords: StalkSegments, members: np.ndarray, free: np.ndarray) -> np.nd
     return members
 
 
-def _support(chords: StalkSegments, members: np.ndarray) -> tuple[float, int]:
+def _support(segments: StalkSegments, members: np.ndarray) -> tuple[float, int]:
     """Return the visible length summed over pairs, m, and the number of pairs with chords in at least two height bins."""
-    bins = np.floor(chords.middle[members, 2] / _BIN).astype(int)
-    occupied = np.unique(np.stack([chords.frame[members], bins], axis=1), axis=0)
+    bins = np.floor(segments.middle[members, 2] / _BIN).astype(int)
+    occupied = np.unique(np.stack([segments.frame[members], bins], axis=1), axis=0)
     frames, counts = np.unique(occupied[:, 0], return_counts=True)
     return _BIN * len(occupied), int((counts >= 2).sum())
 
 
-def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
+def _grasp(segments: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
     """Return the grasp point of a stalk; None if the pairs show too little of it."""
-    length, frames = _support(chords, members)
+    length, frames = _support(segments, members)
     if length < _MIN_SUPPORT or frames < least_frames:
         return None
-    points = chords.middle[members]
+    points = segments.middle[members]
     places = np.arange(heights[0], heights[1] + 1e-9, _BIN)
     within = np.abs(points[None, :, 2] - places[:, None]) < _WINDOW
     count = within.sum(axis=1) * np.exp(-0.5 * ((places - PREFERRED) / 0.3) ** 2)
@@ -198,11 +198,11 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
     local, middle = _robust(points[near], bent=False)
     x, y = local[0] + local[1] * (places[best] - middle)
     spread = float(np.sqrt(np.mean(np.minimum(_offsets(points[near], local, middle), _LINE_RADIUS) ** 2)))
-    thickness = float(np.median(chords.thickness[members[near]]))
+    thickness = float(np.median(segments.thickness[members[near]]))
     # Direction and curvature are fitted to the whole line.
-    whole, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
-    bend = whole[2] if len(whole) > 2 else np.zeros(2)
-    direction = np.array([*(whole[1] + 2.0 * bend * (places[best] - middle)), 1.0])
+    curve, middle = _robust(points, bent=np.ptp(points[:, 2]) > _BENT_LENGTH)
+    bend = curve[2] if len(curve) > 2 else np.zeros(2)
+    direction = np.array([*(curve[1] + 2.0 * bend * (places[best] - middle)), 1.0])
     return GraspPoint(
         np.array([x, y, places[best]]),
         direction / np.linalg.norm(direction),
@@ -210,7 +210,7 @@ def _grasp(chords: StalkSegments, members: np.ndarray, least_frames: int, height
         frames,
         spread,
         (float(bend[0]), float(bend[1])),
-        _taper(points[:, 2], chords.thickness[members]),
+        _taper(points[:, 2], segments.thickness[members]),
     )
 
 
@@ -223,7 +223,7 @@ def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
     return float((parts[0][1] - parts[1][1]) / (parts[0][0] - parts[1][0]))
 
 
-def _agreed(point: GraspPoint, visibility: Visibility) -> int:
+def _count_support(point: GraspPoint, visibility: Visibility) -> int:
     """Count the places along a stalk's line at which pairs show it.
 
     Return 0 unless at least two pairs (or the only one) show it, and few enough see through it.
@@ -232,20 +232,20 @@ def _agreed(point: GraspPoint, visibility: Visibility) -> int:
     shown, through = visibility.query(point.at_height(places))
     count = int(shown.sum())
     frames = int((shown.sum(axis=1) >= _MIN_SHOWN).sum())
-    agreed = frames >= min(2, len(visibility.clouds)) and count >= _MIN_SHARE * (count + through.sum())
+    agreed = frames >= min(2, len(visibility.clouds)) and count >= _MIN_FRACTION * (count + through.sum())
     return count if agreed else 0
 
 
-def _distinct(lines: list[_Line], chords: StalkSegments) -> list[_Line]:
+def _remove_duplicates(lines: list[_Line], segments: StalkSegments) -> list[_Line]:
     """Return the lines without those that are the same stalk as an earlier one."""
     distinct: list[_Line] = []
     for line in lines:
-        if not any(_same(line.point, other.point) and not _beside(chords, line, other) for other in distinct):
+        if not any(_is_same_stalk(line.point, other.point) and not _side_by_side(segments, line, other) for other in distinct):
             distinct.append(line)
     return distinct
 
 
-def _same(point: GraspPoint, other: GraspPoint) -> bool:
+def _is_same_stalk(point: GraspPoint, other: GraspPoint) -> bool:
     """Return True if a line is probably the same stalk as ``other``, which pairs show better."""
     up = point.point[2] - other.point[2]
     distance = float(np.linalg.norm((point.point - other.at_height(point.point[2]))[:2]))
@@ -253,15 +253,15 @@ def _same(point: GraspPoint, other: GraspPoint) -> bool:
     return distance < _APART + _BEND * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
 
 
-def _beside(chords: StalkSegments, one: _Line, other: _Line) -> bool:
+def _side_by_side(segments: StalkSegments, one: _Line, other: _Line) -> bool:
     """Return True if pairs show two lines side by side in the same image rows: these are distinct stalks, however near."""
     apart = [np.zeros(0)]
-    for frame in np.intersect1d(chords.frame[one.members], chords.frame[other.members]):
-        mine, theirs = (chords.middle[line.members[chords.frame[line.members] == frame]] for line in (one, other))
+    for frame in np.intersect1d(segments.frame[one.members], segments.frame[other.members]):
+        mine, theirs = (segments.middle[line.members[segments.frame[line.members] == frame]] for line in (one, other))
         theirs = theirs[np.argsort(theirs[:, 2])]
         place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
         level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
         apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
     distances = np.concatenate(apart)
-    enough = max(_MIN_BESIDE, _SHARE_BESIDE * min(len(one.members), len(other.members)))
+    enough = max(_MIN_BESIDE, _FRACTION_BESIDE * min(len(one.members), len(other.members)))
     return len(distances) >= enough and float(np.median(distances)) > _APART_BESIDE

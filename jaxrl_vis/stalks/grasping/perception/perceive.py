@@ -16,10 +16,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organised
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, Mount, match, organise
 from jaxrl_vis.stalks.grasping.perception.lines import GraspPoint, grasp_points
 from jaxrl_vis.stalks.grasping.perception.slices import slice_points
-from jaxrl_vis.stalks.grasping.perception.stalk_segments import joined, stalk_segments
+from jaxrl_vis.stalks.grasping.perception.stalk_segments import join_segments, stalk_segments
 from jaxrl_vis.stalks.grasping.perception.stitch import DEFAULT, THESIS, Motion, Stitch, Thinned, stitch
 from jaxrl_vis.stalks.grasping.perception.visibility import Visibility
 from jaxrl_vis_envs.plants import Calibration
@@ -121,17 +121,17 @@ def perceive(
             # Matching runs in threads while the network computes masks, perhaps on an accelerator.
             with clock("mask"):
                 painted = [mask(view.left, view.number) for view in views]
-            clouds = list(side_by_side(lambda disparity, red: organised(disparity, red, calibration, mount), matched, painted))
+            clouds = list(side_by_side(lambda disparity, red: organise(disparity, red, calibration, mount), matched, painted))
         with clock("stitch"):
             method = THESIS if variant.stitch else DEFAULT
-            whole = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
+            thinned = list(side_by_side(lambda cloud: Thinned.of(cloud, method), clouds))
             driven = [_driven(*neighbours) for neighbours in itertools.pairwise(views)]
             stitches = list(
-                side_by_side(lambda here, there, far: stitch(here, there, far, method), whole[:-1], whole[1:], driven)
+                side_by_side(lambda here, there, far: stitch(here, there, far, method), thinned[:-1], thinned[1:], driven)
             )
         notes += [
-            f"pair {views[place].number} does not stitch to the next, odometry was used: {step.refused}"
-            for place, step in enumerate(stitches)
+            f"pair {views[index].number} does not stitch to the next, odometry was used: {step.refused}"
+            for index, step in enumerate(stitches)
             if step.refused
         ]
         to_last = [Motion.along(0.0)]
@@ -145,15 +145,15 @@ def perceive(
                     lambda cloud, frame: stalk_segments(cloud, calibration, mount, frame), clouds, range(len(clouds))
                 )
                 parts = [dataclasses.replace(part, middle=motion(part.middle)) for motion, part in zip(to_last, segments)]
-                points = grasp_points(joined(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount))
+                points = grasp_points(join_segments(parts), Visibility(tuple(clouds), tuple(to_last), calibration, mount))
     if not points:
         notes.append("no stalk was found")
     return Perception(tuple(clouds), tuple(stitches), tuple(to_last), points, seconds, tuple(notes))
 
 
-def _driven(here: View, there: View) -> float:
+def _driven(view: View, next_view: View) -> float:
     """Return the distance that the robot drove between two pairs, m; 0 if it is not known."""
-    return 0.0 if here.driven is None or there.driven is None else there.driven - here.driven
+    return 0.0 if view.driven is None or next_view.driven is None else next_view.driven - view.driven
 
 
 @contextlib.contextmanager
@@ -179,15 +179,15 @@ class _Clock:
 
     @contextlib.contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        self._turn()
+        self._record_lap()
         self._names.append(name)
         try:
             yield
         finally:
-            self._turn()
+            self._record_lap()
             self._names.pop()
 
-    def _turn(self) -> None:
+    def _record_lap(self) -> None:
         now = time.perf_counter()
         if self._names:
             self._seconds[self._names[-1]] += now - self._last

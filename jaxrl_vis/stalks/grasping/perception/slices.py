@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from scipy import ndimage
 
-from jaxrl_vis.stalks.grasping.perception.cloud import thinned
+from jaxrl_vis.stalks.grasping.perception.cloud import subsample
 from jaxrl_vis.stalks.grasping.perception.lines import PREFERRED, GraspPoint
 
 THICKNESS = 0.2
@@ -18,7 +18,7 @@ THICKNESS = 0.2
 CELL = 0.01
 """Edge of a cell of the heat map, m."""
 _VOXEL = 0.005  # m: downsampling, so that the density of points does not depend on the distance
-_SHARE = 0.25
+_FRACTION = 0.25
 _MIN_CELLS = 2
 
 
@@ -44,7 +44,7 @@ class Slice:
 def slice_at(points: np.ndarray, low: float) -> Slice:
     """Return the slice of points [N, 3] (m) from the height ``low`` to `THICKNESS` above it."""
     inside = points[(points[:, 2] >= low) & (points[:, 2] < low + THICKNESS)]
-    inside = thinned(inside, _VOXEL)
+    inside = subsample(inside, _VOXEL)
     if not len(inside):
         return Slice(low, np.zeros(2), np.zeros((1, 1)), np.zeros((1, 1), int), np.zeros((0, 3)))
     corner = np.floor(inside[:, :2].min(axis=0) / CELL - 2) * CELL
@@ -52,7 +52,7 @@ def slice_at(points: np.ndarray, low: float) -> Slice:
     counts = np.zeros(cell.max(axis=0) + 4)
     np.add.at(counts, tuple(cell.T), 1.0)
     heat = ndimage.gaussian_filter(counts, 0.7)
-    dense = heat >= _SHARE * np.quantile(heat[counts > 0], 0.9)
+    dense = heat >= _FRACTION * np.quantile(heat[counts > 0], 0.9)
     regions = np.zeros(dense.shape, np.int32)
     count = int(ndimage.label(dense, np.ones((3, 3)), output=regions))  # pyright: ignore
     of_point = regions[tuple(cell.T)]

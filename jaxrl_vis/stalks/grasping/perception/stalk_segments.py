@@ -77,7 +77,7 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
     return StalkSegments(mount.pose.to_world(points), thickness, np.full(len(line), frame), piece)
 
 
-def joined(parts: list[StalkSegments]) -> StalkSegments:
+def join_segments(parts: list[StalkSegments]) -> StalkSegments:
     """Concatenate the chords of several pairs, all in one robot frame; pieces are renumbered to stay distinct."""
     if not parts:
         return _nothing()
@@ -108,7 +108,7 @@ def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.
     return np.where(2 * valid >= end - begin, middle, np.nan).astype(np.float64)
 
 
-def _pieces(line: np.ndarray, across: np.ndarray, far: np.ndarray) -> np.ndarray:
+def _pieces(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Return the number of the piece of each chord [N]: connected components over neighbouring rows."""
     count = len(line)
     ends = np.searchsorted(line, np.arange(line.max() + 3))
@@ -117,8 +117,8 @@ def _pieces(line: np.ndarray, across: np.ndarray, far: np.ndarray) -> np.ndarray
         upper, lower = np.arange(ends[here], ends[here + 1]), np.arange(ends[here + 1], ends[here + 2])
         if not (upper.size and lower.size):
             continue
-        near = np.abs(across[upper, None] - across[None, lower]) < _SIDEWAYS
-        near &= np.abs(far[upper, None] - far[None, lower]) < _JUMP
+        near = np.abs(positions[upper, None] - positions[None, lower]) < _SIDEWAYS
+        near &= np.abs(depth[upper, None] - depth[None, lower]) < _JUMP
         rows, columns = np.nonzero(near)
         one.append(upper[rows])
         other.append(lower[columns])

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, thinned
+from jaxrl_vis.stalks.grasping.perception.cloud import Cloud, subsample
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Method:
         voxel: Edge of a voxel of the grid, m.
         gates: Maximum distances of corresponding points, m, applied in this order.
         steps: Maximum number of iterations with each gate.
-        most: Approximate number of points of the source cloud with each gate, evenly subsampled.
+        max_points: Approximate number of points of the source cloud with each gate, evenly subsampled.
         from_odometry: Whether to start from the odometry and refuse results that differ too much from it, and to weight
             correspondences robustly; if not, start from the identity.
         pixels: Approximate number of pixels of an image to use, evenly subsampled.
@@ -68,29 +68,29 @@ class Method:
     voxel: float
     gates: tuple[float, ...]
     steps: int
-    most: tuple[int, ...]
+    max_points: tuple[int, ...]
     from_odometry: bool
     pixels: int = 1_000_000_000
 
     def after_first_gate(self) -> "Method":
         """Return the method without its first, widest gate."""
-        return dataclasses.replace(self, gates=self.gates[1:], most=self.most[1:])
+        return dataclasses.replace(self, gates=self.gates[1:], max_points=self.max_points[1:])
 
 
-THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, most=(1_000_000,), from_odometry=False)
+THESIS = Method(voxel=0.03, gates=(0.15,), steps=50, max_points=(1_000_000,), from_odometry=False)
 # Wide gates only bring the clouds near enough for the next one, for which few points suffice.
 DEFAULT = Method(
     voxel=0.005,
     gates=(0.15, 0.05, 0.02, 0.01),
     steps=30,
-    most=(1000, 1500, 3000, 5000),
+    max_points=(1000, 1500, 3000, 5000),
     from_odometry=True,
     pixels=512 * 512,
 )
 
-_ODOMETRY_SHARE = 0.05
-_WOBBLE = 0.03  # m
-_TURN = math.radians(3.0)
+_ODOMETRY_FRACTION = 0.05
+_MAX_WOBBLE = 0.03  # m
+_MAX_TURN = math.radians(3.0)
 _MIN_OVERLAP = 0.2
 _STILL = 0.01  # tolerance of convergence relative to the gate, for translation in m and rotation in rad
 
@@ -126,7 +126,7 @@ class Thinned:
             points: [N, 3], m.
             method: Method of stitching, which determines the grid.
         """
-        self.points = thinned(points, method.voxel)
+        self.points = subsample(points, method.voxel)
 
     @classmethod
     def of(cls, cloud: Cloud, method: Method = DEFAULT) -> "Thinned":
@@ -140,38 +140,38 @@ class Thinned:
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
-def stitch(source: Thinned, target: Thinned, driven: float, method: Method = DEFAULT) -> Stitch:
+def stitch(source: Thinned, target: Thinned, distance: float, method: Method = DEFAULT) -> Stitch:
     """Register the cloud of one pair with that of the next.
 
     Args:
         source, target: Clouds of the pair and the next one, each in its own robot frame.
-        driven: Distance that the robot drove along the row between the pairs by its odometry, m.
+        distance: Distance that the robot drove along the row between the pairs by its odometry, m.
         method: Method of stitching.
     """
-    prior = Motion.along(-driven)
+    prior = Motion.along(-distance)
     start = prior if method.from_odometry else Motion.along(0.0)
     if len(source.points) < 10 or len(target.points) < 10:
         return Stitch(prior, math.nan, 0.0, "a cloud is empty")
     motion, residual, overlap = closest_points(source.points, target, start, method)
-    refused = _why_refused(motion, prior, driven, overlap) if method.from_odometry else ""
+    refused = _rejection_reason(motion, prior, distance, overlap) if method.from_odometry else ""
     if refused and len(method.gates) > 1:
         # With little overlap, points of one pair alone bias the widest gate; the odometry may be good enough for the next one.
         motion, residual, overlap = closest_points(source.points, target, start, method.after_first_gate())
-        refused = _why_refused(motion, prior, driven, overlap)
+        refused = _rejection_reason(motion, prior, distance, overlap)
     return Stitch(prior if refused else motion, residual, overlap, refused)
 
 
-def _why_refused(motion: Motion, prior: Motion, driven: float, overlap: float) -> str:
+def _rejection_reason(motion: Motion, prior: Motion, distance: float, overlap: float) -> str:
     """Return the reason to refuse a result, by overlap and odometry; empty to accept it."""
     # Compare displacements at a point of the row, so that rotations count as well.
     place = np.array([0.0, 0.6, 0.8])
     moved = float(np.linalg.norm(motion(place) - prior(place)))
-    allowed = _ODOMETRY_SHARE * abs(driven) + _WOBBLE
+    allowed = _ODOMETRY_FRACTION * abs(distance) + _MAX_WOBBLE
     if overlap < _MIN_OVERLAP:
         return f"only {100 * overlap:.0f} % of the points overlap"
     if moved > allowed:
         return f"it moved {1e3 * moved:.0f} mm from the odometry, which allows {1e3 * allowed:.0f} mm"
-    if motion.angle > _TURN:
+    if motion.angle > _MAX_TURN:
         return f"it turned by {math.degrees(motion.angle):.1f} degrees"
     return ""
 
@@ -190,8 +190,8 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
         with a correspondence.
     """
     motion, residual, overlap = start, math.nan, 0.0
-    for gate, most in zip(method.gates, method.most):
-        chosen = source[:: max(len(source) // most, 1)]
+    for gate, max_points in zip(method.gates, method.max_points):
+        chosen = source[:: max(len(source) // max_points, 1)]
         still = _STILL * gate if method.from_odometry else 1e-5
         for _ in range(method.steps):
             moved = motion(chosen)
@@ -212,9 +212,9 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
 
 def rigid(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> Motion:
     """Return the rigid motion from points [N, 3] to corresponding ones [N, 3], by least squares with weights [N]."""
-    share = weight / weight.sum()
-    here, there = share @ source, share @ target
-    left, _, right = np.linalg.svd(((source - here) * share[:, None]).T @ (target - there))
+    weights = weight / weight.sum()
+    here, there = weights @ source, weights @ target
+    left, _, right = np.linalg.svd(((source - here) * weights[:, None]).T @ (target - there))
     turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
     rotation = right.T @ turn @ left.T
     return Motion(rotation, there - rotation @ here)

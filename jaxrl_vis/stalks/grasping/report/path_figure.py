@@ -66,9 +66,10 @@ def _draw_plane(axes: Axes, stands: Stands, result: ReachResult, index: int, tar
     """Draw the view from above at the target's height: stalks, the arm at the end of the reach, and both paths."""
     origin = stands.origin[index]
     knee, top = stands.knee[index], stands.top[index]
-    share = (target[2] - knee[:, 2]) / (top[:, 2] - knee[:, 2])
-    places = knee + share[:, None] * (top - knee) + origin
-    for place, radius, is_held, is_there in zip(places, stands.radius[index, :, 1], result.held[index], stands.present[index]):
+    fraction = (target[2] - knee[:, 2]) / (top[:, 2] - knee[:, 2])
+    places = knee + fraction[:, None] * (top - knee) + origin
+    radii, is_present = stands.radius[index, :, 1], stands.is_present[index]
+    for place, radius, is_held, is_there in zip(places, radii, result.held[index], is_present):
         if is_there:
             axes.add_patch(Circle(place[:2], radius, color=_HELD if is_held else _STALK))
     planned, taken = result.path[index], result.taken[index]

@@ -41,9 +41,9 @@ def draw_figure(out: Path, family: Family, seed: int, mask: Mask | None, name: s
     # The constrained layout ignores the labels of 3D axes, so ``wspace`` leaves room for them.
     grid = figure.add_gridspec(2, 3, width_ratios=(1.0, 1.0, 1.25), wspace=0.1)
     _image(figure.add_subplot(grid[0, 0]), scene, perception)
-    whole = np.concatenate([motion(cloud.all_points()) for motion, cloud in zip(perception.to_last, perception.clouds)])
+    points = np.concatenate([motion(cloud.all_points()) for motion, cloud in zip(perception.to_last, perception.clouds)])
     red = perception.red_points()
-    _cloud(figure.add_subplot(grid[0, 1], projection="3d"), whole, red, "(a) stitched cloud, stalks in red")
+    _cloud(figure.add_subplot(grid[0, 1], projection="3d"), points, red, "(a) stitched cloud, stalks in red")
     _cloud(figure.add_subplot(grid[1, 0], projection="3d"), None, red, "(b) after the threshold")
     _slice(figure.add_subplot(grid[0, 2]), figure.add_subplot(grid[1, 2]), red, scene, perception)
     _cloud(figure.add_subplot(grid[1, 1], projection="3d"), None, red, "(d) grasp points", perception)
@@ -60,10 +60,10 @@ def _image(axes: Any, scene: Scene, perception: Perception) -> None:
     axes.set_axis_off()
 
 
-def _cloud(axes: Any, whole: np.ndarray | None, red: np.ndarray, title: str, perception: Perception | None = None) -> None:
+def _cloud(axes: Any, points: np.ndarray | None, red: np.ndarray, title: str, perception: Perception | None = None) -> None:
     rng = np.random.default_rng(0)
-    if whole is not None:
-        x, y, z = _shown(whole)[rng.integers(len(_shown(whole)), size=_MAX_POINTS)].T
+    if points is not None:
+        x, y, z = _shown(points)[rng.integers(len(_shown(points)), size=_MAX_POINTS)].T
         axes.scatter(x, y, z, s=0.8, c="#6f8f5a", alpha=0.5, linewidths=0)
     if len(red):
         x, y, z = _shown(red)[rng.integers(len(_shown(red)), size=_MAX_POINTS)].T

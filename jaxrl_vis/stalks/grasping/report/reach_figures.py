@@ -22,7 +22,7 @@ from jaxrl_vis.stalks.grasping.report.video import write_reaches
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Family
 
-THESIS_RATIO, CORNBOT_SHARE = 0.7413, 43 / 48
+THESIS_RATIO, CORNBOT_FRACTION = 0.7413, 43 / 48
 RUNS = 16
 """Number of runs in figure 4.6, as in the thesis."""
 _HELD, _OTHER, _LOST = "#2f855a", "#dd6b20", "#cbd5e0"
@@ -54,7 +54,7 @@ def draw_reach(
         raise RequestError(f"there is nothing that the arm can be sent to in run {seed}: choose another --seed")
     keys = wind_keys(np.full(len(made.targets), seed), np.arange(len(made.targets)))
     look = follow(made.stands, made.stalks, made.again)
-    result = reach(made.stands, made.targets, keys, wind_mm, sides=made.sides, look=look)
+    result = reach(made.stands, made.targets, keys, wind_mm, sides=made.sides, observer=look)
     draw_path(out, made.stands, made.targets, result, int(sent[len(sent) // 2]))
     if video is not None:
         write_reaches(video, made.stands, result, made.stalks.tolist(), sent.tolist(), size)
@@ -118,7 +118,7 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
     axes.set_xticklabels([str(record["number"]) for record in records])
     axes.grid(axis="y", alpha=0.25)
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
-    _beside(figure, score)
+    _draw_proportions(figure, score)
     figure.text(0.03, 0.95, "Attempts and grasps", fontsize=14, weight="bold", color=INK, va="center")
     figure.text(0.03, 0.895, title, fontsize=9, color=FAINT, va="center")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ def _counts(record: Record, name: str) -> tuple[int, int, int, int]:
     return int(record["stalks"]), len(attempts), alone, sum(len(attempt.held) for attempt in attempts) - alone
 
 
-def _beside(figure: Figure, score: Score) -> None:
+def _draw_proportions(figure: Figure, score: Score) -> None:
     """Draw the success rates with their intervals, beside those that the thesis and Cornbot report from fields."""
     axes = figure.add_axes((0.76, 0.13, 0.21, 0.7))
     rows = [
@@ -141,16 +141,16 @@ def _beside(figure: Figure, score: Score) -> None:
         ("reachable,\ncrowded", score.crowded),
         ("all stalks", score.of_all),
     ]
-    for place, (_, share) in enumerate(rows):
-        if share.of:
-            low, high = share.interval
+    for place, (_, proportion) in enumerate(rows):
+        if proportion.of:
+            low, high = proportion.interval
             axes.plot([100 * low, 100 * high], [place, place], color=_HELD, linewidth=2)
-            axes.plot(100 * share.share, place, "o", color=_HELD)
-            axes.text(101, place - 0.22, f"{share.count} of {share.of}", fontsize=7, color=FAINT, ha="right")
+            axes.plot(100 * proportion.value, place, "o", color=_HELD)
+            axes.text(101, place - 0.22, f"{proportion.count} of {proportion.of}", fontsize=7, color=FAINT, ha="right")
     place = len(rows)
     axes.plot(100 * score.thesis_ratio, place, "s", color="#2b6cb0")
     axes.plot(100 * THESIS_RATIO, place + 1, "D", color=_OTHER)
-    axes.plot(100 * CORNBOT_SHARE, place + 2, "D", color=_OTHER)
+    axes.plot(100 * CORNBOT_FRACTION, place + 2, "D", color=_OTHER)
     names = [name for name, _ in rows] + [
         "thesis's ratio,\nhere",
         "thesis's ratio,\nin its field",

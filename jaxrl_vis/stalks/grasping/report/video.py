@@ -47,7 +47,9 @@ def write_reaches(
         is_alone = held == {int(targets[index])}
         for place, frame in enumerate(frames):
             time = (1 + place * _EVERY) * result.interval
-            images.append(_captioned(frame, f"{time:4.2f} s", _deed(time, held, is_alone), REACHED if is_alone else MISSED))
+            images.append(
+                _add_caption(frame, f"{time:4.2f} s", _outcome_caption(time, held, is_alone), REACHED if is_alone else MISSED)
+            )
             seconds.append(_EVERY * result.interval)
         seconds[-1] = HOLD
     write_images(images, seconds, path, _EVERY * result.interval)
@@ -68,7 +70,7 @@ def _program(stalks: int, size: int) -> Any:
 
     def draw(shape: Shape, pose: jax.Array) -> jax.Array:
         model = bending.fit(arms.model, arms.layout, shape)
-        data = mjx_model.kinematics(model, bending.placed(arms.rest, arms.layout, shape).replace(qpos=pose))
+        data = mjx_model.kinematics(model, bending.place_stands(arms.rest, arms.layout, shape).replace(qpos=pose))
         fitted = scene.replace(size=scene.size.at[geoms].set(model.geom_size[geoms]))
         rgb = render_planes(fitted, data, depth=False, quantized=True).rgb
         assert rgb is not None  # it was asked for
@@ -77,7 +79,7 @@ def _program(stalks: int, size: int) -> Any:
     return jaxrl_vis_envs.jit(draw)
 
 
-def _deed(time: float, held: set[int], is_alone: bool) -> str:
+def _outcome_caption(time: float, held_stalks: set[int], is_alone: bool) -> str:
     """Return a caption of the arm's action at a time, s."""
     timing = Timing()
     if time < timing.turn:
@@ -86,12 +88,18 @@ def _deed(time: float, held: set[int], is_alone: bool) -> str:
         return "reaches"
     if time < timing.reach + 0.8 * timing.close:
         return "closes"
-    if not held:
+    if not held_stalks:
         return "holds nothing"
-    return "holds the target" if is_alone else f"holds {len(held)} stalks" if len(held) > 1 else "holds another stalk"
+    return (
+        "holds the target"
+        if is_alone
+        else f"holds {len(held_stalks)} stalks"
+        if len(held_stalks) > 1
+        else "holds another stalk"
+    )
 
 
-def _captioned(frame: np.ndarray, left: str, right: str, colour: tuple[int, int, int]) -> Image.Image:
+def _add_caption(frame: np.ndarray, left: str, right: str, colour: tuple[int, int, int]) -> Image.Image:
     """Return the frame below a header with two captions; the right one has ``colour`` if it says what is held."""
     canvas = Image.new("RGB", (frame.shape[1], frame.shape[0] + _HEADER), BACKGROUND)
     canvas.paste(Image.fromarray(frame), (0, _HEADER))

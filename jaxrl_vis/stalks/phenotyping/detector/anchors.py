@@ -31,21 +31,21 @@ def make_anchors(shape: tuple[int, int], heights: float, widths: tuple[float, ..
     return np.stack([x - wide / 2, y - half, x + wide / 2, y + half, x, x], axis=-1).reshape(-1, 6).astype(np.float32)
 
 
-def encode(stalks: jax.Array, others: jax.Array) -> jax.Array:
-    """Encode stalks [..., 6] as box offsets [..., 6] relative to the reference boxes ``others`` [..., 6]."""
-    middle, size = _middle_and_size(others)
+def encode(stalks: jax.Array, anchors: jax.Array) -> jax.Array:
+    """Encode stalks [..., 6] as box offsets [..., 6] relative to the reference boxes ``anchors`` [..., 6]."""
+    middle, size = _middle_and_size(anchors)
     own_middle, own_size = _middle_and_size(stalks)
-    axis = (stalks[..., 4:] - others[..., 4:]) / size[..., :1]
+    axis = (stalks[..., 4:] - anchors[..., 4:]) / size[..., :1]
     return jnp.concatenate([(own_middle - middle) / size, jnp.log(own_size / size), axis], axis=-1) / _UNIT
 
 
-def decode(codes: jax.Array, others: jax.Array) -> jax.Array:
+def decode(offsets: jax.Array, anchors: jax.Array) -> jax.Array:
     """Decode box offsets [..., 6] to stalks [..., 6]; inverse of `encode`, up to the clipping of sizes."""
-    codes = codes * _UNIT
-    middle, size = _middle_and_size(others)
-    half = 0.5 * size * jnp.exp(jnp.clip(codes[..., 2:4], -_MAX_LOG_SIZE, _MAX_LOG_SIZE))
-    centre = middle + codes[..., :2] * size
-    axis = others[..., 4:] + codes[..., 4:] * size[..., :1]
+    offsets = offsets * _UNIT
+    middle, size = _middle_and_size(anchors)
+    half = 0.5 * size * jnp.exp(jnp.clip(offsets[..., 2:4], -_MAX_LOG_SIZE, _MAX_LOG_SIZE))
+    centre = middle + offsets[..., :2] * size
+    axis = anchors[..., 4:] + offsets[..., 4:] * size[..., :1]
     return jnp.concatenate([centre - half, centre + half, axis], axis=-1)
 
 

@@ -44,7 +44,7 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
     # Fixed-point iteration over all boxes at once: a box is kept unless a kept box of higher score suppresses it. Each round
     # settles at least the next box in order and never changes a settled one, so it converges to the sequential result, usually
     # in a few rounds instead of N steps.
-    def unsettled(state: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def is_unsettled(state: tuple[jax.Array, jax.Array]) -> jax.Array:
         selected, before = state
         return (selected != before).any()
 
@@ -52,7 +52,7 @@ def suppress(overlaps: jax.Array, scores: jax.Array, threshold: float, valid: ja
         selected, _ = state
         return there & ~(better & selected[:, None]).any(axis=0), selected
 
-    selected, _ = jax.lax.while_loop(unsettled, again, again((there, ~there)))
+    selected, _ = jax.lax.while_loop(is_unsettled, again, again((there, ~there)))
     return jnp.zeros(scores.shape, bool).at[order].set(selected)
 
 
@@ -73,8 +73,8 @@ def band_overlap(first: jax.Array, second: jax.Array, lines: int = 8) -> jax.Arr
     union = (high - low).sum(-1)[:, None] + (other_high - other_low).sum(-1)[None] - common
     across = common / jnp.maximum(union, 1e-6)
     shared = jnp.minimum(first[:, None, 3], second[None, :, 3]) - jnp.maximum(first[:, None, 1], second[None, :, 1])
-    least = jnp.minimum((first[:, 3] - first[:, 1])[:, None], (second[:, 3] - second[:, 1])[None])
-    return across * jnp.clip(shared / jnp.maximum(least, 1e-6), 0.0, 1.0)
+    shorter = jnp.minimum((first[:, 3] - first[:, 1])[:, None], (second[:, 3] - second[:, 1])[None])
+    return across * jnp.clip(shared / jnp.maximum(shorter, 1e-6), 0.0, 1.0)
 
 
 def _edges(stalks: jax.Array, lines: int) -> tuple[jax.Array, jax.Array]:
@@ -123,8 +123,8 @@ def roi_align(
     def weights(low: jax.Array, high: jax.Array, cells: int, length: int) -> jax.Array:
         """Return interpolation weights [..., cells, length] of features in the cells between ``low`` and ``high`` [...]."""
         extent = high - low if aligned else jnp.maximum(high - low, 1.0)
-        share = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
-        place = low[..., None] + extent[..., None] * share
+        fraction = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
+        place = low[..., None] + extent[..., None] * fraction
         inside = (place >= -1.0) & (place <= length)
         place = jnp.clip(place, 0.0, length - 1.0)
         weight = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(length)), 0.0) * inside[..., None]

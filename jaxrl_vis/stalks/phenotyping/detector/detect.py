@@ -21,53 +21,53 @@ class Settings:
     """Settings of the networks, stored with their weights.
 
     Attributes:
-        density: Resolution at the row to which images are resized before detection, pixels per metre; 0 for networks trained on
-            images of unknown cameras, which are resized to `width`.
+        pixels_per_metre: Resolution at the row to which images are resized before detection; 0 for networks trained on images
+            of unknown cameras, which are resized to `width`.
         width, lines: Width and height of a resized image of the training cameras, pixels. Images of unknown cameras are
-            downscaled to the width; narrower ones are not enlarged unless `density` is 0.
-        full_width: Image width in pixels at which stalk crops measure `snip_lines` x `snip_columns`; at fewer pixels per metre
+            downscaled to the width; narrower ones are not enlarged unless `pixels_per_metre` is 0.
+        full_width: Image width in pixels at which stalk crops measure `crop_height` x `crop_width`; at fewer pixels per metre
             they shrink in proportion.
-        snip_lines, snip_columns: Height and width of a stalk crop, pixels.
-        band_lines: Height of the band in the resized image, pixels.
+        crop_height, crop_width: Height and width of a stalk crop, pixels.
+        band_height: Height of the band in the resized image, pixels.
         anchor_widths: Widths of the anchors in the resized image, pixels.
         channels, hidden: Sizes of the detector; see `detector_networks.Detector`.
         segmenter: Channels of each level of the segmentation network.
         candidates: Number of top-scoring boxes that enter the suppression of proposals. Most are duplicates of easy stalks:
             with 480, two thirds of the stalks missed in crowded images had no candidate.
         proposals: Number of proposals passed to the box head.
-        most: Maximum number of stalks in an image.
+        max_stalks: Maximum number of stalks in an image.
         proposal_threshold: Strip overlap above which proposals are suppressed as duplicates.
         threshold: Strip overlap above which detections are suppressed as duplicates.
-        least_score: Minimum score of a detection.
+        min_score: Minimum score of a detection.
     """
 
-    density: float = 677.5
+    pixels_per_metre: float = 677.5
     width: int = 844
     lines: int = 676
     full_width: int = 3376
-    snip_lines: int = 640
-    snip_columns: int = 128
-    band_lines: float = 135.0
+    crop_height: int = 640
+    crop_width: int = 128
+    band_height: float = 135.0
     anchor_widths: tuple[float, ...] = (12.0, 24.0, 48.0)
     channels: tuple[int, int, int, int] = (24, 48, 64, 64)
     hidden: int = 128
     segmenter: tuple[int, ...] = (16, 32, 48, 64)
     candidates: int = 1920
     proposals: int = 160
-    most: int = 64
+    max_stalks: int = 64
     proposal_threshold: float = 0.7
     threshold: float = 0.4
-    least_score: float = 0.05
+    min_score: float = 0.05
 
-    def resizing(self, width: int, density: float | None) -> float:
+    def scale_for(self, width: int, pixels_per_metre: float | None) -> float:
         """Return the factor by which an image is resized before detection.
 
         Args:
             width: Width of the image, pixels.
-            density: Pixels per metre at the row; None if the camera is unknown, which is then assumed to cover the same width
-                of the row as the training cameras.
+            pixels_per_metre: Resolution at the row; None if the camera is unknown, which is then assumed to cover the same
+                width of the row as the training cameras.
         """
-        return self.density / density if density and self.density else self.width / width
+        return self.pixels_per_metre / pixels_per_metre if pixels_per_metre and self.pixels_per_metre else self.width / width
 
     def detector(self, dtype: Any = jnp.float32) -> Detector:
         """Return the detector of these settings, with convolutions in ``dtype``."""
@@ -139,7 +139,7 @@ def best_proposals(
     """
     count = min(settings.candidates, logits.shape[0])
     scores, places = jax.lax.top_k(logits, count)
-    stalks = within(decode(codes[places], anchors[places]), shape)
+    stalks = clip_to_image(decode(codes[places], anchors[places]), shape)
     size = stalks[:, 2:4] - stalks[:, :2]
     selected = suppress(band_overlap(stalks, stalks), scores, settings.proposal_threshold)
     selected &= (size[:, 0] > 2.0) & (size[:, 1] > 8.0)
@@ -148,7 +148,7 @@ def best_proposals(
     return stalks[places], best, jnp.isfinite(best)
 
 
-def within(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
+def clip_to_image(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """Clip the boxes of stalks [N, 6] to an image of ``shape`` (height, width), and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = jnp.moveaxis(stalks, -1, 0)
     slope = (below - above) / jnp.maximum(bottom - top, 1e-3)
@@ -166,15 +166,15 @@ def heads(
     return logits, codes
 
 
-def judge(
+def classify_proposals(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
     """Score and refine proposals [P, 6] of one image with features [H, W, C], and remove duplicates."""
     logits, codes = heads(network, params, region_features(features, proposals), "classify")
     stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
-    valid = valid & (scores >= settings.least_score)
+    valid = valid & (scores >= settings.min_score)
     selected = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
-    best, places = jax.lax.top_k(jnp.where(selected, scores, -1.0), min(settings.most, scores.shape[0]))
+    best, places = jax.lax.top_k(jnp.where(selected, scores, -1.0), min(settings.max_stalks, scores.shape[0]))
     return Found(stalks[places], jnp.maximum(best, 0.0), best > 0.0)
 
 
@@ -190,16 +190,16 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     """
     network = settings.detector(dtype)
     shape = (image.shape[0], image.shape[1])
-    anchors = jnp.asarray(make_anchors(shape, settings.band_lines, settings.anchor_widths))
+    anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
     features = network.apply(params, normalise(image)[None], method="features")
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
     proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
-    found = judge(network, params, features[0], proposals, valid, settings)
-    return dataclasses.replace(found, pooled=_pooled(features[0], image))
+    detected = classify_proposals(network, params, features[0], proposals, valid, settings)
+    return dataclasses.replace(detected, pooled=_pool_features(features[0], image))
 
 
-def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:
+def _pool_features(features: jax.Array, image: jax.Array) -> jax.Array:
     """Compute mean and standard deviation [2 C] float32 of features [h, w, C] where the image [H, W, 3] is not black."""
     values = features.astype(jnp.float32)
     lit = image.any(axis=-1).reshape(values.shape[0], STRIDE[0], values.shape[1], STRIDE[1]).any(axis=(1, 3))
@@ -208,7 +208,7 @@ def _pooled(features: jax.Array, image: jax.Array) -> jax.Array:
     return jnp.concatenate([mean, jnp.sqrt((weights * (values - mean) ** 2).sum(axis=(0, 1)))])
 
 
-def initial(settings: Settings, key: jax.Array) -> Any:
+def init_detector(settings: Settings, key: jax.Array) -> Any:
     """Initialise the parameters of a detector at random."""
     images = jax.ShapeDtypeStruct((1, 2 * PADDING, 2 * PADDING, 3), jnp.float32)
     regions = jax.ShapeDtypeStruct((1, *GRID, settings.channels[2]), jnp.float32)

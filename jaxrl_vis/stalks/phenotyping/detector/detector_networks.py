@@ -113,9 +113,9 @@ class Segmenter(nn.Module):
     dtype: jnp.dtype = jnp.float32
 
     @nn.compact
-    def __call__(self, snips: jax.Array) -> jax.Array:
+    def __call__(self, crops: jax.Array) -> jax.Array:
         """Return mask logits [N, H, W] of stalk crops [N, H, W, 3]."""
-        x = snips.astype(self.dtype)
+        x = crops.astype(self.dtype)
         across = jnp.linspace(-1.0, 1.0, x.shape[2], dtype=self.dtype)
         # The horizontal distance from the centre tells the network which stalk is meant.
         x = jnp.concatenate([x, jnp.broadcast_to(jnp.abs(across)[None, None, :, None], (*x.shape[:3], 1))], axis=-1)

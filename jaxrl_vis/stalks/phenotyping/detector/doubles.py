@@ -15,13 +15,13 @@ Piece = tuple[np.ndarray, tuple[int, int]]
 """Mask [h, w] of a part of the image, and the image row and column of its first pixel."""
 
 
-def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared: float = MAX_SHARED) -> np.ndarray:
+def suppress_duplicates(pieces: Sequence[Piece], scores: np.ndarray, max_shared: float = MAX_SHARED) -> np.ndarray:
     """Apply greedy non-maximum suppression by mask overlap.
 
     Args:
         pieces: N masks, float32 from 0 to 1 (thresholded at 0.5) or bool, with their positions.
         scores: Scores [N] of the detections; ties are broken by the lower index.
-        most_shared: Overlap as a fraction of the smaller mask above which two detections are duplicates.
+        max_shared: Overlap as a fraction of the smaller mask above which two detections are duplicates.
 
     Returns:
         [N] bool, True for the detections to keep.
@@ -31,14 +31,14 @@ def without_duplicates(pieces: Sequence[Piece], scores: np.ndarray, most_shared:
     selected: list[int] = []
     for place in np.argsort(-np.asarray(scores), kind="stable").tolist():
         corner = pieces[place][1]
-        shared = (_shared(inside[place], corner, inside[other], pieces[other][1]) for other in selected)
-        least = (min(sizes[place], sizes[other]) for other in selected)
-        if not any(common > most_shared * size for common, size in zip(shared, least)):
+        shared = (_overlap(inside[place], corner, inside[other], pieces[other][1]) for other in selected)
+        smaller = (min(sizes[place], sizes[other]) for other in selected)
+        if not any(common > max_shared * size for common, size in zip(shared, smaller)):
             selected.append(place)
     return np.isin(np.arange(len(pieces)), selected)
 
 
-def _shared(first: np.ndarray, corner: tuple[int, int], second: np.ndarray, other: tuple[int, int]) -> int:
+def _overlap(first: np.ndarray, corner: tuple[int, int], second: np.ndarray, other: tuple[int, int]) -> int:
     """Count the pixels that two masks have in common."""
     low = np.maximum(corner, other)
     high = np.minimum(np.add(corner, first.shape), np.add(other, second.shape))

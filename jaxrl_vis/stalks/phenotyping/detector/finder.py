@@ -12,9 +12,9 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.doubles import without_duplicates
+from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, put_back, smoothed, snip_shape
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste, preprocess_crops
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.width import Strip, strip_width
 from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
@@ -66,7 +66,7 @@ UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
 """Distance from the middle of the band up to the upper height, as a multiple of the height of the band."""
 
 
-def higher_up(stalk: np.ndarray) -> np.ndarray:
+def upper_segment(stalk: np.ndarray) -> np.ndarray:
     """Extrapolate a stalk [6] in the band along its axis to its segment [6] around the upper height, of half its height."""
     left, top, right, bottom, above, below = stalk
     tall = bottom - top
@@ -78,27 +78,29 @@ def higher_up(stalk: np.ndarray) -> np.ndarray:
     return np.array([min(ends) - half, first, max(ends) + half, last, *ends], np.float32)
 
 
-def resize_factor(width: int, settings: Settings, density: float | None) -> float:
+def resize_factor(width: int, settings: Settings, pixels_per_metre: float | None) -> float:
     """Return the factor by which `resize` resizes an image ``width`` pixels wide.
 
-    An image is enlarged only if its ``density`` is known, or if the networks were trained on images of unknown cameras.
+    An image is enlarged only if its ``pixels_per_metre`` is known or the networks were trained on images of unknown cameras.
     """
-    return min(settings.resizing(width, density), _MAX_ENLARGED if density or not settings.density else 1.0)
+    return min(
+        settings.scale_for(width, pixels_per_metre), _MAX_ENLARGED if pixels_per_metre or not settings.pixels_per_metre else 1.0
+    )
 
 
-def resize(image: np.ndarray, settings: Settings, density: float | None) -> tuple[np.ndarray, tuple[float, float]]:
+def resize(image: np.ndarray, settings: Settings, pixels_per_metre: float | None) -> tuple[np.ndarray, tuple[float, float]]:
     """Resize an image for detection.
 
     Args:
         image: [H, W, 3] uint8.
         settings: Settings of the networks.
-        density: Pixels per metre at the row; None if unknown.
+        pixels_per_metre: Resolution of the image at the row; None if unknown.
 
     Returns:
         Resized image, and the vertical and horizontal scale factors from its coordinates to those of the original.
     """
     height, across = image.shape[:2]
-    factor = resize_factor(across, settings, density)
+    factor = resize_factor(across, settings, pixels_per_metre)
     lines, columns = max(round(height * factor), 1), max(round(across * factor), 1)
     if (lines, columns) == (height, across):
         return image, (1.0, 1.0)
@@ -106,7 +108,7 @@ def resize(image: np.ndarray, settings: Settings, density: float | None) -> tupl
     return cv2.resize(image, (columns, lines), interpolation=how), (height / lines, across / columns)
 
 
-def usual_lines(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
+def pad_to_training_height(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]:
     """Crop or pad an image to the height of the training images.
 
     The networks also recognise the band by its position in the image. With another field of view, the centre of the image is
@@ -114,7 +116,7 @@ def usual_lines(image: np.ndarray, settings: Settings) -> tuple[np.ndarray, int]
     is within the range of training are returned unchanged.
 
     Args:
-        image: [H, W, 3] uint8 at the ``density`` of the settings.
+        image: [H, W, 3] uint8 at the ``pixels_per_metre`` of the settings.
         settings: Settings of the networks.
 
     Returns:
@@ -135,15 +137,15 @@ def in_image(stalks: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
-def segment(params: Any, snips: jax.Array, settings: Settings, dtype: Any, full: tuple[int, int]) -> jax.Array:
+def segment(params: Any, crops: jax.Array, settings: Settings, dtype: Any, full_shape: tuple[int, int]) -> jax.Array:
     """Compute probabilities [N, h, w] float32 that pixels of stalk crops [N, h, w, 3] uint8 show the stalk in the centre.
 
-    Crops are resized to the ``full`` size (height, width) for the network, and probabilities back to the size of the crops: the
+    Crops are resized to ``full_shape`` (height, width) for the network, and probabilities back to the size of the crops: the
     network was trained on stalks of that width in pixels.
     """
-    count, *shape = snips.shape[:3]
-    enlarged = jax.image.resize(snips.astype(jnp.float32), (count, *full, 3), "linear")
-    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(enlarged))
+    count, *shape = crops.shape[:3]
+    enlarged = jax.image.resize(crops.astype(jnp.float32), (count, *full_shape, 3), "linear")
+    logits = Segmenter(settings.segmenter, dtype).apply(params, preprocess_crops(enlarged))
     assert isinstance(logits, jax.Array)
     return jax.image.resize(jax.nn.sigmoid(logits), (count, *shape), "linear")
 
@@ -154,7 +156,7 @@ class Finder:
     Args:
         params: Parameters with keys ``detector`` and ``segmenter``.
         settings: Settings stored with the weights.
-        least_score: Minimum score of a detection; 0.5 balances misses against false detections.
+        min_score: Minimum score of a detection; 0.5 balances misses against false detections.
         gate: Gate that estimates how likely each image is misread; None if there is none for these weights.
 
     Attributes:
@@ -162,66 +164,66 @@ class Finder:
         gate: Gate as passed to the constructor.
     """
 
-    def __init__(self, params: Any, settings: Settings, least_score: float = 0.5, gate: Gate | None = None) -> None:
-        self._params, self._settings, self._least, self.gate = params, settings, least_score, gate
+    def __init__(self, params: Any, settings: Settings, min_score: float = 0.5, gate: Gate | None = None) -> None:
+        self._params, self._settings, self._min_score, self.gate = params, settings, min_score, gate
         accelerated = jax.default_backend() in ("gpu", "tpu")
         self.dtype = jnp.bfloat16 if accelerated else jnp.float32
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
 
-    def __call__(self, image: np.ndarray, density: float | None = None) -> Detections:
+    def __call__(self, image: np.ndarray, pixels_per_metre: float | None = None) -> Detections:
         """Detect and segment the stalks of an image, sorted from left to right, without duplicates.
 
         Args:
             image: [H, W, 3] uint8.
-            density: Pixels per metre at the row; None if the camera is unknown.
+            pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
         """
         frame = find_frame(image)
-        detections = self._find(fill_borders(image, frame), density, frame)
+        detections = self._find(fill_borders(image, frame), pixels_per_metre, frame)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
-        return Detections((_moved(detection, frame) for detection in ordered), doubt=detections.doubt)
+        return Detections((_in_whole_image(detection, frame) for detection in ordered), doubt=detections.doubt)
 
-    def look(self, image: np.ndarray, density: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(self, image: np.ndarray, pixels_per_metre: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Detect stalks without segmenting them.
 
         Args:
             image: [h, w, 3] uint8, without black borders.
-            density: Pixels per metre at the row; None if the camera is unknown.
+            pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
 
         Returns:
-            Boxes and axes [N, 6] of all detections down to `Settings.least_score`, in continuous image coordinates, their
+            Boxes and axes [N, 6] of all detections down to `Settings.min_score`, in continuous image coordinates, their
             scores [N], and the pooled features [2 C] of the backbone.
         """
         settings = self._settings
-        reduced, scale = resize(image, settings, density)
+        reduced, scale = resize(image, settings, pixels_per_metre)
         added = 0
-        if density and settings.density:
-            reduced, added = usual_lines(reduced, settings)
-        found = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
-        assert found.pooled is not None
-        moved = found.stalks[found.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
-        return in_image(moved, scale), found.scores[found.valid], np.asarray(found.pooled)
+        if pixels_per_metre and settings.pixels_per_metre:
+            reduced, added = pad_to_training_height(reduced, settings)
+        detected = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
+        assert detected.pooled is not None
+        moved = detected.stalks[detected.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
+        return in_image(moved, scale), detected.scores[detected.valid], np.asarray(detected.pooled)
 
-    def _find(self, image: np.ndarray, density: float | None, frame: Frame) -> Detections:
+    def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
         settings = self._settings
-        share = settings.width / settings.full_width / settings.resizing(image.shape[1], density)
-        stalks, scores, pooled = self.look(image, density)
+        relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
+        stalks, scores, pooled = self.look(image, pixels_per_metre)
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
-        selected = scores >= self._least
+        selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
-        inside = np.array([_is_shown(stalk, frame) for stalk in stalks], bool)
+        inside = np.array([_is_inside_frame(stalk, frame) for stalk in stalks], bool)
         stalks, scores = stalks[inside], scores[inside]
         on_device = jnp.asarray(image)
-        pieces = self._pieces(on_device, stalks, settings.snip_lines, share)
-        pieces = [(_without_border(mask, corner, frame), corner) for mask, corner in pieces]
-        once = np.flatnonzero(without_duplicates(pieces, scores))
+        pieces = self._pieces(on_device, stalks, settings.crop_height, relative_scale)
+        pieces = [(_clear_border_rows(mask, corner, frame), corner) for mask, corner in pieces]
+        once = np.flatnonzero(suppress_duplicates(pieces, scores))
         stalks, scores, pieces = stalks[once], scores[once], [pieces[place] for place in once]
         strips = [strip_width(mask) if mask.size else None for mask, _ in pieces]
-        higher = [_follow(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
+        higher = [_extrapolate_upward(stalk, strip, corner) for stalk, strip, (_, corner) in zip(stalks, strips, pieces)]
         shown = [place for place, upper in enumerate(higher) if upper is not None]
         some = np.array([higher[place] for place in shown], np.float32).reshape(-1, 6)
-        above = self._pieces(on_device, some, settings.snip_lines // 2, share)
-        upper = {place: (_without_border(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
+        above = self._pieces(on_device, some, settings.crop_height // 2, relative_scale)
+        upper = {place: (_clear_border_rows(mask, corner, frame), corner) for place, (mask, corner) in zip(shown, above)}
         detections = Detections(doubt=doubt)
         for place, (stalk, score, (mask, corner)) in enumerate(zip(stalks, scores, pieces)):
             if mask.size:
@@ -232,29 +234,29 @@ class Finder:
         return detections
 
     def _pieces(
-        self, image: jax.Array, stalks: np.ndarray, lines: int, share: float
+        self, image: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float
     ) -> list[tuple[np.ndarray, tuple[int, int]]]:
         """Segment stalks [N, 6] in crops of ``lines`` rows at full resolution; return masks and their corners in the image."""
-        snips = self._segment(image, stalks, lines, share)
-        return [put_back(snip, stalk, (image.shape[0], image.shape[1])) for snip, stalk in zip(snips, stalks)]
+        crops = self._segment(image, stalks, lines, relative_scale)
+        return [paste(crop, stalk, (image.shape[0], image.shape[1])) for crop, stalk in zip(crops, stalks)]
 
-    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, share: float) -> np.ndarray:
-        """Compute masks [N, h, w] float32 of the crops of stalks [N, 6]; ``share`` is the resolution relative to full."""
+    def _segment(self, on_device: jax.Array, stalks: np.ndarray, lines: int, relative_scale: float) -> np.ndarray:
+        """Compute masks [N, h, w] float32 of the crops of stalks [N, 6]; ``relative_scale``: see `crop_shape`."""
         settings = self._settings
-        full = (lines, settings.snip_columns)
-        shape = snip_shape(full, share)
+        full = (lines, settings.crop_width)
+        shape = crop_shape(full, relative_scale)
         if not len(stalks):
             return np.zeros((0, *shape), np.float32)
         masks = []
         for start in range(0, len(stalks), self._batch):
             part = stalks[start : start + self._batch]
             filled = np.pad(part, ((0, self._batch - len(part)), (0, 0)), mode="edge")
-            snips = cut(on_device, filled, shape)
-            masks.append(segment(self._params["segmenter"], snips, settings, self.dtype, full))
+            crops = cut(on_device, filled, shape)
+            masks.append(segment(self._params["segmenter"], crops, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
 
 
-def _is_shown(stalk: np.ndarray, frame: Frame) -> bool:
+def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:
     """Return whether more than half of the axis of a stalk [6] lies outside the black borders."""
     if frame.shown is None:
         return True
@@ -264,7 +266,7 @@ def _is_shown(stalk: np.ndarray, frame: Frame) -> bool:
     return bool(np.mean(shown[line[there], column[there]]) > _SHOWN) if there.any() else False
 
 
-def _without_border(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
+def _clear_border_rows(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> np.ndarray:
     """Return a mask with the rows cleared in which it reaches a black border: the stalk may continue there."""
     if frame.shown is None or not mask.size:
         return mask
@@ -275,7 +277,7 @@ def _without_border(mask: np.ndarray, corner: tuple[int, int], frame: Frame) -> 
     return visible
 
 
-def _moved(detection: Detection, frame: Frame) -> Detection:
+def _in_whole_image(detection: Detection, frame: Frame) -> Detection:
     """Convert a detection from the coordinates of a frame to those of the whole image."""
     down, over = frame.lines[0], frame.columns[0]
     if not down and not over:
@@ -291,11 +293,11 @@ def _moved(detection: Detection, frame: Frame) -> Detection:
     )
 
 
-def _follow(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:
+def _extrapolate_upward(stalk: np.ndarray, strip: Strip | None, corner: tuple[int, int]) -> np.ndarray | None:
     """Extrapolate a stalk to its upper segment [6] by the edges of its mask; None if outside the image or without edges."""
     if strip is None:
         return None
     # Half a pixel from pixel centres to the continuous coordinates of stalks.
     axis = [0.5 * sum(strip.edges(line - 0.5 - corner[0])) + corner[1] + 0.5 for line in (stalk[1], stalk[3])]
-    upper = higher_up(np.array([*stalk[:4], *axis], np.float32))
+    upper = upper_segment(np.array([*stalk[:4], *axis], np.float32))
     return upper if upper[1] > 0 else None

@@ -118,7 +118,7 @@ def read_gate(weights: Path) -> Gate | None:
 
 
 def fit_gate(
-    pooled: np.ndarray, scores: list[np.ndarray], wrong: np.ndarray, plots: np.ndarray, axes: int, most_flagged: float
+    pooled: np.ndarray, scores: list[np.ndarray], wrong: np.ndarray, plots: np.ndarray, axes: int, max_flagged: float
 ) -> Gate:
     """Fit a gate.
 
@@ -131,7 +131,7 @@ def fit_gate(
         wrong: [N] bool, True for images that were misread.
         plots: [N] int, plot of each image.
         axes: Number of principal axes.
-        most_flagged: Fraction of the correctly read images above the threshold (false positive rate).
+        max_flagged: Fraction of the correctly read images above the threshold (false positive rate).
 
     Raises:
         ValueError: There are too few correctly read images, or no misread ones.
@@ -146,7 +146,7 @@ def fit_gate(
         measures[here] = [of_others.measures(pooled[place], scores[place]) for place in here]
     weights = logistic(measures, wrong)
     doubts = 1.0 / (1.0 + np.exp(-np.clip(weights[0] + measures @ weights[1:], -30.0, 30.0)))
-    threshold = float(np.quantile(doubts[~wrong], 1.0 - most_flagged))
+    threshold = float(np.quantile(doubts[~wrong], 1.0 - max_flagged))
     return dataclasses.replace(_statistics(pooled[~wrong], axes), weights=weights, threshold=threshold)
 
 
@@ -169,12 +169,12 @@ def logistic(measures: np.ndarray, wrong: np.ndarray) -> np.ndarray:
         Intercept and weights [1 + M].
     """
     inputs = np.concatenate([np.ones((len(measures), 1)), measures], axis=1)
-    share = np.where(wrong, 0.5 / wrong.sum(), 0.5 / (~wrong).sum())
+    weight = np.where(wrong, 0.5 / wrong.sum(), 0.5 / (~wrong).sum())
     shrink = np.diag([0.0, *[1e-3] * measures.shape[1]])
     weights = np.zeros(inputs.shape[1])
     for _ in range(50):
         chance = 1.0 / (1.0 + np.exp(-np.clip(inputs @ weights, -30.0, 30.0)))
-        slope = inputs.T @ (share * (chance - wrong)) + shrink @ weights
-        bend = (inputs.T * (share * chance * (1.0 - chance))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
+        slope = inputs.T @ (weight * (chance - wrong)) + shrink @ weights
+        bend = (inputs.T * (weight * chance * (1.0 - chance))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
         weights = weights - np.linalg.solve(bend, slope)
     return weights

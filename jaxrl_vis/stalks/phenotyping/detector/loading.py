@@ -34,39 +34,39 @@ def detector_name(weights: Path) -> str:
 
 
 @functools.cache
-def _load(weights: Path, digest: str, least_score: float) -> Finder:
+def _load(weights: Path, digest: str, min_score: float) -> Finder:
     params, settings, _ = read_weights(weights)
-    return Finder(params, settings, least_score, read_gate(weights))
+    return Finder(params, settings, min_score, read_gate(weights))
 
 
-def load_finder(weights: Path, least_score: float) -> Finder:
+def load_finder(weights: Path, min_score: float) -> Finder:
     """Load the networks; cached by the path and contents of the file within a process.
 
     Args:
         weights: Weights file.
-        least_score: Minimum score of a detection, 0 to 1.
+        min_score: Minimum score of a detection, 0 to 1.
 
     Raises:
         RequestError: The weights cannot be read.
     """
-    return _load(weights, file_digest(weights), least_score)
+    return _load(weights, file_digest(weights), min_score)
 
 
 @functools.cache
-def _shared_finder(weights: Path, least_score: float) -> Finder:
-    return load_finder(weights, least_score)
+def _cached_finder(weights: Path, min_score: float) -> Finder:
+    return load_finder(weights, min_score)
 
 
 def find_stalks(
-    weights: Path, least_score: float, image: np.ndarray, density: float | None, plot: Any, pair: Any
+    weights: Path, min_score: float, image: np.ndarray, pixels_per_metre: float | None, plot: Any, pair: Any
 ) -> list[Detection]:
     """Detect the stalks of an image in any process: a `functools.partial` of this function can be pickled.
 
     Args:
         weights: Weights file, which must not change during the lifetime of the process.
-        least_score: Minimum score of a detection, 0 to 1.
+        min_score: Minimum score of a detection, 0 to 1.
         image: Left image [H, W, 3] uint8.
-        density: Pixels per metre at the row; None if the camera is unknown.
+        pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
         plot, pair: Folder and files of the image; unused.
     """
-    return _shared_finder(weights, least_score)(image, density)
+    return _cached_finder(weights, min_score)(image, pixels_per_metre)

@@ -10,7 +10,7 @@ from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, region_features
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import smoothed
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import preprocess_crops
 
 # Kinds of true stalks: NOTHING is padding, UNCLEAR is too occluded to count as positive or negative.
 NOTHING, UNCLEAR, STALK = 0, 1, 2
@@ -59,7 +59,7 @@ def detector_loss(
     """
     network = settings.detector(dtype)
     shape = (images.shape[1], images.shape[2])
-    anchors = jnp.asarray(make_anchors(shape, settings.band_lines, settings.anchor_widths))
+    anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
     features = network.apply(params, normalise(images), method="features")
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
@@ -97,23 +97,23 @@ def _focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
     return (loss * (shows | none)).sum()
 
 
-def _distance(codes: jax.Array, wanted: jax.Array, shows: jax.Array) -> jax.Array:
+def _distance(codes: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
     """Compute the Huber loss of box offsets [K, 6], averaged over the positive boxes."""
-    loss = optax.huber_loss(codes, jnp.clip(wanted, -20.0, 20.0), delta=1.0).sum(axis=-1)
+    loss = optax.huber_loss(codes, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 
 
-def segmenter_loss(params: Any, snips: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
+def segmenter_loss(params: Any, crops: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
     """Compute the cross-entropy and Dice loss of the segmentation of stalk crops.
 
     Args:
         params: Parameters of the segmentation network.
-        snips: Stalk crops [N, h, w, 3] uint8.
+        crops: Stalk crops [N, h, w, 3] uint8.
         masks: True masks [N, h, w] bool.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
     """
-    logits = Segmenter(settings.segmenter, dtype).apply(params, smoothed(snips))
+    logits = Segmenter(settings.segmenter, dtype).apply(params, preprocess_crops(crops))
     assert isinstance(logits, jax.Array)
     return mask_loss(logits, masks)
 

@@ -1,4 +1,4 @@
-"""Stalk crops ("snips"): full-resolution crops of an image, sheared so that the stalk stands upright in the centre.
+"""Stalk crops: full-resolution crops of an image, sheared so that the stalk stands upright in the centre.
 
 Each row of a crop is a part of an image row, shifted by a whole number of pixels: there is no interpolation, edges stay where
 they are, and a mask of the crop can be pasted back exactly.
@@ -15,14 +15,14 @@ _ALONG = 15  # rows of a full-size stalk crop that are averaged
 _EXPONENT = 0.35
 
 
-def snip_shape(full: tuple[int, int], share: float) -> tuple[int, int]:
+def crop_shape(full_shape: tuple[int, int], scale: float) -> tuple[int, int]:
     """Return the height and width of stalk crops, multiples of 8 and at least 16.
 
     Args:
-        full: Height and width of crops of a full-resolution image.
-        share: Resolution of the image relative to full resolution.
+        full_shape: Height and width of crops of a full-resolution image.
+        scale: Resolution of the image relative to full resolution.
     """
-    lines, columns = (max(round(length * share / 8), 2) * 8 for length in full)
+    lines, columns = (max(round(length * scale / 8), 2) * 8 for length in full_shape)
     return lines, columns
 
 
@@ -42,8 +42,8 @@ def crop_places(stalks: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray,
     top = np.round(middle - 0.5 * shape[0]).astype(np.int32)
     tall = np.maximum(stalks[:, 3] - stalks[:, 1], 1.0)
     line = top[:, None] + np.arange(shape[0]) + 0.5
-    share = (line - stalks[:, 1:2]) / tall[:, None]
-    axis = stalks[:, 4:5] + (stalks[:, 5:6] - stalks[:, 4:5]) * share
+    fraction = (line - stalks[:, 1:2]) / tall[:, None]
+    axis = stalks[:, 4:5] + (stalks[:, 5:6] - stalks[:, 4:5]) * fraction
     return top, np.round(axis - 0.5 * shape[1]).astype(np.int32)
 
 
@@ -59,34 +59,34 @@ def cut(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Arr
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def _cut(image: jax.Array, top: jax.Array, left: jax.Array, across: int) -> jax.Array:
+def _cut(image: jax.Array, top: jax.Array, left: jax.Array, width: int) -> jax.Array:
     lines = top[:, None] + jnp.arange(left.shape[1])
-    columns = left[..., None] + jnp.arange(across)
+    columns = left[..., None] + jnp.arange(width)
     inside = ((lines >= 0) & (lines < image.shape[0]))[..., None] & (columns >= 0) & (columns < image.shape[1])
     taken = image[jnp.clip(lines, 0, image.shape[0] - 1)[..., None], jnp.clip(columns, 0, image.shape[1] - 1)]
     return jnp.where(inside.reshape(*inside.shape, *(1,) * (image.ndim - 2)), taken, jnp.zeros((), image.dtype))
 
 
-def smoothed(snips: jax.Array) -> jax.Array:
+def preprocess_crops(crops: jax.Array) -> jax.Array:
     """Preprocess stalk crops [N, h, w, 3] for segmentation: float32 in [-1, 1], smoothed along the stalk.
 
     Values are averaged over 15 rows, as edges run along a stalk and texture mostly does not, and bright tones are compressed.
     On textures not seen in training, this removes most of the bias towards narrow masks.
 
     Args:
-        snips: Stalk crops, uint8 or float from 0 to 255.
+        crops: Stalk crops, uint8 or float from 0 to 255.
     """
-    beside = _ALONG // 2
-    values = jnp.pad(snips.astype(jnp.float32) / 255.0, ((0, 0), (beside, beside), (0, 0), (0, 0)), mode="edge")
+    margin = _ALONG // 2
+    values = jnp.pad(crops.astype(jnp.float32) / 255.0, ((0, 0), (margin, margin), (0, 0), (0, 0)), mode="edge")
     sums = jax.lax.reduce_window(values, 0.0, jax.lax.add, (1, _ALONG, 1, 1), (1, 1, 1, 1), "VALID")
     return 2.0 * jnp.maximum(sums / _ALONG, 0.0) ** _EXPONENT - 1.0
 
 
-def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
+def paste(crop: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
     """Paste a stalk crop back to its position in the image.
 
     Args:
-        snip: Values [height, width] float32 of the crop, such as a mask.
+        crop: Values [height, width] float32 of the crop, such as a mask.
         stalk: [6], stalk that the crop was cut along; see `crop_places`.
         size: Height and width of the image.
 
@@ -94,13 +94,13 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
         Part of the image [h, w] float32, 0 outside the crop, and the image row and column of its first pixel; empty if the crop
         lies outside the image.
     """
-    top, left = (edge[0] for edge in crop_places(stalk[None], (snip.shape[0], snip.shape[1])))
-    columns = snip.shape[1]
-    used = np.flatnonzero((top + np.arange(snip.shape[0]) >= 0) & (top + np.arange(snip.shape[0]) < size[0]))
+    top, left = (edge[0] for edge in crop_places(stalk[None], (crop.shape[0], crop.shape[1])))
+    columns = crop.shape[1]
+    used = np.flatnonzero((top + np.arange(crop.shape[0]) >= 0) & (top + np.arange(crop.shape[0]) < size[0]))
     begin, end = max(int(left.min()), 0), min(int(left.max()) + columns, size[1])
     if not used.size or end <= begin:
         return np.zeros((0, 0), np.float32), (0, 0)
-    whole = np.zeros((used.size, end - begin), np.float32)
+    pasted = np.zeros((used.size, end - begin), np.float32)
     # Rows with the same horizontal shift are copied together.
     places = left[used] - begin
     breaks = [0, *(np.flatnonzero(np.diff(places)) + 1).tolist(), used.size]
@@ -108,5 +108,5 @@ def put_back(snip: np.ndarray, stalk: np.ndarray, size: tuple[int, int]) -> tupl
         place = int(places[first])
         low, high = max(place, 0), min(place + columns, end - begin)
         if high > low:
-            whole[first:last, low:high] = snip[used[first] : used[last - 1] + 1, low - place : high - place]
-    return whole, (int(top + used[0]), begin)
+            pasted[first:last, low:high] = crop[used[first] : used[last - 1] + 1, low - place : high - place]
+    return pasted, (int(top + used[0]), begin)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.weights_file import check_range, read_parameters, write_parameters
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 
 SHIPPED = Path(__file__).with_name("stalks.safetensors")
@@ -22,16 +22,26 @@ SCHEMA = 2
 the proposal."""
 _COMMAND = "jaxrl-vis phenotype train"
 _HINTS = fields.hints(Settings)
+_KEYS = {
+    "pixels_per_metre": "density",
+    "crop_height": "snip_lines",
+    "crop_width": "snip_columns",
+    "band_height": "band_lines",
+    "max_stalks": "most",
+    "min_score": "least_score",
+}
+"""Keys in files of the `Settings` fields that have another name there."""
+_FIELDS = {key: name for name, key in _KEYS.items()}
 # Minimum, maximum and divisor of each setting: a file must not request a network that does not fit in memory.
 _SANE: dict[str, tuple[float, float, int]] = {
-    "density": (0, 100_000, 1),
+    "pixels_per_metre": (0, 100_000, 1),
     **dict.fromkeys(("width", "full_width"), (32, 16384, 1)),
-    **dict.fromkeys(("snip_lines", "snip_columns"), (16, 2048, 8)),
-    **dict.fromkeys(("band_lines", "anchor_widths"), (0.1, 4096, 1)),
+    **dict.fromkeys(("crop_height", "crop_width"), (16, 2048, 8)),
+    **dict.fromkeys(("band_height", "anchor_widths"), (0.1, 4096, 1)),
     **dict.fromkeys(("channels", "segmenter"), (8, 512, 8)),
     "hidden": (1, 4096, 1),
-    **dict.fromkeys(("candidates", "proposals", "most"), (1, 10_000, 1)),
-    **dict.fromkeys(("proposal_threshold", "threshold", "least_score"), (0, 1, 1)),
+    **dict.fromkeys(("candidates", "proposals", "max_stalks"), (1, 10_000, 1)),
+    **dict.fromkeys(("proposal_threshold", "threshold", "min_score"), (0, 1, 1)),
 }
 
 
@@ -50,7 +60,8 @@ def write_weights(
     Raises:
         OSError: The file cannot be written.
     """
-    write_parameters(path, params, {"schema": SCHEMA, "settings": dataclasses.asdict(settings), **about}, bits)
+    stored = {_KEYS.get(name, name): value for name, value in dataclasses.asdict(settings).items()}
+    write_parameters(path, params, {"schema": SCHEMA, "settings": stored, **about}, bits)
 
 
 def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
@@ -67,10 +78,11 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         values = about.pop("settings")
         if not isinstance(values, dict):
             raise ValueError("settings are no table")
+        values = {_FIELDS.get(str(key), str(key)): value for key, value in values.items()}
         if about.pop("schema") != SCHEMA or not values.keys() <= _HINTS.keys():
             raise RequestError(f"{path} holds weights of another version: train them again with `{_COMMAND}`")
         settings = _checked(path, values)
-        return settings, declared(settings)
+        return settings, declare_shapes(settings)
 
     return read_parameters(path, _COMMAND, declare)
 
@@ -91,11 +103,11 @@ def _checked(path: Path, values: dict[str, Any]) -> Settings:
 
 
 @functools.lru_cache(maxsize=4)
-def declared(settings: Settings) -> dict[str, Any]:
+def declare_shapes(settings: Settings) -> dict[str, Any]:
     """Return the shapes and dtypes of the networks' parameters as nested dictionaries, without computing any of them."""
-    snips = jax.ShapeDtypeStruct((1, settings.snip_lines, settings.snip_columns, 3), jnp.float32)
+    crops = jax.ShapeDtypeStruct((1, settings.crop_height, settings.crop_width, 3), jnp.float32)
 
     def draw(key: jax.Array) -> dict[str, Any]:
-        return {"detector": initial(settings, key), "segmenter": Segmenter(settings.segmenter).lazy_init(key, snips)}
+        return {"detector": init_detector(settings, key), "segmenter": Segmenter(settings.segmenter).lazy_init(key, crops)}
 
     return jax.eval_shape(draw, jax.random.key(0))

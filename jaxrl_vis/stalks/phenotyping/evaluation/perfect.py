@@ -5,21 +5,21 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, higher_up
+from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, upper_segment
 
 
-def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray, least: float = 0.3) -> list[Detection]:
+def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray, min_visible: float = 0.3) -> list[Detection]:
     """Return the detections of the visible stalks of an image, from left to right, with score 1.
 
     Args:
         stalks: Stalks with ``stalk``, ``band_box`` and ``band_visible``, as in `truth.StalkInView` or plot.json.
         instance: Index of the stalk that each pixel shows, [H, W] int.
-        least: Minimum visible fraction of a stalk's part in the band.
+        min_visible: Minimum visible fraction of a stalk's part in the band.
     """
     detections = []
     height, width = instance.shape
     for stalk in stalks:
-        if stalk["band_box"] is None or stalk["band_visible"] < least:
+        if stalk["band_box"] is None or stalk["band_visible"] < min_visible:
             continue
         left, top, right, bottom = stalk["band_box"]
         first, last = max(round(left) - 3, 0), min(round(right) + 4, width)
@@ -43,9 +43,9 @@ def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndar
         instance: Index of the stalk that each pixel shows, [H, W] int.
         index: Index of the stalk.
     """
-    left, top, right, bottom = higher_up(stalk)[:4]
-    beside = right - left  # margin, as the stalk may bend
-    first, last = max(round(left - beside), 0), min(round(right + beside), instance.shape[1])
+    left, top, right, bottom = upper_segment(stalk)[:4]
+    margin = right - left  # margin, as the stalk may bend
+    first, last = max(round(left - margin), 0), min(round(right + margin), instance.shape[1])
     if top <= 0 or last <= first:
         return None
     lines = slice(round(top), round(bottom))

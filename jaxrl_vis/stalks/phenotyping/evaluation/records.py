@@ -26,7 +26,7 @@ from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis_envs.plants import Family
 
 SCHEMA = 3
-KEPT_SCORE = 0.05
+MIN_RECORDED_SCORE = 0.05
 """Minimum score of recorded detections: lower ones affect only the far end of the precision-recall curve."""
 
 
@@ -39,7 +39,7 @@ class Task:
         weights: File of the networks' weights; None for ground-truth boxes and masks.
         finder: Name of the networks, or ``truth``.
         method: Method of measuring widths.
-        least_score: Minimum score of a detection that counts.
+        min_score: Minimum score of a detection that counts.
         thesis: If true, also score the thesis's methods on the same detections.
         workers: Number of processes on the machine; stored in the records, as it affects the time per pair.
     """
@@ -48,7 +48,7 @@ class Task:
     weights: Path | None
     finder: str = "truth"
     method: Method = "strip"
-    least_score: float = 0.5
+    min_score: float = 0.5
     thesis: bool = False
     workers: int = 1
 
@@ -64,8 +64,8 @@ def evaluate_plot(task: Task, seed: int) -> Record:
     if task.weights is not None:
         from jaxrl_vis.stalks.phenotyping.detector.loading import load_finder
 
-        find = load_finder(task.weights, KEPT_SCORE)
-    score = score_plot(task.family, seed, find, task.method, task.least_score, task.thesis)
+        find = load_finder(task.weights, MIN_RECORDED_SCORE)
+    score = score_plot(task.family, seed, find, task.method, task.min_score, task.thesis)
     where = {"device": device_name(), "workers": task.workers, "revision": revision()}
     return {**where, **_record(score, task.family.rig.frames)}
 
@@ -86,7 +86,7 @@ def conditions(task: Task) -> dict[str, Any]:
         "finder": task.finder,
         "weights": None if task.weights is None else file_digest(task.weights),
         "method": task.method,
-        "least_score": task.least_score,
+        "least_score": task.min_score,
         "thesis": task.thesis,
     }
 
@@ -101,7 +101,7 @@ def evaluate_tasks(
     """Evaluate the same plots for several tasks in parallel processes.
 
     Args:
-        tasks: Name -> task; all have the same `Task.workers` and `Task.least_score`.
+        tasks: Name -> task; all have the same `Task.workers` and `Task.min_score`.
         seeds: Seeds of the plots.
         paths: Name -> JSON file of the task's records, written after each plot; None for no file. Plots that it already holds
             are not evaluated again.
@@ -117,7 +117,7 @@ def evaluate_tasks(
     """
     names = list(tasks)
     first = tasks[names[0]]
-    summarise_plots = functools.partial(summarise, first.least_score)
+    summarise_plots = functools.partial(summarise, first.min_score)
     tables = {name: RecordFile(paths[name], conditions(task), summarise_plots) for name, task in tasks.items()}
     started(sum(seed in table for table in tables.values() for seed in seeds))
     jobs = [(name, seed) for name in names for seed in seeds if seed not in tables[name]]
@@ -141,9 +141,9 @@ def read_scores(records: Iterable[Record]) -> list[PlotScore]:
     return [_read(record) for record in records]
 
 
-def summarise(least_score: float, records: Iterable[Record]) -> dict[str, Any]:
+def summarise(min_score: float, records: Iterable[Record]) -> dict[str, Any]:
     """Summarise the records of plots, see `summary`."""
-    return summary(read_scores(records), least_score)
+    return summary(read_scores(records), min_score)
 
 
 def _record(score: PlotScore, pairs: int) -> Record:

@@ -78,7 +78,7 @@ def score_plot(
     seed: int,
     find: Find | None,
     method: Method = "strip",
-    least_score: float = 0.5,
+    min_score: float = 0.5,
     with_thesis: bool = False,
 ) -> PlotScore:
     """Render a plot, run the whole pipeline on it, and score the results.
@@ -88,7 +88,7 @@ def score_plot(
         seed: Seed of the plot.
         find: Stalk detector, which should also return detections with low scores; None for ground-truth boxes and masks.
         method: Method of measuring widths.
-        least_score: Minimum score of a detection that counts.
+        min_score: Minimum score of a detection that counts.
         with_thesis: If true, also score the thesis's methods on the same detections.
     """
     sequence = Sequence.of(draw(family, seed))
@@ -102,9 +102,9 @@ def score_plot(
         left, right, instance = np.asarray(pair.left), np.asarray(pair.right), np.asarray(pair.instance)
         stalks = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
         started = time.monotonic()
-        finder = find or functools.partial(_perfectly, stalks, instance)
+        finder = find or functools.partial(_true_detections, stalks, instance)
         detections, ground = find_with_ground(finder, left, right, drive.stated)
-        selected = [place for place, detection in enumerate(detections) if detection.score >= least_score]
+        selected = [place for place, detection in enumerate(detections) if detection.score >= min_score]
         finds_kept = [detections[place] for place in selected]
         frames.append(measure_pair(finds_kept, left, right, drive.stated, method, ground))
         seconds.append(time.monotonic() - started)
@@ -142,8 +142,10 @@ def score_plot(
     )
 
 
-def _perfectly(stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, density: float | None) -> list[Detection]:
-    """Return ground-truth detections, with the signature of a detector; the image and density are ignored."""
+def _true_detections(
+    stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, pixels_per_metre: float | None
+) -> list[Detection]:
+    """Return ground-truth detections, with the signature of a detector; the image and its resolution are ignored."""
     return perfect_detections(map(dataclasses.asdict, stalks), instance, MIN_VISIBLE)
 
 
@@ -156,8 +158,8 @@ def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], 
 
 def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
     """Return the true diameter in mm, as the cameras face it, at a height in m; near a node, the mean above and below it."""
-    beside = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
-    return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in beside]))
+    offsets = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
+    return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in offsets]))
 
 
 def match(detections: list[Detection], stalks: list[StalkInView]) -> tuple[list[int | None], list[tuple[float, float]]]:
@@ -216,12 +218,12 @@ def average_precision(finds: np.ndarray, stalks: int) -> float:
     return float(np.where(place < len(precision), precision[np.minimum(place, len(precision) - 1)], 0.0).mean())
 
 
-def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, Any]:
+def summary(scores: Iterable[PlotScore], min_score: float = 0.5) -> dict[str, Any]:
     """Summarise the scores of plots.
 
     Args:
         scores: Scores of the plots.
-        least_score: Minimum score of a detection for ``precision``, ``recall`` and ``f1``.
+        min_score: Minimum score of a detection for ``precision``, ``recall`` and ``f1``.
 
     Returns:
         ``count_r2`` (1 - SSE / SST against y = x), ``count_mae``, ``count_bias`` (relative to the true number),
@@ -241,7 +243,7 @@ def summary(scores: Iterable[PlotScore], least_score: float = 0.5) -> dict[str, 
     upper = np.concatenate([score.upper for score in scores]) if scores else np.zeros((0, 2))
     upper_error = upper[:, 0] - upper[:, 1]
     people = np.random.default_rng(0).normal(0.0, PERSON_SD, (len(error), 2)).mean(axis=1)
-    selected = finds[finds[:, 0] >= least_score]
+    selected = finds[finds[:, 0] >= min_score]
     hits = float(selected[:, 1].sum())
     best, best_score = _best_f1(finds, stalks)
     return {

@@ -74,20 +74,20 @@ def write_plots(
     write_atomically(index, text)
     present = 0
     for seed in seeds:
-        whole = folder / plot_name(seed) / "plot.json"
-        if whole.exists():
-            if _holds(whole.parent, truth, family.rig.frames):
+        description = folder / plot_name(seed) / "plot.json"
+        if description.exists():
+            if _is_complete(description.parent, truth, family.rig.frames):
                 present += 1
                 done(seed, family.rig.frames)
                 continue
-            whole.unlink()  # incomplete until it is written again
-            for image in [*whole.parent.glob("left_*.*"), *whole.parent.glob("right_*.*")]:
+            description.unlink()  # incomplete until it is written again
+            for image in [*description.parent.glob("left_*.*"), *description.parent.glob("right_*.*")]:
                 image.unlink()  # may have another format
         write_plot(folder / plot_name(seed), draw(family, seed), image_format, truth, done)
     return present
 
 
-def _holds(folder: Path, truth: Truth, frames: int) -> bool:
+def _is_complete(folder: Path, truth: Truth, frames: int) -> bool:
     """Return whether a complete plot holds at least the requested ground truth."""
     maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
     wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]

@@ -36,15 +36,15 @@ def count_by_length(frames: list[list[Sighting]], calibration: Calibration, leng
         calibration: Calibration of the cameras.
         length: Length of the plot, m.
     """
-    shares = []
+    densities = []
     for sightings in frames:
         depths = [sighting.depth_m for sighting in sightings if sighting.depth_m is not None]
         if depths:
             extent = calibration.width / calibration.focal * float(np.median(depths))
-            shares.append(len(sightings) / extent)
+            densities.append(len(sightings) / extent)
         else:
-            shares.append(0.0)
-    return length * float(np.mean(shares)) if shares else 0.0
+            densities.append(0.0)
+    return length * float(np.mean(densities)) if densities else 0.0
 
 
 def mean_widths(frames: list[list[Sighting]], owners: list[list[int | None]]) -> dict[int, float]:

@@ -12,15 +12,15 @@ from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
 from jaxrl_vis_envs.documents import read_json
 
-_FARTHEST = 1e6  # pixels
+_MAX_COORDINATE = 1e6  # pixels
 
 
-def find_truth(image: np.ndarray, density: float | None, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
+def find_truth(image: np.ndarray, pixels_per_metre: float | None, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
     """Return the ground-truth detections in the left image of a pair of a synthetic plot, with a detector's signature.
 
     Args:
         image: The image, of which only the size is used.
-        density: Ignored.
+        pixels_per_metre: Ignored.
         plot: The plot.
         pair: The pair.
 
@@ -49,7 +49,7 @@ def _stalks_by_pair(folder: Path) -> dict[int, list[dict]]:
     of_pair: dict[int, list[dict]] = {}
     for stalk in read_json(folder / "plot.json")["seen"]:
         box = stalk["band_box"]
-        if box is not None and (len(box) != 4 or not all(abs(float(edge)) < _FARTHEST for edge in box)):
+        if box is not None and (len(box) != 4 or not all(abs(float(edge)) < _MAX_COORDINATE for edge in box)):
             raise ValueError("a box is none")
         of_pair.setdefault(stalk["pair"], []).append(
             {**stalk, "band_box": None if box is None else [float(edge) for edge in box]}

@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.phenotyping.io.names import readable
 
 STALK = 1
 """COCO category id of stalks."""
-_FARTHEST = 1e7  # pixels
+_MAX_COORDINATE = 1e7  # pixels
 
 
 def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about: dict[str, Any]) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def coco(images: list[dict[str, Any]], annotations: list[dict[str, Any]], about:
         about: The ``info`` of the data set.
     """
     numbered = [
-        {"id": place + 1, "category_id": STALK, "iscrowd": 0, **annotation} for place, annotation in enumerate(annotations)
+        {"id": index + 1, "category_id": STALK, "iscrowd": 0, **annotation} for index, annotation in enumerate(annotations)
     ]
     categories = [{"id": STALK, "name": "stalk", "supercategory": "plant"}]
     return {"info": about, "images": images, "annotations": numbered, "categories": categories}
@@ -58,8 +58,7 @@ def read_annotations(folder: Path, labels: Sequence[str] = ()) -> dict[str, Any]
         RequestError: There are no annotations, they cannot be read, or one is invalid; the message says which.
     """
     images, annotations = [], []
-    found = gather(folder)
-    for number, image in found:
+    for number, image in gather(folder):
         key = "/".join(map(str, number)) if isinstance(number, tuple) else number
         source = str(image.source)
         images.append({"id": key, "file_name": image.name, "width": image.width, "height": image.height, "source": source})
@@ -78,7 +77,7 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
     if not data["images"] or not data["annotations"]:
         raise RequestError(f"{path} annotates nothing: name a folder with annotated images")
     stalks, summary = choose(data["annotations"], labels, str(path))
-    images = [_checked_image(image, place) for place, image in enumerate(data["images"])]
+    images = [_checked_image(image, index) for index, image in enumerate(data["images"])]
     twice = len(images) - len({image["id"] for image in images})
     if twice:
         raise RequestError(f"{path}: {twice} images have the id of another one, so nobody can tell whose annotations are whose")
@@ -96,30 +95,30 @@ def _checked_annotations(data: dict[str, Any], path: Path, labels: Sequence[str]
     return {"images": images, "annotations": annotations, "summary": summary}
 
 
-def _checked_image(image: dict[str, Any], place: int) -> dict[str, Any]:
+def _checked_image(image: dict[str, Any], index: int) -> dict[str, Any]:
     """Return the entry of an image, with its width and height as integers.
 
     Args:
         image: The entry as read.
-        place: Index of the entry, for messages.
+        index: Index of the entry, for messages.
 
     Raises:
         RequestError: Its id, name or size is missing or invalid.
     """
     if not isinstance(image.get("id"), (int, str)) or not isinstance(image.get("file_name"), str):
-        raise RequestError(f"{image['source']}: image number {place + 1} needs an id and a file_name")
+        raise RequestError(f"{image['source']}: image number {index + 1} needs an id and a file_name")
     name = image["file_name"]
     if not _is_inside(name):
         raise RequestError(
-            f"{image['source']}: image number {place + 1} has the file_name {reprlib.repr(name)}: name a file in that folder"
+            f"{image['source']}: image number {index + 1} has the file_name {reprlib.repr(name)}: name a file in that folder"
         )
     sides = _numbers([image.get("width"), image.get("height")])
     if sides is None or min(sides) < 1 or any(side % 1 for side in sides):
         said = f"{reprlib.repr(image.get('width'))} and {reprlib.repr(image.get('height'))}"
         raise RequestError(f"{image['source']}: image {name} needs a width and a height in pixels, not {said}")
     if sides[0] * sides[1] > MAX_PIXELS:
-        most = f"more than {MAX_PIXELS // 10**6} million pixels"
-        raise RequestError(f"{image['source']}: image {name} is said to have {sides[0]:g} x {sides[1]:g}, {most}")
+        limit = f"more than {MAX_PIXELS // 10**6} million pixels"
+        raise RequestError(f"{image['source']}: image {name} is said to have {sides[0]:g} x {sides[1]:g}, {limit}")
     return {**image, "width": int(sides[0]), "height": int(sides[1])}
 
 
@@ -156,7 +155,7 @@ def _checked_annotation(annotation: dict[str, Any], sizes: dict[int | str, tuple
         raise ValueError("has neither a bbox nor a segmentation")
     if box is None or len(box) != 4:
         raise ValueError("has a bbox that is not 4 numbers (left, top, width, height)")
-    if max(map(abs, box)) > _FARTHEST:
+    if max(map(abs, box)) > _MAX_COORDINATE:
         raise ValueError("has a bbox that lies nowhere near an image")
     left, top, wide, tall = box
     if not (wide > 0 and tall > 0):
@@ -194,7 +193,7 @@ def _checked_segmentation(segmentation: Any, size: tuple[int, int]) -> dict[str,
     corners = [outline for outline in outlines if outline is not None and len(outline) >= 6 and len(outline) % 2 == 0]
     if len(corners) < len(outlines):
         raise ValueError("has a polygon that is not column, line, column, line, ... of 3 corners or more")
-    if any(abs(corner) > _FARTHEST for outline in corners for corner in outline):
+    if any(abs(corner) > _MAX_COORDINATE for outline in corners for corner in outline):
         raise ValueError("has a polygon that lies nowhere near an image")
     return corners
 

@@ -103,8 +103,8 @@ def check_size(calibration: Calibration, width: int, height: int, name: str) -> 
         RequestError: The sizes differ.
     """
     if (width, height) != (calibration.width, calibration.height):
-        wanted = _times((calibration.width, calibration.height))
-        raise RequestError(f"{name} has {_times((width, height))} pixels, but the calibration is for {wanted}")
+        wanted = _format_size((calibration.width, calibration.height))
+        raise RequestError(f"{name} has {_format_size((width, height))} pixels, but the calibration is for {wanted}")
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
@@ -130,7 +130,7 @@ def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, i
     width, height = size
     focal = float(left[0, 0])
     if width < 1 or height < 1 or not 0.1 * width < focal < 50 * width:
-        raise RequestError(f"{path}: a focal length of {focal:g} pixels does not suit an image of {_times(size)} pixels")
+        raise RequestError(f"{path}: a focal length of {focal:g} pixels does not suit an image of {_format_size(size)} pixels")
     if not math.isclose(focal, float(right[0, 0]), rel_tol=1e-6) or not math.isclose(left[1, 2], right[1, 2], abs_tol=1e-3):
         raise RequestError(
             f"{path}: the cameras differ in focal length or in lines, so they are not rectified: rectify the pair"
@@ -152,5 +152,5 @@ def _checked(path: Path, left: np.ndarray, right: np.ndarray, size: tuple[int, i
     return dataclasses.replace(calibration, offset=0.0) if abs(calibration.offset) < 1e-9 else calibration
 
 
-def _times(size: tuple[int, int]) -> str:
+def _format_size(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"

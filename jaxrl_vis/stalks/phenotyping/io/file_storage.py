@@ -32,11 +32,11 @@ def parse_storage(text: str) -> Any:
             return _floats(parse_json(begin))
         except ValueError:
             pass  # may be a YAML flow mapping
-    return _yaml(begin.partition("\n")[2] if begin.startswith("%YAML") else text)
+    return _parse_yaml(begin.partition("\n")[2] if begin.startswith("%YAML") else text)
 
 
 def _floats(value: Any) -> Any:
-    """Convert the integers of parsed JSON to float, as `_yaml` does."""
+    """Convert the integers of parsed JSON to float, as `_parse_yaml` does."""
     if isinstance(value, dict):
         return {name: _floats(part) for name, part in value.items()}
     if isinstance(value, list):
@@ -51,7 +51,7 @@ def _scalar(text: str) -> float | str | None:
     return _SPECIAL.get(text.lower(), text or None)
 
 
-def _yaml(text: str) -> Any:
+def _parse_yaml(text: str) -> Any:
     """Parse the first document of a YAML text.
 
     Raises:

@@ -22,7 +22,7 @@ SAMPLE = Path(__file__).parents[1] / "sample_row"
 """Folder of a short synthetic row that ships with the package."""
 _DEPTH = 6  # levels of nested folders searched for plots
 _MAX_FOLDERS = 20_000
-_LATEST = 0.005  # s, maximum median delay between the images of a pair: a robot at 0.3 m/s drives 1.5 mm
+_MAX_DELAY = 0.005  # s, maximum median delay between the images of a pair: a robot at 0.3 m/s drives 1.5 mm
 _DISPARITIES = {".pfm", ".png", ".tif", ".tiff"}
 _WORD = re.compile(r"(?<![a-z])(left|right)(?![a-z])", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
@@ -88,12 +88,12 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
         if not pattern or PureWindowsPath(pattern).anchor or ".." in PureWindowsPath(pattern).parts:
             raise RequestError(f"--left and --right are patterns within each plot's folder, as 'left/*.png', not {pattern!r}")
     own = _pairs(folder, patterns)
-    folders = {folder: own} if own else _below(folder, patterns)
+    folders = {folder: own} if own else _search_subfolders(folder, patterns)
     plots: dict[str, PlotFolder] = {}
     for path, pairs in folders.items():
         check_length(path)
-        way = path.resolve().name if own else path.relative_to(folder).as_posix()
-        name = "/".join(readable(part) for part in way.split("/")) or "plot"
+        relative = path.resolve().name if own else path.relative_to(folder).as_posix()
+        name = "/".join(readable(part) for part in relative.split("/")) or "plot"
         if name in plots:
             raise RequestError(f"{readable(str(folder))} holds two plots called {name}: rename one of them")
         plots[name] = PlotFolder(name, path, pairs)
@@ -102,13 +102,13 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
     return list(plots.values())
 
 
-def _below(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
+def _search_subfolders(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
     """Return the pairs of all subfolders that hold some, depth first; folders inside those are not searched.
 
     Raises:
         RequestError: There are more than 20,000 folders.
     """
-    found: dict[Path, tuple[PairFiles, ...]] = {}
+    plots: dict[Path, tuple[PairFiles, ...]] = {}
     waiting, count = [(path, 1) for path in _folders(folder)], 0
     while waiting:
         path, depth = waiting.pop(0)
@@ -117,10 +117,10 @@ def _below(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFile
             raise RequestError(f"{readable(str(folder))} holds more than {_MAX_FOLDERS} folders: name one with plots")
         pairs = _pairs(path, patterns)
         if pairs:
-            found[path] = pairs
+            plots[path] = pairs
         elif depth < _DEPTH:
             waiting = [(inside, depth + 1) for inside in _folders(path)] + waiting
-    return found
+    return plots
 
 
 def _folders(folder: Path) -> list[Path]:
@@ -153,29 +153,29 @@ _Sides = dict[str, dict[str, Path]]
 
 def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
     if patterns is not None:
-        sides = _by_patterns(folder, patterns)
+        sides = _pair_by_patterns(folder, patterns)
     else:
-        sides = _by_folder(folder) or {}
-        for name, files in _by_name(folder).items():
+        sides = _pair_by_folder(folder) or {}
+        for name, files in _pair_by_name(folder).items():
             for side, path in files.items():
-                _put(sides, name, side, path)
+                _add_pair(sides, name, side, path)
         _check_rectified(folder, sides)
-    sides = _by_times(folder, sides)
+    sides = _pair_by_times(folder, sides)
     stored = _find_folder(folder, ("disparity",))
     inside = [] if stored is None else image_files(stored, _DISPARITIES)
     for path in [*inside, *image_files(folder, _DISPARITIES)]:
-        beside = path.parent == folder
+        is_sibling = path.parent == folder
         stem = readable(path.stem)
-        name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if beside else stem
-        if name in sides and (not beside or "disparity" in stem.lower()):
-            _put(sides, name, "disparity", path)
+        name = re.sub("disparity", "", stem, flags=re.IGNORECASE).strip("_-. ") if is_sibling else stem
+        if name in sides and (not is_sibling or "disparity" in stem.lower()):
+            _add_pair(sides, name, "disparity", path)
     files = [
         PairFiles(name, by_side.get("left"), by_side.get("right"), by_side.get("disparity")) for name, by_side in sides.items()
     ]
     return tuple(sorted(files, key=lambda pair: _natural(pair.name)))
 
 
-def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
+def _add_pair(sides: _Sides, name: str, side: str, path: Path) -> None:
     """Add a file to ``sides``, in place.
 
     Raises:
@@ -189,7 +189,7 @@ def _put(sides: _Sides, name: str, side: str, path: Path) -> None:
         raise RequestError(f"{both} are both the {what} of pair {name}: rename one of them, or move it elsewhere")
 
 
-def _by_patterns(folder: Path, patterns: Patterns) -> _Sides:
+def _pair_by_patterns(folder: Path, patterns: Patterns) -> _Sides:
     """Find the images that match two patterns; the text matched by the wildcards is the name of the pair."""
     sides: _Sides = {}
     for side, pattern in (("left", patterns.left), ("right", patterns.right)):
@@ -198,7 +198,7 @@ def _by_patterns(folder: Path, patterns: Patterns) -> _Sides:
             match = stars.fullmatch(path.relative_to(folder).as_posix())
             if path.is_file() and not path.name.startswith(".") and match is not None:
                 name = "_".join(part.replace("/", "_").strip("_") for part in match.groups() if part) or "pair"
-                _put(sides, readable(name), side, path)
+                _add_pair(sides, readable(name), side, path)
     return sides if any("left" in files for files in sides.values()) else {}
 
 
@@ -219,7 +219,7 @@ def _check_rectified(folder: Path, sides: _Sides) -> None:
         )
 
 
-def _by_times(folder: Path, sides: _Sides) -> _Sides:
+def _pair_by_times(folder: Path, sides: _Sides) -> _Sides:
     """Pair the images that have no partner of the same name by the timestamps in their names.
 
     Args:
@@ -236,7 +236,7 @@ def _by_times(folder: Path, sides: _Sides) -> _Sides:
     left, right = ({name: time or 0.0 for name, time in times[side].items()} for side in ("left", "right"))
     partner = nearest(left, right)
     apart = sorted(abs(left[name] - right[other]) for name, other in partner.items())
-    if apart and apart[len(apart) // 2] > _LATEST:
+    if apart and apart[len(apart) // 2] > _MAX_DELAY:
         raise RequestError(
             f"{readable(str(folder))}: left and right images are {1000 * apart[len(apart) // 2]:.0f} ms apart by their names, "
             "in which a robot moves on: cameras of a pair must take their images at the same time"
@@ -246,7 +246,7 @@ def _by_times(folder: Path, sides: _Sides) -> _Sides:
     return sides
 
 
-def _by_folder(folder: Path) -> _Sides:
+def _pair_by_folder(folder: Path) -> _Sides:
     """Find images in two subfolders, one per side; empty if there are none.
 
     Raises:
@@ -256,14 +256,14 @@ def _by_folder(folder: Path) -> _Sides:
     names = {path.name.lower(): path for path, images in nested.items() if images}
     pairs = [tuple(names[name] for name in both) for both in (("left", "right"), ("l", "r")) if set(both) <= set(names)][:1]
     if not pairs:
-        found = {
+        candidates = {
             (path, names[other.lower()]) if side == "left" else (names[other.lower()], path)
             for path in names.values()
             for side, other in partners(path.name)
             if other.lower() in names
         }
         # A folder that holds whole pairs is a plot, not a side.
-        pairs = sorted(pair for pair in found if not any(_whole_pairs(path) for path in pair))
+        pairs = sorted(pair for pair in candidates if not any(_whole_pairs(path) for path in pair))
     if len(pairs) > 1:
         both = " and of ".join(f"{readable(left.name)} and {readable(right.name)}" for left, right in pairs[:2])
         raise RequestError(f"{readable(str(folder))} holds pairs of {both}: say which with --left 'PATTERN' --right 'PATTERN'")
@@ -273,7 +273,7 @@ def _by_folder(folder: Path) -> _Sides:
         if _whole_pairs(path):
             return {}
         for image in nested[path]:
-            _put(sides, readable(image.stem), side, image)
+            _add_pair(sides, readable(image.stem), side, image)
     return sides
 
 
@@ -284,29 +284,29 @@ def _side_images(folder: Path) -> list[Path]:
 
 
 def _whole_pairs(folder: Path) -> bool:
-    return any(len(by_side) == 2 for by_side in _by_name(folder).values())
+    return any(len(by_side) == 2 for by_side in _pair_by_name(folder).values())
 
 
-def _by_name(folder: Path) -> _Sides:
+def _pair_by_name(folder: Path) -> _Sides:
     """Find images whose names tell their side, by a word, a letter or a camera number."""
     images = {path: readable(path.stem) for path in image_files(folder)}
     images = {path: stem for path, stem in images.items() if "disparity" not in stem.lower()}
     stems = {stem.lower() for stem in images.values()}
     sides: _Sides = {}
     for image, stem in images.items():
-        word = _side_in(stem, stems)
+        word = _match_side(stem, stems)
         if word is not None:
             name = (stem[: word.start()] + stem[word.end() :]).strip("_-. ") or "pair"
-            _put(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
+            _add_pair(sides, name, "left" if word.group().lower().startswith("l") else "right", image)
         else:
-            for side, other in _counted(stem, stems):
+            for side, other in _pair_by_counter(stem, stems):
                 # The characters common to both names, without the number or letter of the side.
                 same = "".join(one for one, two in zip(stem, other) if one == two)
-                _put(sides, same.strip("_-. ") or "pair", side, image)
+                _add_pair(sides, same.strip("_-. ") or "pair", side, image)
     return sides
 
 
-def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
+def _pair_by_counter(stem: str, stems: set[str]) -> list[tuple[str, str]]:
     """Return the side given by a last letter or camera number of an image's name, with the partner's name; empty if ambiguous.
 
     im0 and im1 are a pair, but im0 to im7 are the images of one camera.
@@ -315,14 +315,14 @@ def _counted(stem: str, stems: set[str]) -> list[tuple[str, str]]:
         stem: Stem of its name.
         stems: Lower-case stems of all images in its folder.
     """
-    found = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
-    if len(found) != 1:
+    matches = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
+    if len(matches) != 1:
         return []
-    back = [other for _, other in partners(found[0][1], files=True) if other.lower() in stems]
-    return found if len(back) == 1 else []
+    back = [other for _, other in partners(matches[0][1], files=True) if other.lower() in stems]
+    return matches if len(back) == 1 else []
 
 
-def _side_in(stem: str, stems: set[str]) -> re.Match[str] | None:
+def _match_side(stem: str, stems: set[str]) -> re.Match[str] | None:
     """Find the word or letter of an image's name that tells its side; None if there is none.
 
     Names of rows and repetitions may hold such letters, too, as in R2_left_000 or plot_R1_L_000. So words take precedence over

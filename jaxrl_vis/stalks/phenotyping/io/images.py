@@ -77,7 +77,7 @@ def read_image(path: Path) -> np.ndarray:
         OSError: The file cannot be read, is not a complete image, or has another pixel type. The message is one line that
             names the file.
     """
-    image = _decoded(path)
+    image = _decode(path)
     if image is None:
         raise _unreadable(path, "is not an image, or only a part of one")
     if image.dtype not in (np.uint8, np.uint16):
@@ -113,14 +113,14 @@ def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
     Raises:
         OSError: The file cannot be read, or holds no disparities. The message is one line that names the file.
     """
-    image = _decoded(path)
+    image = _decode(path)
     if image is None or image.ndim != 2 or image.dtype.itemsize == 1:
         raise OSError(f"{path} holds no disparities: name a PFM, or a TIFF or PNG of 16 bits or more and one channel")
     values = image.astype(np.float32) / (1.0 if image.dtype.kind == "f" else scale)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
 
-def _decoded(path: Path) -> np.ndarray | None:
+def _decode(path: Path) -> np.ndarray | None:
     """Decode an image to [H, W] or [H, W, channels] (BGR order) of any dtype; return None if OpenCV cannot decode it.
 
     Raises:
@@ -143,8 +143,8 @@ def _decoded(path: Path) -> np.ndarray | None:
     return upright(image, orientation) if image.shape[:2] == size else None
 
 
-def _unreadable(path: Path, why: str) -> OSError:
+def _unreadable(path: Path, reason: str) -> OSError:
     """Return an error whose message names the file and whose ``strerror`` does not, like errors of the operating system."""
-    error = OSError(f"{path} {why}")
-    error.strerror = f"it {why}"
+    error = OSError(f"{path} {reason}")
+    error.strerror = f"it {reason}"
     return error

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-_LARGEST = 1 << 48  # maximum run length, more than any image has pixels
-_AT_ONCE = 4_000_000  # pairs of an image row and a polygon edge that are processed together
+_MAX_RUN = 1 << 48  # maximum run length, more than any image has pixels
+_CHUNK_SIZE = 4_000_000  # pairs of an image row and a polygon edge that are processed together
 
 
 def encode_mask(mask: np.ndarray, corner: tuple[int, int], size: tuple[int, int]) -> dict[str, Any]:
@@ -77,12 +77,12 @@ def outlined_mask(outlines: list[list[float]], size: tuple[int, int]) -> np.ndar
         first, last = np.clip(np.ceil([here[:, 1].min() - 0.5, here[:, 1].max() - 0.5]), 0, height).astype(int)
         middles = np.arange(first, last) + 0.5
         crossings = np.zeros((len(middles), width + 1), np.int32)
-        some = max(_AT_ONCE // max(len(middles), 1), 1)  # edges per batch: an outline may have millions
+        some = max(_CHUNK_SIZE // max(len(middles), 1), 1)  # edges per batch: an outline may have millions
         for start in range(0, len(here), some):
             one, other = here[start : start + some], ahead[start : start + some]
             edge, line = np.nonzero((one[:, 1:] <= middles) != (other[:, 1:] <= middles))
-            share = (middles[line] - one[edge, 1]) / (other[edge, 1] - one[edge, 1])
-            crossing = one[edge, 0] + share * (other[edge, 0] - one[edge, 0])
+            fraction = (middles[line] - one[edge, 1]) / (other[edge, 1] - one[edge, 1])
+            crossing = one[edge, 0] + fraction * (other[edge, 0] - one[edge, 0])
             # A pixel is inside if the number of crossings to its left is odd.
             np.add.at(crossings, (line, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
         mask[first:last] |= np.cumsum(crossings[:, :width], axis=1) % 2 == 1
@@ -108,7 +108,7 @@ def decode_counts(text: str) -> list[int]:
         if bits & 0x10:
             value -= 1 << shift
         counts.append(value + (counts[-2] if len(counts) > 2 else 0))
-        if abs(counts[-1]) > _LARGEST:
+        if abs(counts[-1]) > _MAX_RUN:
             raise ValueError("runs of a mask hold what is no number of pixels")
         value, shift = 0, 0
     if shift:

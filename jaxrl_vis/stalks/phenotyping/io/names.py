@@ -11,7 +11,7 @@ from pathlib import Path
 from jaxrl_vis.errors import RequestError
 
 _UNPRINTABLE = ("Cc", "Cs", "Zl", "Zp")  # control characters, surrogates, ends of lines and paragraphs
-_LONGEST = 200  # bytes; file systems allow 255, and names derived from it are longer
+_MAX_LENGTH = 200  # bytes; file systems allow 255, and names derived from it are longer
 
 
 def readable(name: str) -> str:
@@ -36,8 +36,8 @@ def check_length(path: Path) -> None:
     """Raise a `RequestError` if a file name is so long that files named after it could not be written."""
     name = readable(path.name)
     length = len(name.encode())
-    if length > _LONGEST:
+    if length > _MAX_LENGTH:
         short = f"{name[:24]}...{name[-12:]}"
         raise RequestError(
-            f"{readable(str(path.parent))} holds {short}, whose name has {length} bytes: rename it, to {_LONGEST} at most"
+            f"{readable(str(path.parent))} holds {short}, whose name has {length} bytes: rename it, to {_MAX_LENGTH} at most"
         )

@@ -25,9 +25,9 @@ def read_orientation(file: BinaryIO) -> int:
     begin = file.read(8)
     file.seek(0)
     if begin.startswith(b"\xff\xd8"):
-        data = _of_jpeg(file)
+        data = _jpeg_exif(file)
     elif begin.startswith(PNG):
-        data = _of_png(file)
+        data = _png_exif(file)
     else:
         data = file.read() if begin[:4] in (b"II*\0", b"MM\0*") else b""
     exif = Image.Exif()
@@ -50,7 +50,7 @@ def upright(image: np.ndarray, orientation: int) -> np.ndarray:
     return np.ascontiguousarray(image)
 
 
-def _of_jpeg(file: BinaryIO) -> bytes:
+def _jpeg_exif(file: BinaryIO) -> bytes:
     """Return the EXIF data of a JPEG; empty if there are none before its pixels."""
     file.seek(2)
     while len(head := file.read(4)) == 4 and head[0] == 0xFF and head[1] not in (0xD9, 0xDA):
@@ -65,7 +65,7 @@ def _of_jpeg(file: BinaryIO) -> bytes:
     return b""
 
 
-def _of_png(file: BinaryIO) -> bytes:
+def _png_exif(file: BinaryIO) -> bytes:
     """Return the EXIF data of a PNG; empty if there are none."""
     file.seek(len(PNG))
     while len(head := file.read(8)) == 8 and head[4:] != b"IEND":

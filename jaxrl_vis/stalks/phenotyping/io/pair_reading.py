@@ -32,7 +32,7 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
     """
     sides: tuple[Side, ...] = ("left",) if pair.right is None and not right_needed else ("left", "right")
     # Checked before decoding: a small file may hold more pixels than fit into memory.
-    sizes = [_of_side(pair, side, image_size) for side in sides]
+    sizes = [_read_side_file(pair, side, image_size) for side in sides]
     if sizes[0] != sizes[-1]:
         raise Unusable(f"the left image has {_size(sizes[0])} pixels and the right one {_size(sizes[-1])}")
     if calibration is not None and sizes[0] != (calibration.height, calibration.width):
@@ -53,10 +53,10 @@ def read_side(pair: PairFiles, side: Side) -> np.ndarray:
     Raises:
         Unusable: It is missing or unreadable.
     """
-    return rgb8(_of_side(pair, side, read_image))
+    return rgb8(_read_side_file(pair, side, read_image))
 
 
-def _of_side(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T:
+def _read_side_file(pair: PairFiles, side: Side, read: Callable[[Path], T]) -> T:
     """Return the result of ``read`` for the file of one image of a pair.
 
     Raises:

@@ -102,10 +102,10 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
 
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         kinds: dict[str, str] = {connection.topic: connection.msgtype for connection in reader.connections}
-        pair = topics or _pair_of(kinds, path)
+        pair = topics or _topic_pair(kinds, path)
         for topic in (pair.left, pair.right):
             if kinds.get(topic) not in _IMAGE:
-                raise RequestError(f"{path} has no images on {topic}: {_listed(kinds)}")
+                raise RequestError(f"{path} has no images on {topic}: {_format_topics(kinds)}")
 
         def messages(topic: str) -> Iterator[Any]:
             wanted = [connection for connection in reader.connections if connection.topic == topic]
@@ -120,7 +120,7 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
         _write_odometry(folder / "odometry.csv", kinds, messages)
 
 
-def _pair_of(kinds: dict[str, str], path: Path) -> Topics:
+def _topic_pair(kinds: dict[str, str], path: Path) -> Topics:
     """Find the topics of the left and right images.
 
     Args:
@@ -138,11 +138,11 @@ def _pair_of(kinds: dict[str, str], path: Path) -> Topics:
         pairs = best or pairs
     if len(pairs) != 1:
         what = "several pairs of images" if pairs else "no pair of left and right images"
-        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_listed(kinds)}")
+        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_format_topics(kinds)}")
     return pairs.pop()
 
 
-def _listed(kinds: dict[str, str]) -> str:
+def _format_topics(kinds: dict[str, str]) -> str:
     images = sorted(topic for topic, kind in kinds.items() if kind in _IMAGE)
     others = f" and {len(images) - _SHOWN} others" if len(images) > _SHOWN else ""
     return f"images are on {', '.join(images[:_SHOWN])}{others}" if images else "no topic has images"
@@ -161,7 +161,9 @@ def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) 
     message = None if info is None else next(messages(info), None)
     if message is None:
         return
-    distortion, matrix, projection = ([float(value) for value in _either(message, name)] for name in ("D", "K", "P"))
+    distortion, matrix, projection = (
+        [float(value) for value in _field_of_either_case(message, name)] for name in ("D", "K", "P")
+    )
     as_built = any(abs(value) > 1e-9 for value in distortion) or not np.allclose(matrix[:3], projection[:3], rtol=1e-6)
     if "rect" not in topic and as_built:
         raise RequestError(f"{topic} has raw images, which its camera_info says are distorted: record or name rectified ones")
@@ -171,7 +173,7 @@ def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) 
     write_atomically(path, json.dumps(values))
 
 
-def _either(message: Any, name: str) -> Any:
+def _field_of_either_case(message: Any, name: str) -> Any:
     """Return a field whose name is upper case in ROS 1 and lower case in ROS 2."""
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
 

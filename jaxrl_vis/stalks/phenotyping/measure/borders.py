@@ -16,7 +16,7 @@ _RINGING = 16  # pixels: reach of JPEG ringing into a border
 _MIN_LINES = 0.08  # minimum length of a border's side, as a fraction of the image's
 _BEND = 2.5  # pixels: maximum distance of a border's side from a smooth curve
 _MIN_AGREEING = 0.9  # minimum fraction of a side's rows that lie on the curve
-_THINNEST = 8.0  # pixels: maximum width of a border at an end within the image
+_MIN_THICKNESS = 8.0  # pixels: maximum width of a border at an end within the image
 _INSIDE = 2  # pixels by which a detected border is widened
 
 
@@ -41,7 +41,7 @@ def find_frame(image: np.ndarray) -> Frame:
     lit = ~dark
     lines, columns = (_extent(image, lit.any(axis=1 - axis), axis) for axis in (0, 1))
     part = image[slice(*lines), slice(*columns)]
-    outside = _wedges(part, dark[slice(*lines), slice(*columns)])
+    outside = _border_wedges(part, dark[slice(*lines), slice(*columns)])
     if not outside.any():
         return Frame(lines, columns)
     shown = np.zeros(dark.shape, bool)
@@ -69,14 +69,14 @@ def _is_filled(part: np.ndarray) -> bool:
     return bool(part.size) and float(part.mean()) <= _FILLED
 
 
-def _wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
+def _border_wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
     """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image."""
     outside = np.zeros(dark.shape, bool)
     for turns in range(4):
-        seen, filled = np.rot90(dark, turns), np.rot90(image, turns)
-        reach = _side(seen, filled)
+        turned, filled = np.rot90(dark, turns), np.rot90(image, turns)
+        reach = _side(turned, filled)
         if reach is not None:
-            wedge = np.arange(seen.shape[1]) < reach[:, None]
+            wedge = np.arange(turned.shape[1]) < reach[:, None]
             outside |= np.rot90(wedge, -turns)
     return outside
 
@@ -102,8 +102,8 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
         # Dark objects next to the border make it look wider; nothing makes it look narrower.
         heavy = np.abs(reach - curve) <= max(_BEND, float(np.quantile(np.abs(reach - curve), 0.5)))
     # A border extends to the adjacent sides of the image, or tapers off.
-    ends = [curve[end] for end, whole in ((0, first == 0), (-1, last == dark.shape[0])) if not whole]
-    if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _THINNEST:
+    ends = [curve[end] for end, complete in ((0, first == 0), (-1, last == dark.shape[0])) if not complete]
+    if np.mean(np.abs(reach - curve) <= _BEND) < _MIN_AGREEING or max(ends, default=0.0) > _MIN_THICKNESS:
         return None
     columns = np.zeros(dark.shape[0])
     columns[first:last] = np.maximum(curve, 0.0) + _INSIDE

@@ -13,15 +13,15 @@ class LensRange:
     """Range of lenses.
 
     Attributes:
-        density: Minimum resolution at the row, pixels per metre.
+        pixels_per_metre: Minimum resolution at the row, pixels per metre.
         view: Minimum vertical field of view at the row, m.
     """
 
-    density: float
+    pixels_per_metre: float
     view: float
 
 
-TRIED = LensRange(density=640.0, view=0.68)
+TRIED = LensRange(pixels_per_metre=640.0, view=0.68)
 """Range in which counts and widths are as good as with the standard lens: 5 % beyond the last such lenses of
 `benchmarks.stalks.lenses`, as rows are not exactly 0.8 m away."""
 
@@ -35,12 +35,12 @@ def lens_fault(calibration: Calibration, distance: float, lines: int, tried: Len
         lines: Height of the images without black borders, pixels.
         tried: Range of validated lenses.
     """
-    density = calibration.focal / distance
-    view = lines / density
-    if density < tried.density:
+    pixels_per_metre = calibration.focal / distance
+    view = lines / pixels_per_metre
+    if pixels_per_metre < tried.pixels_per_metre:
         return (
-            f"{density:.0f} pixels per metre of a row {distance:.2f} m away, fewer than the {tried.density:.0f} that were "
-            "tried: use images of more pixels, a longer lens or a smaller distance"
+            f"{pixels_per_metre:.0f} pixels per metre of a row {distance:.2f} m away, fewer than the "
+            f"{tried.pixels_per_metre:.0f} that were tried: use images of more pixels, a longer lens or a smaller distance"
         )
     if view < tried.view:
         return (

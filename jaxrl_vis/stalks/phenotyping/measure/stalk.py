@@ -92,12 +92,12 @@ def measure(
     place = strip.reference if line is None else line - corner[0]
     matched = _disparity(strip, corner, left, right, calibration, depths, disparity)
     if ground is not None and height is not None:
-        place = _place_at(height, strip, corner, matched, calibration, ground)
+        place = _row_at_height(height, strip, corner, matched, calibration, ground)
     disparity_here = matched.at(place + corner[0])
     if disparity_here is None:
         return Measurement(line=place + corner[0], lean=strip.lean, reason="the right image does not show it clearly")
-    beside, error = disparity_here
-    depth = float(calibration.depth(np.array(beside)))
+    shift, error = disparity_here
+    depth = float(calibration.depth(np.array(shift)))
     if not depths[0] <= depth <= depths[1]:
         return Measurement(line=place + corner[0], depth=depth, lean=strip.lean, reason=f"it stands {depth:.2f} m away")
     reach = _REACH * calibration.focal / depth
@@ -109,19 +109,19 @@ def measure(
         return Measurement(line=place + corner[0], lean=strip.lean, reason="no ellipse fits the mask")
     half = 0.5 * pixels / math.cos(strip.lean)
     edges = tuple((middle + corner[1] + side * half, place + corner[0]) for side in (-1.0, 1.0))
-    tilt = _tilt(matched, beside, calibration)
+    tilt = _tilt(matched, shift, calibration)
     diameter = diameter_mm(calibration, edges[0], edges[1], depth, strip.lean, tilt)
     # Away from the middle of the visible part, the error of the slopes adds to that of the edges.
     span = max(strip.last - strip.first, 1)
     lever = math.sqrt(1.0 + 12.0 * ((place - strip.reference) / span) ** 2)
-    relative = math.hypot(strip.deviation * lever / pixels, error / max(beside - calibration.offset, 1e-6))
+    relative = math.hypot(strip.deviation * lever / pixels, error / max(shift - calibration.offset, 1e-6))
     return Measurement(
         diameter_mm=diameter,
         deviation_mm=diameter * relative,
         line=place + corner[0],
         column=middle + corner[1],
         width=pixels,
-        disparity=beside,
+        disparity=shift,
         depth=depth,
         height=math.nan if ground is None else ground.height(middle + corner[1], place + corner[0], depth, calibration),
         lean=strip.lean,
@@ -131,7 +131,7 @@ def measure(
     )
 
 
-def _place_at(
+def _row_at_height(
     height: float, strip: Strip, corner: tuple[int, int], matched: StalkDisparity, calibration: Calibration, ground: Ground
 ) -> float:
     """Return the row of the mask with visible edges nearest to a ``height`` in m; the reference row if heights are unknown."""

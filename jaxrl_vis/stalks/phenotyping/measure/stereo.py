@@ -50,8 +50,8 @@ class StalkDisparity:
             Disparity and its standard error, pixels; None if there are fewer than three inliers, or fewer than 0.4 of the
             windows tried.
         """
-        least = max(3, math.ceil(_AGREEING * self.tried))
-        if self.lines.size < least:
+        minimum = max(3, math.ceil(_AGREEING * self.tried))
+        if self.lines.size < minimum:
             return None
         offset = self.lines - line
         first, second = index_pairs(self.lines.size)
@@ -61,12 +61,12 @@ class StalkDisparity:
         spread = max(1.4826 * median(np.abs(rest - middle)), 0.05)
         good = np.abs(rest - middle) < 3.5 * min(spread, _SCATTER)
         count = np.count_nonzero(good)
-        if count < least:
+        if count < minimum:
             return None
         where, value = offset[good], self.values[good]
         if count > 3:
-            beside = where - where.sum() / count
-            slope = float(beside @ value) / float(beside @ beside)
+            centred = where - where.sum() / count
+            slope = float(centred @ value) / float(centred @ centred)
         remaining = value - slope * where
         mean = float(remaining.sum()) / count
         scatter = max(math.sqrt(float(((remaining - mean) ** 2).sum()) / count), 0.02)
@@ -112,16 +112,16 @@ def match_rows(
     wanted = [strip for strip in wanted if strip.inside(left.shape, half_height, spread)]
     # A few windows are searched over all disparities. If these agree, the others are searched near the expected disparity.
     first = sorted(set(np.linspace(0, len(wanted) - 1, min(_FIRST, len(wanted))).round().astype(int)))
-    whole = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
-    matches = {place: _match(left, right, wanted[place], whole, half_height, spread) for place in first}
-    expected = _agreed([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
+    limits = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
+    matches = {place: _match(left, right, wanted[place], limits, half_height, spread) for place in first}
+    expected = _robust_line([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
     for place, window in enumerate(wanted):
         if place in matches:
             continue
-        within = whole
+        within = limits
         if expected is not None:
             middle = expected[0] + expected[1] * window.line
-            within = max(math.floor(middle) - _BESIDE, whole[0]), min(math.ceil(middle) + _BESIDE, whole[1])
+            within = max(math.floor(middle) - _BESIDE, limits[0]), min(math.ceil(middle) + _BESIDE, limits[1])
         matches[place] = _match(left, right, window, within, half_height, spread) if within[0] < within[1] else None
     values = [(float(wanted[place].line), *result) for place, result in sorted(matches.items()) if result is not None]
     matched = np.array(values, float).reshape(-1, 3)
@@ -144,11 +144,11 @@ class _Window:
 
 
 def _match(
-    left: np.ndarray, right: np.ndarray, window: _Window, within: tuple[int, int], half_height: int, spread: int
+    left: np.ndarray, right: np.ndarray, window: _Window, bounds: tuple[int, int], half_height: int, spread: int
 ) -> tuple[float, float] | None:
     """Return the disparity and correlation of a window; None if there is no match within the bounds, or an ambiguous one."""
     top, bottom = window.line - half_height, window.line + half_height + 1
-    begin, end = max(window.first - within[1] - 1, 0), min(window.last - within[0] + 1, right.shape[1])
+    begin, end = max(window.first - bounds[1] - 1, 0), min(window.last - bounds[0] + 1, right.shape[1])
     if end - begin < window.last - window.first + 2:
         return None
     piece = np.ascontiguousarray(left[top:bottom, window.first : window.last])
@@ -157,7 +157,7 @@ def _match(
     return None if best is None else (window.first - (begin + best[0]), best[1])
 
 
-def _agreed(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
+def _robust_line(matches: list[tuple[int, float]]) -> tuple[float, float] | None:
     """Fit a robust line to (row, disparity) pairs and return its offset and slope.
 
     Returns None unless at least three, and all but one, are inliers.

@@ -100,8 +100,8 @@ def line_edges(mask: np.ndarray, threshold: float = 0.5) -> tuple[np.ndarray, np
     order = np.lexsort((start, start - end, line))
     first = np.concatenate([[True], np.diff(line[order]) > 0])
     line, start, end = (array[order][first] for array in (line, start, end))
-    whole = (start > 0) & (end < soft.shape[1])
-    line, start, end = line[whole], start[whole], end[whole]
+    complete = (start > 0) & (end < soft.shape[1])
+    line, start, end = line[complete], start[complete], end[complete]
 
     def crossing(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
         """Return the position between the inner and the outer pixel at which the mask crosses the threshold, 0 to 1."""
@@ -149,16 +149,16 @@ def strip_near(strip: Strip, line: float, reach: float, lines: int) -> Strip | N
     begin, end = np.searchsorted(strip.points[0], (first, last))
     place, left, right = (array[begin:end] for array in strip.points)
     offset = place - strip.reference
-    beside = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
+    residuals = [edge - fit[0] - fit[1] * offset for edge, fit in zip((left, right), (strip.left, strip.right))]
     tolerance = max(3.0, _SWELLING * strip.width(line))
-    good = np.logical_and(*(np.abs(offsets) < tolerance for offsets in beside))
-    for offsets in beside:
+    good = np.logical_and(*(np.abs(offsets) < tolerance for offsets in residuals))
+    for offsets in residuals:
         good &= np.abs(offsets - _mode(offsets[good])) < _OUTLIER_DISTANCE if good.any() else False
     count = int(good.sum())
     if count < max(_MIN_LINES, 0.5 * (last - first)) or not place[good].min() <= line <= place[good].max():
         return None
-    moved = [float(offsets[good].mean()) for offsets in beside]
-    rms = float(np.sqrt(np.mean([np.var(offsets[good]) for offsets in beside])))
+    moved = [float(offsets[good].mean()) for offsets in residuals]
+    rms = float(np.sqrt(np.mean([np.var(offsets[good]) for offsets in residuals])))
     edges = [(edge + shift, fit[1]) for edge, shift, fit in zip(strip.edges(line), moved, (strip.left, strip.right))]
     return Strip(
         reference=line,

@@ -31,7 +31,7 @@ class Trait:
         unit: UCUM unit of the values; ``1`` for counts.
         statistic: Statistic over the stalks of a plot, in words.
         term: Identifier of the trait in an ontology; empty if none is known.
-        whole: If true, the values are integers.
+        is_integer: If true, the values are integers.
     """
 
     column: str
@@ -39,7 +39,7 @@ class Trait:
     unit: str
     statistic: str
     term: str = ""
-    whole: bool = False
+    is_integer: bool = False
 
 
 # Diameters have the Plant Trait Ontology's term for stem thickness. Stalk numbers have none: the Crop Ontology of sorghum
@@ -47,7 +47,7 @@ class Trait:
 # neither counts main stems and tillers of a plot together. `--term` sets the term that a breeding programme uses.
 _DIAMETER = "TO:0000339"
 TRAITS = (
-    Trait("stalks", "stalk number", "1", "count in the plot", whole=True),
+    Trait("stalks", "stalk number", "1", "count in the plot", is_integer=True),
     Trait("stalks_per_m", "stalk number", "1/m", "count per length of row"),
     Trait("width_mean_mm", "stalk diameter", "mm", "mean over stalks, 12 inches above the ground", _DIAMETER),
     Trait("width_sd_mm", "stalk diameter", "mm", "standard deviation over stalks, 12 inches above the ground", _DIAMETER),
@@ -55,7 +55,7 @@ TRAITS = (
     Trait("width_24in_mean_mm", "stalk diameter", "mm", "mean over stalks, 24 inches above the ground", _DIAMETER),
     Trait("taper_mean_mm_per_in", "stalk taper", "mm/[in_i]", "mean over stalks, from 12 to 24 inches above the ground"),
     Trait("length_m", "row length", "m", "way of the robot along the row"),
-    Trait("stalks_measured", "stalk number", "1", "count of the stalks whose diameter was measured", whole=True),
+    Trait("stalks_measured", "stalk number", "1", "count of the stalks whose diameter was measured", is_integer=True),
 )
 _ABOUT = ("flag", "method", "version")
 """Columns of plots.csv that describe the values in the same row."""
@@ -228,7 +228,7 @@ def _write_plantcv(
     out: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str], plan: Plan, traits: Sequence[Trait]
 ) -> str:
     about = ["plot", *columns, *_ABOUT]
-    kinds = {trait.column: "<class 'int'>" if trait.whole else "<class 'float'>" for trait in traits}
+    kinds = {trait.column: "<class 'int'>" if trait.is_integer else "<class 'float'>" for trait in traits}
     # A trait without a value in any plot is left out: json2csv would write "NA" into a numeric column.
     there = [trait for trait in traits if any(row.get(trait.column, "") != "" for row in rows)]
     variables = {name: {"category": "metadata", "datatype": "<class 'str'>"} for name in about}
@@ -242,7 +242,7 @@ def _write_plantcv(
                 "method": "jaxrl-vis phenotype",
                 "scale": trait.unit,
                 "datatype": kinds[trait.column],
-                "value": int(row[trait.column]) if trait.whole else float(row[trait.column]),
+                "value": int(row[trait.column]) if trait.is_integer else float(row[trait.column]),
                 "label": "count" if trait.unit == "1" else trait.unit,
             }
             for trait in there

@@ -136,9 +136,9 @@ def write_times(data: dict[str, Any], out: Path) -> None:
     seconds = float(np.mean([plot["seconds_per_pair"] * plot["pairs"] for plot in known]))
     (count_1, count_2), (width_1, width_2) = HUMAN_MINUTES["count"], HUMAN_MINUTES["width"]
 
-    def row(task: str, first: float, second: float, own: str, thesis: str) -> dict[str, str]:
+    def row(task: str, first: float, second: float, measured: str, thesis: str) -> dict[str, str]:
         quoted = {"person 1, quoted": f"{first:.2f} min", "person 2, quoted": f"{second:.2f} min"}
-        return {"": task, **quoted, "thesis's robot, quoted": thesis, "here, measured": own}
+        return {"": task, **quoted, "thesis's robot, quoted": thesis, "here, measured": measured}
 
     rows = [
         row("stalk count", count_1, count_2, "", ""),

@@ -10,13 +10,13 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import Sighting
 
 COUNTED, REJECTED, MEASURED = (70, 235, 100), (255, 105, 75), (255, 225, 60)
 """RGB colours: outlines of counted and of rejected detections, and marks where widths were measured."""
-_WIDEST = 1688
+_MAX_WIDTH = 1688
 _LEGEND = (("counted", COUNTED), ("not counted", REJECTED), ("width was taken here", MEASURED))
 
 
 def overlay_scale(width: int) -> float:
     """Return the scale factor of the overlay of an image ``width`` pixels wide; at most 1."""
-    return min(_WIDEST / width, 1.0)
+    return min(_MAX_WIDTH / width, 1.0)
 
 
 def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str | None], title: str = "") -> np.ndarray:
@@ -32,10 +32,10 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     canvas = np.round(255.0 * (small / 255.0) ** 0.7).astype(np.uint8)
-    thick = max(round(size[0] / 800), 1)
+    thickness = max(round(size[0] / 800), 1)
     for sighting, label in zip(sightings, labels):
-        _outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thick)
-    writer = _Writer(canvas, max(size[0] / 2200, 0.3), thick)
+        _outline(canvas, sighting, COUNTED if label is not None else REJECTED, scale, thickness)
+    writer = _Writer(canvas, max(size[0] / 2200, 0.3), thickness)
     writer.legend(readable(title))  # OpenCV does not survive a lone surrogate
     for sighting, label in sorted(zip(sightings, labels), key=lambda pair: pair[0].column):
         width = "" if sighting.diameter_mm is None else f"{sighting.diameter_mm:.1f} mm"
@@ -45,7 +45,7 @@ def draw_overlay(image: np.ndarray, sightings: list[Sighting], labels: list[str 
     return canvas
 
 
-def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thick: int) -> None:
+def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int], scale: float, thickness: int) -> None:
     """Draw the two edges of a stalk in the band, and bars where its widths were measured."""
 
     def at(column: float, line: float) -> tuple[int, int]:
@@ -63,12 +63,12 @@ def _outline(canvas: np.ndarray, sighting: Sighting, colour: tuple[int, int, int
     # The outline passes through the measured centre.
     middle = [sighting.column + slope * (line - sighting.line) for line in (top, bottom)]
     for side in (-half, half):
-        cv2.line(canvas, at(middle[0] + side, top), at(middle[1] + side, bottom), colour, thick, cv2.LINE_AA)
+        cv2.line(canvas, at(middle[0] + side, top), at(middle[1] + side, bottom), colour, thickness, cv2.LINE_AA)
     bars = [(sighting.column, sighting.line, sighting.width_px)] if sighting.diameter_mm is not None else []
     for column, line, width in [*bars, *([sighting.upper_place] if sighting.upper_place else [])]:
         reach = 0.5 * (width or 0.0)
         over, down = reach * math.cos(lean), reach * math.sin(lean)
-        cv2.line(canvas, at(column - over, line - down), at(column + over, line + down), MEASURED, 2 * thick, cv2.LINE_AA)
+        cv2.line(canvas, at(column - over, line - down), at(column + over, line + down), MEASURED, 2 * thickness, cv2.LINE_AA)
 
 
 class _Writer:
@@ -76,12 +76,12 @@ class _Writer:
 
     Args:
         canvas: Image [H, W, 3] uint8.
-        letters: Font scale of OpenCV.
-        thick: Line thickness of the letters, pixels.
+        font_scale: Font scale of OpenCV.
+        thickness: Line thickness of the letters, pixels.
     """
 
-    def __init__(self, canvas: np.ndarray, letters: float, thick: int) -> None:
-        self._canvas, self._letters, self._thick = canvas, letters, thick
+    def __init__(self, canvas: np.ndarray, font_scale: float, thickness: int) -> None:
+        self._canvas, self._letters, self._thick = canvas, font_scale, thickness
         self._taken: list[tuple[int, int, int, int]] = []
 
     def above(self, place: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:

@@ -29,7 +29,7 @@ def outline(detection: Detection) -> list[float]:
         return [left, top, right, top, right, bottom, left, bottom]
     first = mask[rows].argmax(axis=1) + detection.corner[1]
     last = mask.shape[1] - mask[rows][:, ::-1].argmax(axis=1) + detection.corner[1]
-    sides = [_simplified(np.stack([side, lines[rows]], axis=1)) for side in (first, last)]
+    sides = [_simplify_outline(np.stack([side, lines[rows]], axis=1)) for side in (first, last)]
     # Use the outer corners of the first and the last pixels instead of their centres.
     for side in sides:
         side[0, 1] -= 0.5
@@ -37,24 +37,24 @@ def outline(detection: Detection) -> list[float]:
     return np.concatenate([sides[0], sides[1][::-1]]).round(1).ravel().tolist()
 
 
-def _simplified(points: np.ndarray) -> np.ndarray:
+def _simplify_outline(points: np.ndarray) -> np.ndarray:
     """Simplify a polyline [K, 2] by the Douglas-Peucker algorithm."""
     return cv2.approxPolyDP(points.astype(np.float32)[:, None], _TOLERANCE, closed=False)[:, 0].astype(float)
 
 
-def write_coco(path: Path, found: Sequence[tuple[Path, tuple[int, int], list[Detection]]], about: str) -> None:
+def write_coco(path: Path, detected: Sequence[tuple[Path, tuple[int, int], list[Detection]]], about: str) -> None:
     """Write the detections in several images in COCO format.
 
     Args:
         path: The file; images are named relative to its folder.
-        found: File, size (height, width) and detections of each image.
+        detected: File, size (height, width) and detections of each image.
         about: Description of the data set.
 
     Raises:
         OSError: The file cannot be written.
     """
     images, annotations = [], []
-    for number, (image, (height, width), detections) in enumerate(found, start=1):
+    for number, (image, (height, width), detections) in enumerate(detected, start=1):
         name = image.relative_to(path.parent).as_posix()
         images.append({"id": number, "file_name": name, "width": width, "height": height})
         for detection in detections:

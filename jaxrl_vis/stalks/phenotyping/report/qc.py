@@ -148,13 +148,13 @@ class Page:
             for track in rejected
         ]
         reasons = Counter(sighting.reason for frame in plot.frames for sighting in frame if sighting.reason)
-        finds = [{"why": why, "finds": count} for why, count in _grouped(reasons).most_common()]
+        finds = [{"why": why, "finds": count} for why, count in _group_reasons(reasons).most_common()]
         write = self._file.write
-        write(f'<details id="{_safe(name)}"><summary>{_safe(name)}: {_safe(_headline(plot.row))}</summary>')
+        write(f'<details id="{_escape(name)}"><summary>{_escape(name)}: {_escape(_headline(plot.row))}</summary>')
         if plot.why:
-            write(f'<p class="doubt">No count: {_safe(plot.why)}.</p>')
+            write(f'<p class="doubt">No count: {_escape(plot.why)}.</p>')
         if plot.strange:
-            write(f'<p class="doubt">{_safe(plot.strange[:1].upper() + plot.strange[1:])}.</p>')
+            write(f'<p class="doubt">{_escape(plot.strange[:1].upper() + plot.strange[1:])}.</p>')
         if plot.stalks:
             write(_chart(plot, rejected))
             write(f"<h3>Stalks</h3><p>{_ERRORS}</p>" + table({"picture": "", **_STALK_COLUMNS}, tables))
@@ -177,13 +177,13 @@ class Page:
         Raises:
             OSError: The file cannot be written.
         """
-        rows = [{**row, "plot": _Html(f'<a href="#{_safe(row["plot"])}">{_safe(row["plot"])}</a>')} for row in self._rows]
+        rows = [{**row, "plot": _Html(f'<a href="#{_escape(row["plot"])}">{_escape(row["plot"])}</a>')} for row in self._rows]
         with replacing(path) as encoded:
             file = codecs.getwriter("utf-8")(encoded)
             file.write('<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Stalks</title>')
             file.write(f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head><body>')
             file.write("<h1>Stalks: what was counted and measured</h1>")
-            file.write("".join(f"<p>{_safe(line)}</p>" for line in self._about))
+            file.write("".join(f"<p>{_escape(line)}</p>" for line in self._about))
             file.write("<h2>Plots</h2><p>Click on a column to sort by it, and on a plot to see its stalks.</p>")
             file.write(table(_PLOT_COLUMNS, rows))
             if skipped:
@@ -199,7 +199,7 @@ class _Html(str):
     """HTML that must not be escaped again."""
 
 
-def _safe(value: Any) -> str:
+def _escape(value: Any) -> str:
     return html.escape(str(value))
 
 
@@ -210,7 +210,7 @@ def _headline(row: dict[str, Any]) -> str:
     return ", ".join([*parts, *([] if row["flag"] == "ok" else [str(row["flag"])])])
 
 
-def _grouped(reasons: Counter[str]) -> Counter[str]:
+def _group_reasons(reasons: Counter[str]) -> Counter[str]:
     """Merge the counts of reasons that differ only in a distance."""
     groups: Counter[str] = Counter()
     for reason, count in reasons.items():
@@ -226,7 +226,7 @@ def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
         rows: Values by column name; flags other than ``ok`` are highlighted.
     """
     head = "".join(
-        f'<th aria-sort="none"><button>{_safe(title)}</button></th>' if title else "<th></th>" for title in columns.values()
+        f'<th aria-sort="none"><button>{_escape(title)}</button></th>' if title else "<th></th>" for title in columns.values()
     )
     lines = []
     for row in rows:
@@ -236,7 +236,7 @@ def table(columns: dict[str, str], rows: Iterable[dict[str, Any]]) -> str:
             if column in _DIGITS and value != "":
                 value = f"{float(value):.{_DIGITS[column]}f}"
             kind = ' class="doubt"' if column == "flag" and value != "ok" else ""
-            cells.append(f"<td{kind}>{value if isinstance(value, _Html) else _safe(value)}</td>")
+            cells.append(f"<td{kind}>{value if isinstance(value, _Html) else _escape(value)}</td>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
     return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div>"
 
@@ -257,25 +257,25 @@ class _Pictures:
         # The best sighting of each track, grouped by pair, so that each overlay is read once.
         wanted: dict[int, list[tuple[int, int]]] = {}
         for place, track in enumerate(plot.tracks):
-            frame, sighting = max(track.sightings, key=lambda indices: self._clear(*indices))
+            frame, sighting = max(track.sightings, key=lambda indices: self._clear_section(*indices))
             wanted.setdefault(frame, []).append((place, sighting))
-        self._found: dict[int, _Html] = {}
+        self._crops: dict[int, _Html] = {}
         for frame, tracks in wanted.items():
             overlay = read_image(folder / file_name(f"{plot.pairs[frame]}.png"))
             for place, sighting in tracks:
                 name = f"pair {plot.pairs[frame]}"
-                self._found[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
+                self._crops[place] = picture(self._crop(overlay, plot.frames[frame][sighting]), name, "stalk")
 
-    def _clear(self, frame: int, sighting: int) -> tuple[bool, float]:
+    def _clear_section(self, frame: int, sighting: int) -> tuple[bool, float]:
         chosen = self._plot.frames[frame][sighting]
         return chosen.diameter_mm is not None, chosen.confidence
 
     def _crop(self, overlay: np.ndarray, sighting: Sighting) -> np.ndarray:
         scale = overlay_scale(self._plot.image_width)
         left, top, right, bottom = (round(edge * scale) for edge in sighting.box)
-        beside = max((bottom - top) // 2, 12)
-        top, bottom = max(top - beside // 2, 0), min(bottom + beside // 4, overlay.shape[0])
-        left, right = max(left - beside, 0), min(right + beside, overlay.shape[1])
+        margin = max((bottom - top) // 2, 12)
+        top, bottom = max(top - margin // 2, 0), min(bottom + margin // 4, overlay.shape[0])
+        left, right = max(left - margin, 0), min(right + margin, overlay.shape[1])
         cut = overlay[top:bottom, left:right]
         shrink = min(240 / max(cut.shape[0], 1), 1.0)
         return (
@@ -286,17 +286,17 @@ class _Pictures:
 
     def of(self, track: Track) -> _Html:
         """Return the image of a track's best sighting."""
-        return self._found[next(place for place, other in enumerate(self._plot.tracks) if other is track)]
+        return self._crops[next(index for index, other in enumerate(self._plot.tracks) if other is track)]
 
-    def whole(self, most: int) -> Iterable[str]:
-        """Yield images of at most ``most`` whole pairs, spread evenly over the plot."""
+    def whole(self, count: int) -> Iterable[str]:
+        """Yield images of at most ``count`` whole pairs, spread evenly over the plot."""
         pairs = self._plot.pairs
-        for place in np.unique(np.linspace(0, len(pairs) - 1, min(most, len(pairs))).round()).astype(int):
+        for place in np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round()).astype(int):
             overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))
             shrink = min(_THUMB / overlay.shape[1], 1.0)
             small = cv2.resize(overlay, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
             name = f"pair {pairs[place]}"
-            yield f"<figure>{picture(small, name, 'pair')}<figcaption>{_safe(name)}</figcaption></figure>"
+            yield f"<figure>{picture(small, name, 'pair')}<figcaption>{_escape(name)}</figcaption></figure>"
 
 
 def picture(image: np.ndarray, name: str, kind: str) -> _Html:
@@ -309,9 +309,8 @@ def picture(image: np.ndarray, name: str, kind: str) -> _Html:
     """
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 75])
     source = base64.b64encode(data.tobytes()).decode()
-    return _Html(
-        f'<img class="{kind}" loading="lazy" alt="{_safe(name)}" title="{_safe(name)}" src="data:image/jpeg;base64,{source}">'
-    )
+    title = _escape(name)
+    return _Html(f'<img class="{kind}" loading="lazy" alt="{title}" title="{title}" src="data:image/jpeg;base64,{source}">')
 
 
 def _chart(plot: PlotResult, rejected: list[Track]) -> str:
@@ -325,18 +324,18 @@ def _chart(plot: PlotResult, rejected: list[Track]) -> str:
         return ""
     places = [point[0] for point in points] + [track.position_m - plot.start for track in rejected]
     low, high = min(places) - 0.05, max(places) + 0.05
-    most = 1.1 * max(point[1] + point[2] for point in points)
+    maximum = 1.1 * max(point[1] + point[2] for point in points)
     wide, tall, margin = 900, 240, 44
 
     def x(place: float) -> float:
         return margin + (place - low) / (high - low) * (wide - margin - 8)
 
     def y(width: float) -> float:
-        return tall - 30 - width / most * (tall - 40)
+        return tall - 30 - width / maximum * (tall - 40)
 
     marks = []
-    step = 5 if most < 40 else 10
-    for value in range(0, int(most) + 1, step):
+    step = 5 if maximum < 40 else 10
+    for value in range(0, int(maximum) + 1, step):
         marks.append(f'<line class="grid" x1="{margin}" x2="{wide - 8}" y1="{y(value):.1f}" y2="{y(value):.1f}"/>')
         marks.append(f'<text x="{margin - 6}" y="{y(value) + 4:.1f}" text-anchor="end">{value}</text>')
     apart = 0.25 if high - low > 1.0 else 0.1
@@ -345,14 +344,14 @@ def _chart(plot: PlotResult, rejected: list[Track]) -> str:
         marks.append(f'<text x="{x(tick):.1f}" y="{tall - 12}" text-anchor="middle">{tick:.2f}</text>')
     for track in rejected:
         place = f'x="{x(track.position_m - plot.start):.1f}" y="{tall - 32}"'
-        marks.append(f'<text class="no" {place} text-anchor="middle">×<title>{_safe(track.reason)}</title></text>')
+        marks.append(f'<text class="no" {place} text-anchor="middle">×<title>{_escape(track.reason)}</title></text>')
     for place, width, error, row in points:
         kind = "good" if row["flag"] == "ok" else "doubt"
         ends = f'y1="{y(width - error):.1f}" y2="{y(width + error):.1f}"'
         title = f"stalk {row['stalk']}: {row['width_mm']} ± {row['width_se_mm']} mm, {row['flag']}"
         marks.append(f'<line class="{kind}" x1="{x(place):.1f}" x2="{x(place):.1f}" {ends}/>')
         marks.append(
-            f'<circle class="{kind}" cx="{x(place):.1f}" cy="{y(width):.1f}" r="4"><title>{_safe(title)}</title></circle>'
+            f'<circle class="{kind}" cx="{x(place):.1f}" cy="{y(width):.1f}" r="4"><title>{_escape(title)}</title></circle>'
         )
     caption = "Width in mm along the row in m. Orange: look at its flag. ×: rejected."
     return (

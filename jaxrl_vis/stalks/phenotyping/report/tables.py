@@ -51,7 +51,7 @@ PLOT_COLUMNS = (
     "version",
 )
 Row = dict[str, Any]
-_LEAST_SEEN = 0.95  # minimum fraction of the row that pairs must show for a count
+_MIN_SEEN = 0.95  # minimum fraction of the row that pairs must show for a count
 _MAX_ERROR = 0.08  # of a width: maximum scatter between pairs before it is uncertain
 NO_GROUND = "no visible ground"
 """Flag of widths at an unknown height, as the ground was not seen."""
@@ -137,7 +137,7 @@ def _flag(widths: StalkWidths, confidence: float) -> str:
 def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin: Origin) -> Row:
     widths = np.array([float(row["width_mm"]) for row in stalks if row["width_mm"] != ""])
     # In unfamiliar images the networks detect nothing, so no detections do not mean a count of 0.
-    count = len(stalks) if path.seen >= _LEAST_SEEN and stalks else ""
+    count = len(stalks) if path.seen >= _MIN_SEEN and stalks else ""
     doubts = [PARTLY_SEEN] if stalks and count == "" else []
     doubts += [NO_WIDTHS] if stalks and not widths.size else []
     doubts += [SKIPPED] if stalks and skipped else []
@@ -159,7 +159,7 @@ def _plot_row(stalks: list[Row], pairs: int, path: Driven, skipped: int, origin:
 
 
 def rows_without_path(
-    frames: list[list[Sighting]], skipped: int, origin: Origin, why: str, metric: bool = True
+    frames: list[list[Sighting]], skipped: int, origin: Origin, reason: str, metric: bool = True
 ) -> tuple[list[Row], Row]:
     """Compute the row of a plot whose pairs cannot be linked: there is no count, and there are no rows of stalks.
 
@@ -167,7 +167,7 @@ def rows_without_path(
         frames: Sightings of each pair.
         skipped: Number of pairs that could not be used.
         origin: Values common to all rows.
-        why: Flag of the plot.
+        reason: Flag of the plot.
         metric: If true, state the mean width of the detections; false if the unit of the calibration is in doubt.
     """
     sightings = [sighting for frame in frames for sighting in frame] if metric else []
@@ -180,7 +180,7 @@ def rows_without_path(
         "stalks": "",
         "stalks_per_m": "",
         **_widths(np.array(measured)),
-        "flag": why,
+        "flag": reason,
         "method": origin.method,
         "version": origin.version,
     }

@@ -13,10 +13,10 @@ from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
 from jaxrl_vis.stalks.phenotyping.report.qc import picture, table
 from jaxrl_vis.stalks.phenotyping.report.qc_style import SCRIPT, STYLE
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
-from jaxrl_vis.stalks.phenotyping.training.held_out import LEAST_SCORE, Finds, Score
+from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, Finds, Score
 
 _ANNOTATED, _RIGHT, _FALSE = (255, 225, 60), (70, 235, 100), (255, 105, 75)
-_MOST = 60  # images shown
+_MAX_IMAGES = 60  # images shown
 _COLUMNS = {
     "weights": "weights",
     "images": "images",
@@ -53,14 +53,14 @@ def write_page(
         OSError: The file cannot be written.
     """
     rows = []
-    for name, each in scores.items():
-        values = dataclasses.asdict(each) | {"masks": overlaps.get(name, math.nan), "false": each.finds - each.right}
+    for name, score in scores.items():
+        values = dataclasses.asdict(score) | {"masks": overlaps.get(name, math.nan), "false": score.finds - score.right}
         texts = {key: f"{value:.2f}" if isinstance(value, float) else value for key, value in values.items()}
         rows.append({"weights": name, **{key: "" if text == "nan" else text for key, text in texts.items()}})
     figures = []
-    for place, example in enumerate(examples[:_MOST]):
-        shown = {name: draw_finds(example, each[place]) for name, each in finds.items()}
-        pictures = "".join(picture(image, f"image {place + 1}, {name}", "pair") for name, image in shown.items())
+    for index, example in enumerate(examples[:_MAX_IMAGES]):
+        shown = {name: draw_finds(example, of_set[index]) for name, of_set in finds.items()}
+        pictures = "".join(picture(image, f"image {index + 1}, {name}", "pair") for name, image in shown.items())
         figures.append(f"<figure>{pictures}<figcaption>{' | '.join(shown)}</figcaption></figure>")
     parts = [
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Training on own images</title>',
@@ -68,7 +68,7 @@ def write_page(
         "<h1>Networks before and after training, on images that were held out</h1>",
         *(f"<p>{fact}</p>" for fact in facts),
         table(_COLUMNS, rows),
-        f"<p>Yellow: annotated. Green: found, with a score of {LEAST_SCORE:g} or more. Red: found where nothing is annotated."
+        f"<p>Yellow: annotated. Green: found, with a score of {MIN_SCORE:g} or more. Red: found where nothing is annotated."
         "</p>",
         *figures,
         f"<script>{SCRIPT}</script></body></html>\n",
@@ -77,12 +77,12 @@ def write_page(
 
 
 def draw_finds(example: Example, finds: Finds) -> np.ndarray:
-    """Draw the annotations and the detections of at least `LEAST_SCORE` on a copy of an example's image, [h, w, 3] uint8."""
+    """Draw the annotations and the detections of at least `MIN_SCORE` on a copy of an example's image, [h, w, 3] uint8."""
     canvas = example.image.copy()
     for stalk in example.stalks[example.kinds == STALK]:
         _box(canvas, stalk, _ANNOTATED)
     for stalk, score, right in zip(finds.stalks, finds.scores, finds.right):
-        if score >= LEAST_SCORE:
+        if score >= MIN_SCORE:
             colour = _RIGHT if right else _FALSE
             _box(canvas, stalk, colour)
             place = (round(float(stalk[0])), max(round(float(stalk[1])) - 4, 12))

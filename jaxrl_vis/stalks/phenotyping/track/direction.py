@@ -14,8 +14,8 @@ from jaxrl_vis_envs.plants import Calibration
 
 _ALONG, _DEPTH = 0.006, 0.02  # m: maximum differences of two sightings of one stalk after motion compensation
 _MIN_SHARED = 4  # minimum number of shared stalks of two pairs to be compared
-_SHARED_SHARE = 0.75  # minimum shared fraction of the smaller pair's stalks: so many do not match by chance
-_MAX_STEP_SHARE = 0.5  # of those: a pair contradicts the odometry if its step matches fewer
+_SHARED_FRACTION = 0.75  # minimum shared fraction of the smaller pair's stalks: so many do not match by chance
+_MAX_STEP_FRACTION = 0.5  # of those: a pair contradicts the odometry if its step matches fewer
 _MIN_CONTRADICTIONS = 0.25  # minimum fraction of the comparable pairs that contradict the odometry
 _MIN_LINKED = 0.3  # minimum fraction of all sightings that are linked in reverse: fewer may be so by chance
 _LINK_RATIO = 1.2  # minimum ratio of links in reverse to forward, if the forward direction is consistent
@@ -53,12 +53,12 @@ def follow_either_way(
         columns: Range of visible image columns; see `follow.follow`.
     """
     tracks, path = follow(frames, distances, calibration, columns=columns)
-    fits = not _contradicted(frames, path.places)
+    fits = not _is_contradicted(frames, path.places)
     back, backwards = follow(frames, -np.asarray(distances, float), calibration, columns=columns)
     # If pairs differ too much to contradict either direction, take the one in which more sightings are linked.
     better = _links(back) > (_LINK_RATIO if fits else 1.0) * _links(tracks)
     well = _links(back) > _MIN_LINKED * sum(map(len, frames))
-    if better and well and not _contradicted(frames, backwards.places):
+    if better and well and not _is_contradicted(frames, backwards.places):
         tracks = [dataclasses.replace(track, position_m=-track.position_m) for track in back]
         return Followed(tracks, dataclasses.replace(backwards, places=-backwards.places), True)
     return Followed(tracks, path, fits)
@@ -69,7 +69,7 @@ def _links(tracks: list[Track]) -> int:
     return sum(len(track.sightings) - 1 for track in tracks)
 
 
-def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
+def _is_contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
     """Return whether most pairs that share stalks with the previous one contradict the path.
 
     Args:
@@ -78,11 +78,11 @@ def _contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
     """
     compared = judged = against = 0
     for first, second, step in zip(frames, frames[1:], np.diff(places)):
-        best, own, most = _shared(_places(first), _places(second), float(step))
-        compared += most >= _MIN_SHARED
-        if best >= max(_MIN_SHARED, _SHARED_SHARE * most):
+        best, own, possible = _count_shared(_places(first), _places(second), float(step))
+        compared += possible >= _MIN_SHARED
+        if best >= max(_MIN_SHARED, _SHARED_FRACTION * possible):
             judged += 1
-            against += own < _MAX_STEP_SHARE * best
+            against += own < _MAX_STEP_FRACTION * best
     return against > max(judged / 2, _MIN_CONTRADICTIONS * compared)
 
 
@@ -96,7 +96,7 @@ def _places(sightings: list[Sighting]) -> np.ndarray:
     return np.array(known, float).reshape(-1, 2)
 
 
-def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, int, int]:
+def _count_shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, int, int]:
     """Count the stalks that two pairs share, by matching their positions after a step of the cameras.
 
     Args:
@@ -106,9 +106,9 @@ def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, in
     Returns:
         Number of shared stalks after the best step and after about the given step, and the maximum possible number.
     """
-    most = min(len(first), len(second))
-    if most < _MIN_SHARED:
-        return 0, 0, most
+    possible = min(len(first), len(second))
+    if possible < _MIN_SHARED:
+        return 0, 0, possible
     moved = first[:, None, 0] - second[None, :, 0]  # [N, M], m: motion of the cameras if the two are one stalk
     near = np.abs(first[:, None, 1] - second[None, :, 1]) < _DEPTH
 
@@ -120,4 +120,4 @@ def _shared(first: np.ndarray, second: np.ndarray, step: float) -> tuple[int, in
     best = max((count(float(by)) for by in candidates), default=0)
     # Tolerate an error of the odometry of a few per cent, which `follow` corrects where possible.
     own = max((count(float(by)) for by in candidates if abs(by - step) < 0.018), default=0)
-    return best, own, most
+    return best, own, possible

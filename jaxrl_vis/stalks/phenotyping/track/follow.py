@@ -31,7 +31,7 @@ class Gates:
         behind: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
         astray: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
         row: Maximum difference between the depth of a counted stalk and the median depth.
-        share: Minimum fraction of the pairs with the stalk in view that must show it to count it.
+        fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
         least: Minimum number of pairs that must show it, unless fewer have it in view.
         ends: Maximum distance of a counted stalk's foot beyond the ends of the path.
     """
@@ -42,8 +42,8 @@ class Gates:
     behind: float = 0.005
     astray: float = 0.34
     row: float = 0.2
-    share: float = 0.3
-    least: int = 2
+    fraction: float = 0.3
+    minimum: int = 2
     ends: float = 0.01
 
 
@@ -143,7 +143,7 @@ def follow(
             depth = float(view.depth[new]) if view.known[new] else math.nan
             if new in taken:
                 track = tracks[taken[new]]
-                along = view.along[new] if view.known[new] else view.beside(track.place()[1])[new]
+                along = view.along[new] if view.known[new] else view.along_at(track.place()[1])[new]
             else:
                 track, along = _Open(), view.along[new]
                 tracks.append(track)
@@ -158,7 +158,7 @@ def follow(
     )
     length = abs(float(places[-1] - places[0]) + step) if len(places) else 0.0
     path = Path(places, length, _seen(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
-    closed = [_closed(track, path, step, field, usual, gates) for track in _merged(tracks, gates)]
+    closed = [_finish_track(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
@@ -173,8 +173,8 @@ def _seen(places: np.ndarray, step: float, field: list[float]) -> float:
     if not len(places):
         return 0.0
     points = np.linspace(places[0] - 0.5 * step, places[-1] + 0.5 * step, 201)
-    beside = points[:, None] - places
-    return float(((beside >= field[0]) & (beside <= field[1])).any(axis=1).mean())
+    offsets = points[:, None] - places
+    return float(((offsets >= field[0]) & (offsets <= field[1])).any(axis=1).mean())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,24 +209,24 @@ class _PairView:
         known = np.isfinite(along) & np.isfinite(depth)
         # A depth without a position: not a stalk of the row.
         elsewhere = np.array([sighting.depth_m is not None and sighting.along_m is None for sighting in sightings], bool)
-        over = np.array([_over(sighting) for sighting in sightings])
+        over = np.array([_lean_offset(sighting) for sighting in sightings])
         half = 0.5 * calibration.baseline
         along = np.where(known, along, rays * usual - half)
-        return cls(rays, along, depth, known, ~elsewhere & _apart_in_space(sightings), over, half, usual)
+        return cls(rays, along, depth, known, ~elsewhere & _are_distinct(sightings), over, half, usual)
 
-    def beside(self, depth: float) -> np.ndarray:
+    def along_at(self, depth: float) -> np.ndarray:
         """Return the positions along the row [N], m, assuming a ``depth`` in m; the usual depth if NaN."""
         return self.rays * (depth if math.isfinite(depth) else self.usual) - self.half
 
 
-def _over(sighting: Sighting) -> float:
+def _lean_offset(sighting: Sighting) -> float:
     """Return the distance along the row from a stalk's foot to the place of its measurement, m; 0 if unknown."""
     if sighting.height_m is None or sighting.lean_deg is None or abs(sighting.lean_deg) > _MAX_LEAN:
         return 0.0
     return sighting.height_m * math.tan(math.radians(sighting.lean_deg))
 
 
-def _apart_in_space(sightings: list[Sighting]) -> np.ndarray:
+def _are_distinct(sightings: list[Sighting]) -> np.ndarray:
     """Return [N] bool, True for sightings of a pair that are distinct stalks: two stalks cannot intersect in space.
 
     Of two that do, the less certain one is a duplicate and marked False. The minimum distance is 60 % of that at which they
@@ -253,7 +253,7 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
         return []
     there = np.array([track.place() for track in tracks])
     # A sighting without depth is compared at the depth of the track.
-    along = np.where(view.known, view.along, [view.beside(depth) for _, depth in there]) + place
+    along = np.where(view.known, view.along, [view.along_at(depth) for _, depth in there]) + place
     aside = np.abs(there[:, :1] - along) / gates.along
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
     cost = np.where((aside < 1.0) & (away < 1.0) & view.there, aside + 0.5 * away, _FORBIDDEN_COST)
@@ -261,7 +261,7 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
     return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _FORBIDDEN_COST]
 
 
-def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
+def _merge_tracks(tracks: list[_Open], gates: Gates) -> list[_Open]:
     """Merge tracks of one stalk into the longer one, which is modified in place: same position, and hardly ever seen together.
 
     Tracks are also merged if they always lie on the same rays and one of the depths is wrong: of two stalks one behind the
@@ -270,7 +270,7 @@ def _merged(tracks: list[_Open], gates: Gates) -> list[_Open]:
     merged: list[_Open] = []
     for track in sorted(tracks, key=lambda track: -len(track.sightings)):
         for other in merged:
-            aside, away = _apart(track, other)
+            aside, away = _track_distance(track, other)
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A wrongly assigned sighting may make both appear in one pair.
             near = aside < gates.merge and away < gates.depth
@@ -292,11 +292,11 @@ def _one_behind(track: _Open, other: _Open) -> float:
     if len(track.sightings) < 2 or not len(depths):
         return math.inf
     depth = float(np.median(depths))
-    beside = np.array([offset + ray * depth for offset, ray in track.rays]) - float(np.median(other.along))
-    return float(np.median(np.abs(beside)))
+    positions = np.array([offset + ray * depth for offset, ray in track.rays]) - float(np.median(other.along))
+    return float(np.median(np.abs(positions)))
 
 
-def _apart(track: _Open, other: _Open) -> tuple[float, float]:
+def _track_distance(track: _Open, other: _Open) -> tuple[float, float]:
     """Return the distances of two tracks along the row and in depth, m."""
     depths = track.depths(), other.depths()
     if all(map(len, depths)) or not any(map(len, depths)):
@@ -307,7 +307,7 @@ def _apart(track: _Open, other: _Open) -> tuple[float, float]:
     return abs(track.at(depth) - other.at(depth)), 0.0
 
 
-def _closed(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
+def _finish_track(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
     position = float(np.median(track.along))
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
@@ -316,7 +316,7 @@ def _closed(track: _Open, path: Path, step: float, field: tuple[float, ...], usu
     expected = int((np.abs(path.places + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
     # A stalk without a measured depth must be seen twice as often.
-    wanted = max(min(gates.least, expected), math.ceil((1.0 if known else 2.0) * gates.share * expected), 1)
+    wanted = max(min(gates.minimum, expected), math.ceil((1.0 if known else 2.0) * gates.fraction * expected), 1)
     begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
     if len(track.sightings) < wanted:
         reason = f"seen in {len(track.sightings)} of {expected} pairs"

@@ -26,7 +26,7 @@ _MASK_ERROR = 0.7  # pixels: bias of masks on one texture
 _HIDING_ERROR = 0.8  # mm, if an edge may be occluded in all pairs
 _CALIBRATION_ERROR = 0.005  # relative: focal length and baseline of a good calibration
 _FEW = 2.0  # pairs: correction for the underestimated scatter of few pairs
-_FURTHEST = 4.0 * INCH  # m: maximum distance of a measurement from a height
+_MAX_OFFSET = 4.0 * INCH  # m: maximum distance of a measurement from a height
 _NEAR_HEIGHT = 0.5 * INCH  # m: distance within which the taper correction is negligible
 _ASIDE = 20.0  # degrees off the cameras' axis at which the weight is 1/e: from aside, oval stalks show another side
 
@@ -71,10 +71,10 @@ class StalkWidths:
 def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
     """Estimate the widths of the stalks of a plot, in the order of their tracks."""
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
-    first = [_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
+    first = [_widths_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
     tapers = [width.taper for width in first if width.taper is not None]
     taper = float(np.median(tapers)) if len(tapers) >= _MIN_SIGHTINGS else USUAL_TAPER
-    return [_of_stalk(sightings, taper) for sightings in of_stalks]
+    return [_widths_of_stalk(sightings, taper) for sightings in of_stalks]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ class _Value:
         mm, deviation: Diameter and its standard error, mm.
         height: Height of the measurement above the ground, m.
         confidence: Weight of the measurement.
-        hidden: True if an edge may be occluded.
+        occluded: True if an edge may be occluded.
         pixel: Size of a pixel at the stalk, mm; 0 if unknown.
     """
 
@@ -93,14 +93,14 @@ class _Value:
     deviation: float | None
     height: float
     confidence: float
-    hidden: bool
+    occluded: bool
     pixel: float
 
 
-def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
+def _widths_of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
     known = [
         _Value(
-            e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.hidden, _pixel(e.diameter_mm, e.width_px)
+            e.diameter_mm, e.deviation_mm, e.height_m, e.confidence * _facing(e), e.occluded, _pixel(e.diameter_mm, e.width_px)
         )
         for e in sightings
         if e.diameter_mm is not None and e.height_m is not None
@@ -111,13 +111,13 @@ def _of_stalk(sightings: list[Sighting], taper: float) -> StalkWidths:
             e.upper_deviation_mm,
             e.upper_height_m,
             e.upper_confidence * _facing(e),
-            e.upper_hidden,
+            e.upper_occluded,
             _pixel(e.upper_mm, None if e.upper_place is None else e.upper_place[2]),
         )
         for e in sightings
         if e.upper_mm is not None and e.upper_height_m is not None
     ]
-    lower, upper = _at(LOWER, known, taper), _at(UPPER, above, taper)
+    lower, upper = _width_at(LOWER, known, taper), _width_at(UPPER, above, taper)
     if lower is None:
         return StalkWidths(robust_width(sightings), upper, None, False)
     own = None if upper is None else (lower.mm - upper.mm) / ((UPPER - LOWER) / INCH)
@@ -134,15 +134,15 @@ def _facing(sighting: Sighting) -> float:
     return 1.0 if sighting.ray_deg is None else math.exp(-((sighting.ray_deg / _ASIDE) ** 2))
 
 
-def _at(height: float, values: list[_Value], taper: float) -> Width | None:
+def _width_at(height: float, values: list[_Value], taper: float) -> Width | None:
     """Estimate the width at a height in m; None if nothing was measured near it."""
     near, far = [], 0
     for value in values:
-        beside = (value.height - height) / INCH
-        if abs(value.height - height) > _FURTHEST:
+        inches = (value.height - height) / INCH
+        if abs(value.height - height) > _MAX_OFFSET:
             continue
-        error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * beside)
-        near.append(dataclasses.replace(value, mm=value.mm + taper * beside, deviation=error))
+        error = math.hypot(value.deviation or 0.0, _TAPER_SPREAD * taper * inches)
+        near.append(dataclasses.replace(value, mm=value.mm + taper * inches, deviation=error))
         far += abs(value.height - height) > _NEAR_HEIGHT
     width = _robust(near)
     return None if width is None else dataclasses.replace(width, corrected=2 * far > len(near))
@@ -152,7 +152,7 @@ def robust_width(sightings: list[Sighting]) -> Width | None:
     """Estimate the diameter of a stalk from sightings at any height; None if it was never measured."""
     return _robust(
         [
-            _Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.hidden, _pixel(e.diameter_mm, e.width_px))
+            _Value(e.diameter_mm, e.deviation_mm, 0.0, e.confidence * _facing(e), e.occluded, _pixel(e.diameter_mm, e.width_px))
             for e in sightings
             if e.diameter_mm is not None
         ]
@@ -165,22 +165,22 @@ def _robust(values: list[_Value]) -> Width | None:
     If there are too few of these, all measurements are used, and the 0.85 quantile instead of the median, as measurements with
     an occluded edge are lower bounds.
     """
-    clear = [value for value in values if not value.hidden]
-    some, share = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
-    if not some:
+    clear = [value for value in values if not value.occluded]
+    used, quantile = (clear, 0.5) if len(clear) >= _MIN_CLEAR or len(clear) == len(values) else (values, _LOWER_BOUNDS)
+    if not used:
         return None
-    widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in some]).T
+    widths, stated, weights = np.array([(value.mm, value.deviation or 0.0, value.confidence) for value in used]).T
     weights = np.maximum(weights, 0.02)
     order = np.argsort(widths)
     passed = np.cumsum(weights[order]) - 0.5 * weights[order]
-    middle = float(np.interp(share * weights.sum(), passed, widths[order]))
+    middle = float(np.interp(quantile * weights.sum(), passed, widths[order]))
     enough = float(weights.sum() ** 2 / (weights**2).sum())
     scatter = 1.4826 * float(np.median(np.abs(widths - middle))) * 1.2533 if len(widths) > 2 else 0.0
-    least = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
-    of_pairs = max(scatter, least) / math.sqrt(enough)
+    mean_error = math.sqrt(float((weights * stated**2).sum() / weights.sum()))
+    of_pairs = max(scatter, mean_error) / math.sqrt(enough)
     error = math.hypot(
         of_pairs * math.sqrt(1.0 + _FEW / len(widths)),
-        _MASK_ERROR * float(np.median([value.pixel for value in some])),
+        _MASK_ERROR * float(np.median([value.pixel for value in used])),
         _HIDING_ERROR * (1.0 - len(clear) / len(values)),
         _CALIBRATION_ERROR * middle,
     )

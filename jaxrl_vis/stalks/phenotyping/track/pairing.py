@@ -12,11 +12,11 @@ from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Sightin
 from jaxrl_vis_envs.plants import Calibration
 
 _MIN_STALKS = 4
-_MOST = 0.7  # minimum fraction of the detections that are measured in a good pair
+_MIN_MEASURED = 0.7  # minimum fraction of the detections that are measured in a good pair
 _SAME_DEPTH = 0.15  # maximum relative difference of the depths of one row
 _NEAREST = 3.0  # minimum depth in baselines: below, the fields of view hardly overlap
-_LEAST_DISPARITY = 2.0  # pixels
-_SMALL_SHARE, _LARGE_SHARE = 0.25, 0.6
+_MIN_DISPARITY = 2.0  # pixels
+_SMALL_FRACTION, _LARGE_FRACTION = 0.25, 0.6
 _LINES = (6, 12, 24, 48)  # vertical offsets of unrectified images that are tried, pixels at a focal length of 2168
 
 
@@ -40,11 +40,11 @@ def pair_fault(
     grey_left, grey_right = grey_at(left), grey_at(right)
     measured = sum(sighting.diameter_mm is not None for sighting in sightings)
     fault = _upside_down(grey_left, grey_right, calibration) if ground is None else None
-    if fault is None and (ground is None or measured < _MOST * len(detections)):
+    if fault is None and (ground is None or measured < _MIN_MEASURED * len(detections)):
         fault = _distance_fault(detections, grey_left, grey_right, calibration)
     if fault is not None:
         return fault
-    if len(detections) < _MIN_STALKS or measured > _SMALL_SHARE * len(detections):
+    if len(detections) < _MIN_STALKS or measured > _SMALL_FRACTION * len(detections):
         return None
     # The mirror image of a swapped pair is a correct pair.
     mirror = dataclasses.replace(calibration, centre=(calibration.width - 1 - calibration.centre[0], calibration.centre[1]))
@@ -57,11 +57,11 @@ def pair_fault(
         )
         for detection in detections
     ]
-    if _share(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_SHARE:
+    if _measured_fraction(turned, grey_left[:, ::-1], grey_right[:, ::-1], mirror) >= _LARGE_FRACTION:
         return "left and right are swapped: exchange their names"
     for lines in sorted({max(round(line * calibration.focal / 2168), 3) for line in _LINES}):
         for shift in (lines, -lines):
-            if _share(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_SHARE:
+            if _measured_fraction(detections, grey_left, np.roll(grey_right, shift, axis=0), calibration) >= _LARGE_FRACTION:
                 return f"the right image lies about {lines} lines too {'high' if shift > 0 else 'low'}: rectify the pair"
     return None
 
@@ -85,7 +85,7 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
         return None
     depth = float(np.median(depths))
     agree = np.mean(np.abs(np.array(depths) / depth - 1.0) < _SAME_DEPTH)
-    if DEPTHS[0] <= depth <= DEPTHS[1] or agree < _LARGE_SHARE:
+    if DEPTHS[0] <= depth <= DEPTHS[1] or agree < _LARGE_FRACTION:
         return None
     baseline = calibration.baseline * USUAL_DISTANCE / depth
     return (
@@ -100,7 +100,7 @@ def _any_depth(find: Detection, left: np.ndarray, right: np.ndarray, calibration
     if strip is None:
         return None
     nearest = float(calibration.disparity(np.array(_NEAREST * calibration.baseline)))
-    matched = stalk_disparity(strip, find.corner, left, right, calibration, (calibration.offset + _LEAST_DISPARITY, nearest))
+    matched = stalk_disparity(strip, find.corner, left, right, calibration, (calibration.offset + _MIN_DISPARITY, nearest))
     at = matched.at(strip.reference + find.corner[0])
     return None if at is None else float(calibration.depth(np.array(at[0])))
 
@@ -110,7 +110,7 @@ def _some(detections: list[Detection]) -> list[Detection]:
     return detections[:: -(-len(detections) // 10)] if detections else []
 
 
-def _share(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
+def _measured_fraction(detections: list[Detection], left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float:
     """Return the fraction of the detections, of which at most ten are tried, that can be measured with the right image."""
     some = _some(detections)
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)

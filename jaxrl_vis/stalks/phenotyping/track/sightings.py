@@ -27,7 +27,7 @@ _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is foun
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
 _AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
-_HIDDEN = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
+_OCCLUDED = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
 _BEHIND = 0.003  # m: a stalk further behind occludes nothing
 _TOUCHING = 0.1  # of half a stalk's width: distance within which edges touch
 _SAME_DEPTH = 0.06  # m: change of depth over 12 inches of a stalk that leans by 10 degrees
@@ -54,8 +54,8 @@ class Sighting:
             of the measurement around 24 inches above the ground.
         upper_place: Column, row and width of that measurement, pixels.
         confidence: Confidence of the measurement, 0 to 1.
-        hidden, upper_hidden: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches it,
-            or, for the lower measurement, the edges are not visible around the row itself.
+        occluded, upper_occluded: True if an edge may be occluded, so that the diameter is a lower bound: another stalk touches
+            it, or, for the lower measurement, the edges are not visible around the row itself.
         ray_deg: Horizontal angle between the left camera's axis and the ray to the stalk, degrees, positive to the right.
         reason: Reason why the stalk was not measured; empty if it was.
     """
@@ -78,23 +78,24 @@ class Sighting:
     upper_confidence: float = 0.0
     upper_place: tuple[float, float, float] | None = None
     confidence: float = 0.0
-    hidden: bool = False
-    upper_hidden: bool = False
+    occluded: bool = False
+    upper_occluded: bool = False
     ray_deg: float | None = None
     reason: str = ""
 
     @classmethod
     def read(cls, values: dict[str, Any]) -> "Sighting":
-        """Build a sighting from the JSON object of its `dataclasses.asdict`.
+        """Build a sighting from its `json_values`.
 
         Raises:
             ValueError: A field is missing, unknown, or of the wrong type or length.
         """
         parts: dict[str, Any] = {}
         for name, (kind, optional, length) in _KINDS.items():
-            if name not in values:
+            key = _KEYS.get(name, name)
+            if key not in values:
                 continue
-            value = parts[name] = tuple(values[name]) if isinstance(values[name], list) else values[name]
+            value = parts[name] = tuple(values[key]) if isinstance(values[key], list) else values[key]
             if value is None and optional:
                 continue
             several = value if isinstance(value, tuple) else (value,)
@@ -103,6 +104,14 @@ class Sighting:
         if len(parts) != len(values) or not {"box", "axis", "score", "line", "column"} <= parts.keys():
             raise ValueError("something is missing or too many")
         return cls(**parts)
+
+    def json_values(self) -> dict[str, Any]:
+        """Return the fields as JSON values by their keys in files."""
+        return {_KEYS.get(name, name): value for name, value in dataclasses.asdict(self).items()}
+
+
+# Keys in files of the fields that have another name there.
+_KEYS = {"occluded": "hidden", "upper_occluded": "upper_hidden"}
 
 
 def _field_kind(hint: Any) -> tuple[type | tuple[type, ...], bool, int]:
@@ -231,64 +240,71 @@ def measure_pair(
         One sighting per detection.
     """
     if calibration is None:
-        return [_in_pixels(detection) for detection in detections]
+        return [_unscaled_sighting(detection) for detection in detections]
     grey_left, grey_right = grey_at(left), grey_at(right)
     measured: list[tuple[Measurement, Measurement | None]] = []
     for detection in detections:
         line = 0.5 * (detection.box[1] + detection.box[3])
         images = (grey_left, grey_right, calibration)
         how = {"method": method, "ground": ground, "disparity": disparity}
-        got = measure(detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how)
+        measurement = measure(
+            detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how
+        )
         upper = None
         if ground is not None and detection.upper is not None:
             upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
-        measured.append((got, upper))
-    measured = _without_strangers(measured, calibration, find_frame(grey_right).columns[0])
-    hidden = _hidden_edges([got for got, _ in measured])
-    above = _hidden_edges([upper or Measurement() for _, upper in measured])
-    hidden = [behind or not got.here for behind, (got, _) in zip(hidden, measured)]
+        measured.append((measurement, upper))
+    measured = _without_mismatches(measured, calibration, find_frame(grey_right).columns[0])
+    occluded = _occluded_edges([measurement for measurement, _ in measured])
+    above = _occluded_edges([upper or Measurement() for _, upper in measured])
+    occluded = [behind or not measurement.here for behind, (measurement, _) in zip(occluded, measured)]
     sightings = []
-    for detection, (got, upper), *behind in zip(detections, measured, hidden, above):
-        less = dataclasses.replace(got, confidence=got.confidence * _HIDDEN) if behind[0] else got
+    for detection, (measurement, upper), *behind in zip(detections, measured, occluded, above):
+        less = dataclasses.replace(measurement, confidence=measurement.confidence * _OCCLUDED) if behind[0] else measurement
         sighting = _sighting(detection, less, upper, calibration)
-        sightings.append(dataclasses.replace(sighting, hidden=behind[0], upper_hidden=behind[1]))
+        sightings.append(dataclasses.replace(sighting, occluded=behind[0], upper_occluded=behind[1]))
     return sightings
 
 
-def _without_strangers(
-    measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, begin: int
+def _without_mismatches(
+    measured: list[tuple[Measurement, Measurement | None]], calibration: Calibration, first_column: int
 ) -> list[tuple[Measurement, Measurement | None]]:
     """Invalidate measurements of stalks outside the right image, which were matched with something else.
 
     Args:
         measured: Lower and upper measurement of each stalk of a pair.
         calibration: Calibration of the cameras.
-        begin: First column of the right image without a black border.
+        first_column: First column of the right image without a black border.
     """
-    depths = [got.depth for got, _ in measured if got.diameter_mm is not None]
+    depths = [measurement.depth for measurement, _ in measured if measurement.diameter_mm is not None]
     if len(depths) < _AT_DISTANCE:
         return measured
     row = float(np.median(depths))
     disparity = float(calibration.disparity(np.array(row)))
-    kept = []
-    for got, upper in measured:
-        beyond = got.column - 0.5 * got.width - disparity < begin
-        if got.diameter_mm is not None and beyond and abs(got.depth - row) > _FAR_FROM_ROW:
-            got = Measurement(line=got.line, column=got.column, lean=got.lean, reason="the right image does not show it")
+    valid = []
+    for measurement, upper in measured:
+        beyond = measurement.column - 0.5 * measurement.width - disparity < first_column
+        if measurement.diameter_mm is not None and beyond and abs(measurement.depth - row) > _FAR_FROM_ROW:
+            measurement = Measurement(
+                line=measurement.line,
+                column=measurement.column,
+                lean=measurement.lean,
+                reason="the right image does not show it",
+            )
             upper = None
-        kept.append((got, upper))
-    return kept
+        valid.append((measurement, upper))
+    return valid
 
 
-def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
+def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
     """Return True for stalks with an edge at another stalk that is not behind them.
 
     Such an edge may be that of the other stalk, and the width too small.
     """
-    hidden = []
+    occluded = []
     for measurement in measurements:
         half = 0.5 * measurement.width / math.cos(measurement.lean) if measurement.diameter_mm is not None else math.nan
-        hidden.append(False)
+        occluded.append(False)
         for other in measurements:
             if (
                 measurement.diameter_mm is None
@@ -299,11 +315,11 @@ def _hidden_edges(measurements: list[Measurement]) -> list[bool]:
                 continue
             middle = other.column + math.tan(other.lean) * (other.line - measurement.line)
             reach = 0.5 * other.width / math.cos(other.lean) + _TOUCHING * half
-            hidden[-1] |= any(abs(measurement.column + side * half - middle) < reach for side in (-1.0, 1.0))
-    return hidden
+            occluded[-1] |= any(abs(measurement.column + side * half - middle) < reach for side in (-1.0, 1.0))
+    return occluded
 
 
-def _in_pixels(detection: Detection) -> Sighting:
+def _unscaled_sighting(detection: Detection) -> Sighting:
     strip = detection.strip or strip_width(detection.mask)
     line = 0.5 * (detection.box[1] + detection.box[3])
     column = 0.5 * sum(detection.axis)
@@ -323,21 +339,21 @@ def _in_pixels(detection: Detection) -> Sighting:
     )
 
 
-def _sighting(detection: Detection, got: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
+def _sighting(detection: Detection, measurement: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
     """Build a sighting from measurements, rounded so that it is unchanged by a round trip through JSON."""
-    line = got.line if math.isfinite(got.line) else 0.5 * (detection.box[1] + detection.box[3])
-    column = got.column if math.isfinite(got.column) else 0.5 * sum(detection.axis)
+    line = measurement.line if math.isfinite(measurement.line) else 0.5 * (detection.box[1] + detection.box[3])
+    column = measurement.column if math.isfinite(measurement.column) else 0.5 * sum(detection.axis)
 
     def known(value: float | None, digits: int) -> float | None:
         return None if value is None or not math.isfinite(value) else round(value, digits)
 
     # Another stalk may stand where this one's axis was extrapolated to.
-    same = upper is not None and abs(upper.depth - got.depth) < _SAME_DEPTH
+    same = upper is not None and abs(upper.depth - measurement.depth) < _SAME_DEPTH
     higher = upper if upper is not None and upper.diameter_mm is not None and same else Measurement()
     along = None
-    if got.diameter_mm is not None:
+    if measurement.diameter_mm is not None:
         # The axis is half a diameter behind the front surface.
-        depth = got.depth + 0.5e-3 * got.diameter_mm
+        depth = measurement.depth + 0.5e-3 * measurement.diameter_mm
         along = (column - calibration.centre[0]) / calibration.focal * depth - 0.5 * calibration.baseline
     return Sighting(
         box=tuple(round(edge, 2) for edge in detection.box),  # pyright: ignore[reportArgumentType]
@@ -345,13 +361,13 @@ def _sighting(detection: Detection, got: Measurement, upper: Measurement | None,
         score=round(detection.score, 4),
         line=round(line, 2),
         column=round(column, 2),
-        width_px=known(got.width, 3),
-        lean_deg=known(math.degrees(got.lean), 2),
-        diameter_mm=known(got.diameter_mm, 4),
-        deviation_mm=known(got.deviation_mm, 4),
-        depth_m=known(got.depth, 5),
+        width_px=known(measurement.width, 3),
+        lean_deg=known(math.degrees(measurement.lean), 2),
+        diameter_mm=known(measurement.diameter_mm, 4),
+        deviation_mm=known(measurement.deviation_mm, 4),
+        depth_m=known(measurement.depth, 5),
         along_m=known(along, 5),
-        height_m=known(got.height, 4),
+        height_m=known(measurement.height, 4),
         upper_mm=known(higher.diameter_mm, 4),
         upper_deviation_mm=known(higher.deviation_mm, 4),
         upper_height_m=known(higher.height, 4),
@@ -359,7 +375,7 @@ def _sighting(detection: Detection, got: Measurement, upper: Measurement | None,
         upper_place=None
         if higher.diameter_mm is None
         else tuple(round(x, 2) for x in (higher.column, higher.line, higher.width)),  # pyright: ignore[reportArgumentType]
-        confidence=round(got.confidence, 4),
+        confidence=round(measurement.confidence, 4),
         ray_deg=round(math.degrees(math.atan((column - calibration.centre[0]) / calibration.focal)), 2),
-        reason=got.reason,
+        reason=measurement.reason,
     )

@@ -19,30 +19,30 @@ def relight(images: jax.Array, key: jax.Array) -> jax.Array:
     keys: dict[str, jax.Array] = dict(zip(names, jax.random.split(key, len(names))))
     count = images.shape[0]
 
-    def each(name: str, low: float, high: float) -> jax.Array:
+    def per_image(name: str, low: float, high: float) -> jax.Array:
         return jax.random.uniform(keys[name], (count, 1, 1, 1), minval=low, maxval=high)
 
     values = (images.astype(jnp.float32) / 255.0) ** 2.2
     grey = values.mean(axis=-1, keepdims=True)
-    values = jnp.maximum(grey + (values - grey) * each("grey", 0.2, 1.5), 0.0)
-    gain = jnp.exp(each("gain", -1.2, 1.0)) * jnp.exp(0.2 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
+    values = jnp.maximum(grey + (values - grey) * per_image("grey", 0.2, 1.5), 0.0)
+    gain = jnp.exp(per_image("gain", -1.2, 1.0)) * jnp.exp(0.2 * jax.random.normal(keys["colour"], (count, 1, 1, 3)))
     # Smooth random variations of brightness, as of other textures, on a grid of 24 x 24 cells.
     coarse = jax.random.normal(keys["blotch"], (count, 24, 24, 1))
-    gain = gain * jnp.exp(each("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
-    values = _blurred(values * gain, jnp.where(each("sharp", 0.0, 1.0) > 0.5, each("blur", 0.3, 1.3), 0.05))
+    gain = gain * jnp.exp(per_image("strength", 0.0, 0.3) * jax.image.resize(coarse, (*images.shape[:3], 1), "linear"))
+    values = _blur(values * gain, jnp.where(per_image("sharp", 0.0, 1.0) > 0.5, per_image("blur", 0.3, 1.3), 0.05))
     # Up to three times the shot and read noise of the original images, of which downscaled ones have less.
-    level = 3.0 * each("level", 0.0, 1.0) ** 2 / _WELL_ROOT
+    level = 3.0 * per_image("level", 0.0, 1.0) ** 2 / _WELL_ROOT
     values = values + level * jnp.sqrt(values + _DARK) * jax.random.normal(keys["noise"], values.shape)
     curve = jnp.exp(0.15 * jax.random.normal(keys["gamma"], (count, 1, 1, 1))) / 2.2
     return jnp.round(255.0 * jnp.clip(values, 0.0, 1.0) ** curve).astype(jnp.uint8)
 
 
-def _blurred(values: jax.Array, deviation: jax.Array) -> jax.Array:
+def _blur(values: jax.Array, deviation: jax.Array) -> jax.Array:
     """Blur values [N, H, W, C] by a Gaussian with standard deviation ``deviation`` [N, 1, 1, 1], pixels."""
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation) ** 2)  # [N, 1, 1, taps]
     taps = taps / taps.sum(axis=-1, keepdims=True)
     for axis in (1, 2):
-        padding = [(_TAPS, _TAPS) if place == axis else (0, 0) for place in range(4)]
+        padding = [(_TAPS, _TAPS) if index == axis else (0, 0) for index in range(4)]
         padded, size = jnp.pad(values, padding, mode="edge"), values.shape[axis]
         parts = [jax.lax.slice_in_dim(padded, k, k + size, axis=axis) * taps[..., k : k + 1] for k in range(2 * _TAPS + 1)]
         values = sum(parts[1:], parts[0])
@@ -65,10 +65,10 @@ def move(
         Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``.
     """
     keys = jax.random.split(key, images.shape[0])
-    return jax.vmap(_moved)(images, stalks, kinds, sizes, keys)
+    return jax.vmap(_transform_stalks)(images, stalks, kinds, sizes, keys)
 
 
-def _moved(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Array, key: jax.Array):
+def _transform_stalks(image: jax.Array, stalks: jax.Array, kinds: jax.Array, shape: jax.Array, key: jax.Array):
     drawn = jax.random.uniform(key, (7,), minval=-1.0, maxval=1.0)
     height, width = shape[0], shape[1]
     still = drawn[0] > 0.5
@@ -110,45 +110,47 @@ def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Arr
     line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
     top, left = jnp.floor(line).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
     down, over = (line - top)[..., None], (column - left)[..., None]
-    below, beside = jnp.minimum(top + 1, shape[0] - 1), jnp.minimum(left + 1, shape[1] - 1)
+    below, right = jnp.minimum(top + 1, shape[0] - 1), jnp.minimum(left + 1, shape[1] - 1)
     values = image.astype(jnp.float32)
-    upper = values[top, left] * (1 - over) + values[top, beside] * over
-    lower = values[below, left] * (1 - over) + values[below, beside] * over
+    upper = values[top, left] * (1 - over) + values[top, right] * over
+    lower = values[below, left] * (1 - over) + values[below, right] * over
     return jnp.round((upper * (1 - down) + lower * down) * inside[..., None]).astype(jnp.uint8)
 
 
-def vary_snips(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def augment_crops(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Augment stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool: width, texture, contrast, mirroring and lighting."""
     light, side, marks, size, contrast, along = jax.random.split(key, 6)
-    snips, masks = _stretched(snips, masks, size)
-    snips = _striped(_set_off(_textured(snips, marks), masks, contrast), masks, along)
-    mirror = jax.random.bernoulli(side, 0.5, (snips.shape[0],))
-    snips = jnp.where(mirror[:, None, None, None], snips[:, :, ::-1], snips)
+    crops, masks = _stretch(crops, masks, size)
+    crops = _add_stripes(_change_contrast(_add_texture(crops, marks), masks, contrast), masks, along)
+    mirror = jax.random.bernoulli(side, 0.5, (crops.shape[0],))
+    crops = jnp.where(mirror[:, None, None, None], crops[:, :, ::-1], crops)
     masks = jnp.where(mirror[:, None, None], masks[:, :, ::-1], masks)
-    return relight(snips, light), masks
+    return relight(crops, light), masks
 
 
-def _stretched(snips: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _stretch(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Stretch crops and masks horizontally about their centre by a factor from exp(-0.3) to exp(0.3)."""
-    count, _, width = snips.shape[:3]
+    count, _, width = crops.shape[:3]
     wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
     place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], source of each column
     place = jnp.clip(place, 0.0, width - 1.0)
     left = jnp.minimum(jnp.floor(place).astype(jnp.int32), width - 2)
-    share = (place - left)[:, None, :]
+    fraction = (place - left)[:, None, :]
 
     def columns(values: jax.Array, at: jax.Array) -> jax.Array:
         return jnp.take_along_axis(values, at.reshape(count, 1, width, *(1,) * (values.ndim - 3)), axis=2)
 
-    values = snips.astype(jnp.float32)
-    mixed = columns(values, left) * (1 - share[..., None]) + columns(values, left + 1) * share[..., None]
+    values = crops.astype(jnp.float32)
+    mixed = columns(values, left) * (1 - fraction[..., None]) + columns(values, left + 1) * fraction[..., None]
     inside = masks.astype(jnp.float32)
-    return jnp.round(mixed).astype(jnp.uint8), columns(inside, left) * (1 - share) + columns(inside, left + 1) * share >= 0.5
+    return jnp.round(mixed).astype(jnp.uint8), columns(inside, left) * (1 - fraction) + columns(
+        inside, left + 1
+    ) * fraction >= 0.5
 
 
-def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
+def _add_texture(crops: jax.Array, key: jax.Array) -> jax.Array:
     """Add random speckles, fibres along the stalk and shading to crops, to cover more than the textures of a family."""
-    count, height, width = snips.shape[:3]
+    count, height, width = crops.shape[:3]
     spots, fibres, shades, amounts = jax.random.split(key, 4)
     amount = jax.random.uniform(amounts, (4, count, 1, 1))
 
@@ -158,52 +160,52 @@ def _textured(snips: jax.Array, key: jax.Array) -> jax.Array:
 
     dark = jnp.where(noise(spots, 6, 3) > 2.2 - 1.4 * amount[0], 1.0 - 0.6 * amount[1], 1.0)
     grain = jnp.exp(0.25 * amount[2] * noise(fibres, 160, 2) + 0.35 * amount[3] * noise(shades, 80, 10))
-    return jnp.round(jnp.clip(snips * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
+    return jnp.round(jnp.clip(crops * (dark * grain)[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
-def _striped(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+def _add_stripes(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     """Add light and dark stripes along the stalk to 70 % of the crops, as of ribs and folded sheaths, varying by internode.
 
     A dark stripe looks like a gap between two stalks, but the stalk continues on its other side.
     """
-    count, height, width = snips.shape[:3]
+    count, height, width = crops.shape[:3]
     keys = jax.random.split(key, 5)
     # Index of the internode, out of four, that each row belongs to.
     nodes = jnp.sort(jax.random.uniform(keys[0], (3, count)), axis=0) * height
     internode = (jnp.arange(height) > nodes[..., None]).sum(axis=0)  # [N, lines]
     stripes = jnp.zeros(masks.shape)
     weights = jax.nn.softmax(2.0 * jax.random.normal(keys[1], (2, count)), axis=0)
-    for place, (columns, weight) in enumerate(zip((5, 12), weights)):
-        drawn = jax.random.normal(keys[2 + place], (count, 4, max(width // columns, 2)))
+    for index, (columns, weight) in enumerate(zip((5, 12), weights)):
+        drawn = jax.random.normal(keys[2 + index], (count, 4, max(width // columns, 2)))
         across = jax.image.resize(drawn, (count, 4, width), "linear")
         stripes += weight[:, None, None] * jnp.take_along_axis(across, internode[..., None], axis=1)
     amount, chance = jax.random.uniform(keys[4], (2, count, 1, 1))
     factor = jnp.where(masks & (chance < 0.7), jnp.exp(amount * jnp.tanh(4.0 * stripes)), 1.0)
-    return jnp.round(jnp.clip(snips * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
+    return jnp.round(jnp.clip(crops * factor[..., None], 0.0, 255.0)).astype(jnp.uint8)
 
 
-def _set_off(snips: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
+def _change_contrast(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Array:
     """Randomise the contrast of stalks to the background, and their shading towards the edges, in half of the crops.
 
     The shading of a round stalk towards its edges depends on its surface and on the light. A network that overfits to it
     misplaces the edges of other stalks. The change is multiplicative, so black remains black and no edge appears where none was
     visible.
     """
-    count, _, width = snips.shape[:3]
+    count, _, width = crops.shape[:3]
     keys = jax.random.split(key, 6)
     inside = masks.astype(jnp.float32)
     own = jnp.exp(0.3 * jax.random.normal(keys[0], (count, 1, 1, 1)) + 0.15 * jax.random.normal(keys[1], (count, 1, 1, 3)))
     # Fraction of stalk pixels in the horizontal neighbourhood of each pixel: 1 at the centre, about a half at the edges.
-    share = jnp.zeros_like(inside)
+    coverage = jnp.zeros_like(inside)
     weights = jax.nn.softmax(2.0 * jax.random.normal(keys[2], (3, count)), axis=0)
     for reach, weight in zip((4, 8, 16), weights):
         reach = min(reach, (width - 1) // 2)
         sums = jax.lax.reduce_window(inside, 0.0, jax.lax.add, (1, 1, 2 * reach + 1), (1, 1, 1), "SAME")
-        share += weight[:, None, None] * sums / (2 * reach + 1)
+        coverage += weight[:, None, None] * sums / (2 * reach + 1)
     amount = jax.random.uniform(keys[3], (count, 1, 1), minval=-0.3, maxval=0.8)
     power = jnp.exp(0.4 * jax.random.normal(keys[4], (count, 1, 1)))
-    shade = 1.0 - amount * jnp.clip(2.0 * (1.0 - share), 0.0, 1.0) ** power
+    shade = 1.0 - amount * jnp.clip(2.0 * (1.0 - coverage), 0.0, 1.0) ** power
     # Half of the crops are unchanged: in real images, the original contrast is the only cue.
     changed = jax.random.bernoulli(keys[5], 0.5, (count, 1, 1, 1)) & masks[..., None]
     factor = jnp.where(changed, own * shade[..., None], 1.0)
-    return jnp.round(jnp.clip(snips * factor, 0.0, 255.0)).astype(jnp.uint8)
+    return jnp.round(jnp.clip(crops * factor, 0.0, 255.0)).astype(jnp.uint8)

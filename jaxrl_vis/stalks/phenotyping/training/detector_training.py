@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, initial, padded_shape
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, init_detector, padded_shape
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.losses import detector_loss, segmenter_loss
-from jaxrl_vis.stalks.phenotyping.training.augment import move, relight, vary_snips
+from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, move, relight
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 from jaxrl_vis.stalks.phenotyping.training.pool import Pool
 from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
@@ -33,7 +33,7 @@ class Plan:
         images: Maximum number of training images.
         first: Number of images from which updates start.
         batch: Batch size of images.
-        snips: Batch size of stalk crops.
+        crops: Batch size of stalk crops.
         rate: Peak learning rate.
         average: Decay rate of the exponential moving average of the parameters.
         seed: Random seed.
@@ -44,7 +44,7 @@ class Plan:
     images: int = 800
     first: int = 24
     batch: int = 8
-    snips: int = 32
+    crops: int = 32
     rate: float = 1e-3
     average: float = 0.998
     seed: int = 0
@@ -69,7 +69,7 @@ class _Pool(Pool[Example]):
 
     def __init__(self, sources: list[Iterator[Example]], plan: Plan) -> None:
         self._plan = plan
-        self.snips: list[tuple[int, int]] = []
+        self.crops: list[tuple[int, int]] = []
         self._largest = (0, 0)
         super().__init__(sources, plan.images)
 
@@ -77,7 +77,7 @@ class _Pool(Pool[Example]):
         """Add an example and its stalk crops."""
         height, width = example.image.shape[:2]
         self._largest = max(self._largest[0], height), max(self._largest[1], width)
-        self.snips += [(len(self.examples), place) for place in range(len(example.snips))]
+        self.crops += [(len(self.examples), index) for index in range(len(example.crops))]
         super().add(example)
 
     def images(self, rng: np.random.Generator) -> Images:
@@ -87,14 +87,14 @@ class _Pool(Pool[Example]):
 
     def strips(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
         """Sample a batch of stalk crops with their masks; return None if there are no crops yet."""
-        if not self.snips:
+        if not self.crops:
             return None
         # All crops of a batch have one shape, that of a randomly sampled crop.
-        shape = self.examples[self.snips[rng.integers(len(self.snips))][0]].snips.shape[1:3]
-        alike = [place for place in self.snips if self.examples[place[0]].snips.shape[1:3] == shape]
-        chosen = [alike[place] for place in rng.integers(len(alike), size=self._plan.snips)]
+        shape = self.examples[self.crops[rng.integers(len(self.crops))][0]].crops.shape[1:3]
+        alike = [place for place in self.crops if self.examples[place[0]].crops.shape[1:3] == shape]
+        chosen = [alike[place] for place in rng.integers(len(alike), size=self._plan.crops)]
         return (
-            np.stack([self.examples[image].snips[place] for image, place in chosen]),
+            np.stack([self.examples[image].crops[place] for image, place in chosen]),
             np.stack([self.examples[image].masks[place] for image, place in chosen]),
         )
 
@@ -128,7 +128,7 @@ def update_networks(
         New state, and the terms of the loss by name.
     """
     params, average, moments = state
-    rate, share = rates
+    rate, decay = rates
     (images, stalks, kinds, sizes), strips = batch
     places, light, near, variation = jax.random.split(key, 4)
     images, stalks, kinds = move(images, stalks, kinds, sizes, places)
@@ -139,15 +139,15 @@ def update_networks(
         total, parts = detector_loss(params["detector"], images, stalks, kinds, settings, dtype, near)
         if strips is None:
             return total, parts
-        snips, masks = vary_snips(strips[0], strips[1], variation)
-        of_masks = segmenter_loss(params["segmenter"], snips, masks, settings, dtype)
+        crops, masks = augment_crops(strips[0], strips[1], variation)
+        of_masks = segmenter_loss(params["segmenter"], crops, masks, settings, dtype)
         return total + of_masks, {**parts, "masks": of_masks}
 
     gradients, parts = jax.grad(loss, has_aux=True)(params)
     updates, moments = _optimiser().update(gradients, moments, params)
     updates = _map_frozen(jnp.zeros_like, updates, frozen)  # weight decay also acts at zero gradient
     params = jax.tree.map(lambda old, change: old + rate * change, params, updates)
-    average = jax.tree.map(lambda old, new: share * old + (1.0 - share) * new, average, params)
+    average = jax.tree.map(lambda old, new: decay * old + (1.0 - decay) * new, average, params)
     return (params, average, moments), parts
 
 
@@ -176,7 +176,7 @@ def initial_networks(settings: Settings, detector_key: jax.Array, segmenter_key:
     """Initialise the parameters of both networks at random."""
     blank = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     return {
-        "detector": initial(settings, detector_key),
+        "detector": init_detector(settings, detector_key),
         "segmenter": Segmenter(settings.segmenter).lazy_init(segmenter_key, blank),
     }
 
@@ -187,7 +187,12 @@ def _optimiser() -> optax.GradientTransformation:
 
 
 def train(
-    sources: list[Iterator[Example]], settings: Settings, plan: Plan, report: Report, every: float = 30.0, start: Any = None
+    sources: list[Iterator[Example]],
+    settings: Settings,
+    plan: Plan,
+    report: Report,
+    report_interval: float = 30.0,
+    start: Any = None,
 ) -> tuple[Any, int]:
     """Train the networks.
 
@@ -196,7 +201,7 @@ def train(
         settings: Settings of the networks.
         plan: Training schedule.
         report: Progress callback, see `Report`.
-        every: Minimum interval between reports, s.
+        report_interval: Minimum interval between reports, s.
         start: Initial parameters, as returned by this function; None for random initialisation.
 
     Returns:
@@ -225,7 +230,7 @@ def train(
 
     try:
         pool.fill(plan.first)
-        step = repeat(update, pool, plan, started, report, every)
+        step = repeat(update, pool, plan, started, report, report_interval)
     finally:
         pool.close()
     return state[1], step

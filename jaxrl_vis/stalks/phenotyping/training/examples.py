@@ -14,9 +14,9 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-from jaxrl_vis.stalks.phenotyping.detector.finder import higher_up, resize, resize_factor
+from jaxrl_vis.stalks.phenotyping.detector.finder import resize, resize_factor, upper_segment
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import cut, snip_shape
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, find_calibration, read_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, rgb8
@@ -30,7 +30,7 @@ from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
 
 MIN_VISIBLE = 0.3
 """Minimum visible fraction of a stalk's part in the band to count it as a `STALK`."""
-_MasksOf = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
+_MaskFunction = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 """Function that returns the masks [N, h, w] bool of the crops of stalks with indices [N], given their positions (boxes and
 axes) [N or more, 6] and the (height, width) of crops."""
 MAX_STALKS = 56
@@ -51,14 +51,14 @@ class Example:
         stalks: [T, 6] float32, boxes, and x coordinates of the axis at the top and bottom of the box, pixels of the resized
             image; padded to T = `MAX_STALKS`.
         kinds: [T] int32: `losses.NOTHING` (padding), ``UNCLEAR`` or ``STALK``.
-        snips: Stalk crops [S, H, W, 3] uint8 at full resolution; S is not padded.
+        crops: Stalk crops [S, H, W, 3] uint8 at full resolution; S is not padded.
         masks: Masks [S, H, W] bool of the crops.
     """
 
     image: np.ndarray
     stalks: np.ndarray
     kinds: np.ndarray
-    snips: np.ndarray
+    crops: np.ndarray
     masks: np.ndarray
 
 
@@ -73,11 +73,11 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
     """
     sequence = Sequence.of(draw(family, seed))
     settled = sequence.plot.family
-    density = sequence.drive.true.focal / settled.rig.distance
+    pixels_per_metre = sequence.drive.true.focal / settled.rig.distance
     rng = np.random.default_rng([seed, 17])
     by_day = settled.scene.share > 0
     if by_day:  # the scale of third-party images is not known exactly
-        density *= float(np.exp(rng.uniform(*_SCALES)))
+        pixels_per_metre *= float(np.exp(rng.uniform(*_SCALES)))
     length = len(sequence)
     chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
     examples = []
@@ -87,39 +87,39 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         true = sequence.drive.true
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
-        masks_of = functools.partial(_instance_masks, instance, indices)
-        example = _example(image, density, stalks, kinds, masks_of, settings, rng, _HIGHER)
+        mask_function = functools.partial(_instance_masks, instance, indices)
+        example = _example(image, pixels_per_metre, stalks, kinds, mask_function, settings, rng, _HIGHER)
         if by_day:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.
-            shape = snip_shape((settings.snip_lines, settings.snip_columns), family.rig.width / settings.full_width)
-            example = resized_snips(cut_out(example, (settings.lines, settings.width), rng), shape)
+            shape = crop_shape((settings.crop_height, settings.crop_width), family.rig.width / settings.full_width)
+            example = resize_crops(cut_out(example, (settings.lines, settings.width), rng), shape)
         examples.append(example)
     return examples
 
 
-def resized_snips(example: Example, shape: tuple[int, int]) -> Example:
+def resize_crops(example: Example, shape: tuple[int, int]) -> Example:
     """Resize the stalk crops and masks of an example to ``shape`` (height, width)."""
-    if not len(example.snips) or example.snips.shape[1:3] == shape:
+    if not len(example.crops) or example.crops.shape[1:3] == shape:
         return example
     size = (shape[1], shape[0])
-    snips = np.stack([cv2.resize(snip, size, interpolation=cv2.INTER_LINEAR) for snip in example.snips])
+    crops = np.stack([cv2.resize(crop, size, interpolation=cv2.INTER_LINEAR) for crop in example.crops])
     masks = [cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in example.masks]
-    return dataclasses.replace(example, snips=snips, masks=np.stack(masks))
+    return dataclasses.replace(example, crops=crops, masks=np.stack(masks))
 
 
-def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -> Example:
+def cut_out(example: Example, max_size: tuple[int, int], rng: np.random.Generator) -> Example:
     """Crop the image of an example at random, mostly around a stalk.
 
     Args:
         example: Example to crop; its stalk crops are unchanged.
-        most: Maximum height and width.
+        max_size: Maximum height and width.
         rng: Generator of the position.
 
     Returns:
         Example with clipped stalks, of which those that are hardly left in the image are ``NOTHING``.
     """
     size = example.image.shape[:2]
-    lines, columns = (min(length, limit) for length, limit in zip(size, most))
+    lines, columns = (min(length, limit) for length, limit in zip(size, max_size))
     low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])
     there = np.flatnonzero(example.kinds == STALK)
     if len(there) and rng.random() < _AT_STALKS:
@@ -136,10 +136,12 @@ def cut_out(example: Example, most: tuple[int, int], rng: np.random.Generator) -
     there = shown.all(axis=1) & (example.kinds != NOTHING)
     kinds = np.where(there, example.kinds, NOTHING)
     image = example.image[top : top + lines, left : left + columns]
-    return dataclasses.replace(example, image=np.ascontiguousarray(image), stalks=_clipped(stalks, lines, columns), kinds=kinds)
+    return dataclasses.replace(
+        example, image=np.ascontiguousarray(image), stalks=_clip_stalks(stalks, lines, columns), kinds=kinds
+    )
 
 
-def _clipped(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
+def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
     """Clip the boxes of stalks [T, 6] to an image of ``lines`` x ``columns`` pixels, and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = stalks.T
     slope = (below - above) / np.maximum(bottom - top, 1e-3)
@@ -151,7 +153,7 @@ def _clipped(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
 def _instance_masks(
     instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of an instance segmentation; see `_MasksOf`."""
+    """Cut the masks of stalk crops out of an instance segmentation; see `_MaskFunction`."""
     cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is outside the image
     return cut_out == indices[parts][:, None, None] + 1
 
@@ -189,19 +191,19 @@ def true_boxes(
 
 def _example(
     image: Any,
-    density: float | None,
+    pixels_per_metre: float | None,
     stalks: np.ndarray,
     kinds: np.ndarray,
-    masks_of: _MasksOf,
+    mask_function: _MaskFunction,
     settings: Settings,
     rng: Any,
     higher: float = 0.0,
 ) -> Example:
     """Build the example of an image [H, W, 3]; a fraction ``higher`` of its stalks also gets a crop around the upper height."""
-    whole = np.asarray(image)
-    reduced, scale = resize(whole, settings, density)
-    share = settings.width / settings.full_width / settings.resizing(whole.shape[1], density)
-    shape = snip_shape((settings.snip_lines, settings.snip_columns), share)
+    full_image = np.asarray(image)
+    reduced, scale = resize(full_image, settings, pixels_per_metre)
+    relative_scale = settings.width / settings.full_width / settings.scale_for(full_image.shape[1], pixels_per_metre)
+    shape = crop_shape((settings.crop_height, settings.crop_width), relative_scale)
     clear = np.flatnonzero(kinds == STALK)
     # Jitter the positions, as detections are not exact.
     moved = stalks[clear].copy()
@@ -209,21 +211,21 @@ def _example(
     moved[:, 4:] += wide * rng.normal(size=(len(clear), 2))
     moved[:, 1::2][:, :2] += 2.0 * wide * rng.normal(size=(len(clear), 1))
     drawn = rng.random(len(clear)) < higher
-    above = np.array([higher_up(stalk) for stalk in moved[drawn]], np.float32).reshape(-1, 6)
+    above = np.array([upper_segment(stalk) for stalk in moved[drawn]], np.float32).reshape(-1, 6)
     shown = above[:, 1] > 0
     clear, moved = np.concatenate([clear, clear[drawn][shown]]), np.concatenate([moved, above[shown]])
     on_device, places = jnp.asarray(image), moved
-    snips, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
+    crops, masks = np.zeros((0, *shape, 3), np.uint8), np.zeros((0, *shape), bool)
     if len(clear):
         filled = -(-len(clear) // 16) * 16  # few shapes, few compilations
         places = np.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
-        snips = np.asarray(cut(on_device, places, shape))[: len(clear)]
-        masks = masks_of(clear, places, shape)
+        crops = np.asarray(cut(on_device, places, shape))[: len(clear)]
+        masks = mask_function(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
     count = min(len(stalks), MAX_STALKS)
     padded, padded_kinds = np.zeros((MAX_STALKS, 6), np.float32), np.full(MAX_STALKS, NOTHING, np.int32)
     padded[:count], padded_kinds[:count] = (stalks / divisor)[:count], kinds[:count]
-    return Example(np.asarray(reduced), padded, padded_kinds, snips, masks)
+    return Example(np.asarray(reduced), padded, padded_kinds, crops, masks)
 
 
 def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Iterator[Example]:
@@ -235,7 +237,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         RequestError: Annotations are missing or invalid, or an image is missing or differs in size from its annotations.
     """
     data = read_annotations(folder, labels)
-    density_of = _densities(folder, data["images"])
+    resolution_of = _resolutions(folder, data["images"])
     of_image: dict[int, list[dict[str, Any]]] = {}
     for annotation in data["annotations"]:
         of_image.setdefault(annotation["image_id"], []).append(annotation)
@@ -260,7 +262,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         stalks = np.concatenate([stalks, strips])
         rng = np.random.default_rng([number, 18])
         yield _example(
-            image, density_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
+            image, resolution_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
         )
 
 
@@ -287,18 +289,18 @@ def _own_masks(
     places: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of annotations; see `_MasksOf`.
+    """Cut the masks of stalk crops out of annotations; see `_MaskFunction`.
 
     One at a time: masks may overlap, and all of an image together could exceed the memory.
     """
-    snips = [
-        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[place : place + 1], shape))
-        for place, part in enumerate(parts)
+    crops = [
+        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[index : index + 1], shape))
+        for index, part in enumerate(parts)
     ]
-    return np.concatenate(snips)
+    return np.concatenate(crops)
 
 
-def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
+def _resolutions(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
     """Return the pixels per metre at the row of each image by its id; all None if the folder has no calibration.
 
     Raises:
@@ -313,9 +315,9 @@ def _densities(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | 
     return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
 
 
-_MOST_ENLARGED = 3.0
-_WIDEST_SNIP = 512  # pixels
-_WIDEST = 2048  # pixels: maximum width of a resized image
+_MAX_ENLARGED = 3.0
+_MAX_CROP_WIDTH = 512  # pixels
+_MAX_WIDTH = 2048  # pixels: maximum width of a resized image
 
 
 def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
@@ -328,23 +330,25 @@ def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
         RequestError: The annotations or the calibration of the folder cannot be read.
     """
     data = read_annotations(folder, labels)
-    densities = _densities(folder, data["images"])
+    densities = _resolutions(folder, data["images"])
     known = all(densities.values())
     widths = {image["id"]: image["width"] for image in data["images"]}
     boxes = [annotation for annotation in data["annotations"] if not annotation.get("iscrowd")]
     if not known:
         tall = float(np.median([annotation["bbox"][3] / widths[annotation["image_id"]] for annotation in boxes]))
-        width = round(min(settings.band_lines / tall, _WIDEST, _MOST_ENLARGED * max(widths.values())))
+        width = round(min(settings.band_height / tall, _MAX_WIDTH, _MAX_ENLARGED * max(widths.values())))
         ratio = settings.full_width / settings.width
-        settings = dataclasses.replace(settings, density=0.0, width=max(width, 32), full_width=max(round(ratio * width), 32))
+        settings = dataclasses.replace(
+            settings, pixels_per_metre=0.0, width=max(width, 32), full_width=max(round(ratio * width), 32)
+        )
     factors = {number: resize_factor(width, settings, densities[number]) for number, width in widths.items()}
     sizes = np.array([np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]] for annotation in boxes])
     # A stalk crop is at least twice as wide as the median box: trunks are thicker than stalks.
     columns = 8 * math.ceil(2.0 * settings.full_width / settings.width * float(np.median(sizes[:, 0])) / 8)
     return dataclasses.replace(
         settings,
-        snip_columns=min(max(settings.snip_columns, columns), _WIDEST_SNIP),
-        band_lines=round(float(np.median(sizes[:, 1])), 1),
+        crop_width=min(max(settings.crop_width, columns), _MAX_CROP_WIDTH),
+        band_height=round(float(np.median(sizes[:, 1])), 1),
         anchor_widths=tuple(round(float(width), 1) for width in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95))),
     )
 

@@ -14,8 +14,8 @@ from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precisi
 from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
-_SNIPS = 8  # stalk crops per batch
-LEAST_SCORE = 0.5
+_CROPS = 8  # stalk crops per batch
+MIN_SCORE = 0.5
 """Minimum score of a detection to be counted."""
 
 
@@ -44,7 +44,7 @@ class Score:
 
     Attributes:
         images, labels: Numbers of images and of annotated stalks.
-        finds, right: Numbers of detections with a score of at least `LEAST_SCORE`, and of true positives among them.
+        finds, right: Numbers of detections with a score of at least `MIN_SCORE`, and of true positives among them.
         precision, recall, f1: Metrics of these detections; NaN if the denominator is 0.
         ap50: Average precision of all detections at an intersection over union of 0.5; NaN without labels.
         soft: Soft F1, 2 x (sum of the scores of true positives) / (sum of all scores + labels), which is continuous in the
@@ -100,8 +100,8 @@ def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds
         fitting = np.where(free, overlaps_with(stalks[place, :4], clear[:, :4]), 0.0)
         if fitting.size and fitting.max() >= IOU:
             right[place], free[int(fitting.argmax())] = True, False
-    beside = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
-    return right, beside & ~right
+    on_unclear = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
+    return right, on_unclear & ~right
 
 
 def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, dtype: Any) -> float:
@@ -115,11 +115,11 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
     """
     overlaps = []
     for example in examples:
-        for first in range(0, len(example.snips), _SNIPS):
-            snips, masks = (values[first : first + _SNIPS] for values in (example.snips, example.masks))
-            filled = np.pad(snips, ((0, _SNIPS - len(snips)), (0, 0), (0, 0), (0, 0)), mode="edge")
-            full = (settings.snip_lines, settings.snip_columns)
-            made = np.asarray(segment(params, filled, settings, dtype, full))[: len(snips)] >= 0.5
+        for first in range(0, len(example.crops), _CROPS):
+            crops, masks = (values[first : first + _CROPS] for values in (example.crops, example.masks))
+            filled = np.pad(crops, ((0, _CROPS - len(crops)), (0, 0), (0, 0), (0, 0)), mode="edge")
+            full = (settings.crop_height, settings.crop_width)
+            made = np.asarray(segment(params, filled, settings, dtype, full))[: len(crops)] >= 0.5
             common, either = (made & masks).sum((1, 2)), (made | masks).sum((1, 2))
             overlaps += (common / np.maximum(either, 1)).tolist()
     return float(np.mean(overlaps)) if overlaps else float("nan")
@@ -127,10 +127,10 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
 
 def score(finds: Sequence[Finds]) -> Score:
     """Compute the metrics of the detections in several images, pooled."""
-    labels = sum(each.labels for each in finds)
-    scores = np.concatenate([each.scores[~each.ignored] for each in finds] or [np.zeros(0)])
-    right = np.concatenate([each.right[~each.ignored] for each in finds] or [np.zeros(0, bool)])
-    counted = scores >= LEAST_SCORE
+    labels = sum(image.labels for image in finds)
+    scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])
+    right = np.concatenate([image.right[~image.ignored] for image in finds] or [np.zeros(0, bool)])
+    counted = scores >= MIN_SCORE
     hits, count = int(right[counted].sum()), int(counted.sum())
     nothing = float("nan")
     return Score(

@@ -14,7 +14,7 @@ import numpy as np
 _SIDE = 16  # pixels: height and width of a thumbnail
 _ALIKE = 0.97  # minimum correlation of the thumbnails of copies
 _COPY = re.compile(r"([._-]rf[._-][0-9a-f]{6,}|[ ._-]*(aug|copy|flip|mirror|rot)[a-z]*[ ._-]*\d*|[ ._-]*\(\d+\))$")
-FEWEST = 5
+MIN_IMAGES = 5
 """Minimum number of photographs to hold out any."""
 
 
@@ -76,7 +76,7 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
 def split(photographs: np.ndarray, seed: int) -> Split:
     """Split images by photograph: a fifth for testing, and a sixth of the rest for early stopping.
 
-    With fewer than `FEWEST` photographs, all images are for training.
+    With fewer than `MIN_IMAGES` photographs, all images are for training.
 
     Args:
         photographs: [N] int, see `photographs_of`.
@@ -84,8 +84,8 @@ def split(photographs: np.ndarray, seed: int) -> Split:
     """
     groups = np.random.default_rng([seed, 23]).permutation(np.unique(photographs))
     count = len(groups)
-    test = max(round(count / 5), 1) if count >= FEWEST else 0
-    stop = max(round((count - test) / 6), 1) if count >= FEWEST else 0
+    test = max(round(count / 5), 1) if count >= MIN_IMAGES else 0
+    stop = max(round((count - test) / 6), 1) if count >= MIN_IMAGES else 0
 
     def part(chosen: np.ndarray) -> tuple[int, ...]:
         return tuple(np.flatnonzero(np.isin(photographs, chosen)).tolist())

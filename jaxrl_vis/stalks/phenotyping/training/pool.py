@@ -15,16 +15,16 @@ class Pool(Generic[T]):
         examples: Examples available so far.
     """
 
-    def __init__(self, sources: list[Iterator[T]], most: int) -> None:
+    def __init__(self, sources: list[Iterator[T]], capacity: int) -> None:
         """Start the first thread; the others start once it has yielded an example.
 
         Args:
             sources: Iterators over examples, at least one; each is consumed by its own thread.
-            most: Number of examples at which the threads are stopped.
+            capacity: Number of examples at which the threads are stopped.
         """
         self._queue: queue.Queue[T | Exception | None] = queue.Queue(maxsize=16)
         self._stop = threading.Event()
-        self._most, self._running = most, len(sources)
+        self._capacity, self._running = capacity, len(sources)
         self.examples: list[T] = []
         # The others start after the first example, when its functions have been compiled.
         self._waiting = sources[1:]
@@ -45,23 +45,23 @@ class Pool(Generic[T]):
         except Exception as error:  # raised in the consumer, by `fill`
             self._hand_over(error)
 
-    def _hand_over(self, made: T | Exception | None) -> None:
+    def _hand_over(self, item: T | Exception | None) -> None:
         while not self._stop.is_set():
             try:
-                self._queue.put(made, timeout=0.2)
+                self._queue.put(item, timeout=0.2)
                 return
             except queue.Full:
                 continue
 
-    def fill(self, least: int) -> None:
-        """Collect finished examples, and wait until there are at least ``least``, or no more will come.
+    def fill(self, minimum: int) -> None:
+        """Collect finished examples, and wait until there are at least ``minimum``, or no more will come.
 
         Raises:
             Exception: Any exception raised by a source.
         """
-        while self._running and len(self.examples) < self._most:
+        while self._running and len(self.examples) < self._capacity:
             try:
-                example = self._queue.get(block=len(self.examples) < least)
+                example = self._queue.get(block=len(self.examples) < minimum)
             except queue.Empty:
                 return
             if isinstance(example, Exception):
@@ -72,7 +72,7 @@ class Pool(Generic[T]):
                 self._running -= 1
                 continue
             self.add(example)
-        if len(self.examples) >= self._most:
+        if len(self.examples) >= self._capacity:
             self.stop()
 
     def add(self, example: T) -> None:

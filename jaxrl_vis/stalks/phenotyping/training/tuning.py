@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.training.detector_training import (
     initial_networks,
     update_networks,
 )
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resized_snips
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resize_crops
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, find_in, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import Split
 
@@ -47,7 +47,7 @@ class Tuning:
         steps: Maximum number of updates.
         minutes: Maximum duration of the updates in minutes; None for no limit.
         batch: Batch size of images.
-        snips: Batch size of stalk crops; 0 if masks are not trained.
+        crops: Batch size of stalk crops; 0 if masks are not trained.
         rate: Peak learning rate.
         look: Number of updates between evaluations on held-out images.
         patience: Number of evaluations without improvement after which training stops.
@@ -57,7 +57,7 @@ class Tuning:
     steps: int
     minutes: float | None
     batch: int
-    snips: int
+    crops: int
     rate: float
     look: int = 25
     patience: int = 8
@@ -93,7 +93,7 @@ def tune(
     settings: Settings,
     tuning: Tuning,
     start: Any,
-    say: Say,
+    echo: Say,
     keep: Callable[[Any, int], None] = lambda params, step: None,
 ) -> Tuned:
     """Fine-tune the networks on annotated images.
@@ -104,7 +104,7 @@ def tune(
         settings: Settings of the networks.
         tuning: Fine-tuning schedule.
         start: Initial parameters, whose first layers are frozen; None for random initialisation.
-        say: Progress callback, see `Say`.
+        echo: Progress callback, see `Say`.
         keep: Called with the best parameters so far and their update, so that they survive an interruption. Without images for
             early stopping, called with the latest parameters at each evaluation.
 
@@ -112,7 +112,7 @@ def tune(
         NonFiniteError: A loss is not finite.
     """
     dtype = jnp.bfloat16 if jax.default_backend() in ("gpu", "tpu") else jnp.float32
-    frozen = ((*FROZEN,) if start is not None else ()) + (() if tuning.snips else ("segmenter",))
+    frozen = ((*FROZEN,) if start is not None else ()) + (() if tuning.crops else ("segmenter",))
     detector_key, segmenter_key, steps_key = jax.random.split(jax.random.key(tuning.seed), 3)
     state = beginning(start if start is not None else initial_networks(settings, detector_key, segmenter_key))
     shape = padded_shape(_largest(examples))
@@ -121,16 +121,16 @@ def tune(
 
     began = time.monotonic()
     words = f"compiling for images of {shape[1]} x {shape[0]} pixels on {jax.default_backend()}"
-    with heartbeat(words, say):
+    with heartbeat(words, echo):
         zeros = jnp.float32(0.0), jnp.float32(0.0)
         update = update_networks.lower(state, batches.draw(), steps_key, zeros, settings, dtype, frozen).compile()
         before = find_in(state[1]["detector"], test, shape, settings, dtype)
     compile_s = time.monotonic() - began
-    say(f"compiled in {compile_s:.0f} s; --minutes count from here")
+    echo(f"compiled in {compile_s:.0f} s; --minutes count from here")
 
     watch = _Watch(stop, shape, settings, dtype, state[1], tuning.patience)
     if stop:
-        say(f"before: score {watch.best:.3f} on {len(stop)} images that decide when to stop")
+        echo(f"before: score {watch.best:.3f} on {len(stop)} images that decide when to stop")
     started, step, why = time.monotonic(), 0, f"{tuning.steps} updates are made"
     last = started
     while step < tuning.steps:
@@ -143,8 +143,8 @@ def tune(
         rates = jnp.float32(rate), jnp.float32(min(0.99, (1.0 + step) / (10.0 + step)))
         state, losses = update(state, batches.draw(), jax.random.fold_in(steps_key, step), rates)
         step += 1
-        told = step == 1 or time.monotonic() - last > _HEARTBEAT
-        if told or step % tuning.look == 0:
+        reports = step == 1 or time.monotonic() - last > _HEARTBEAT
+        if reports or step % tuning.look == 0:
             values = {name: float(value) for name, value in losses.items()}
             if not np.isfinite(list(values.values())).all():
                 raise NonFiniteError(f"a loss is not finite at step {step}: try a lower --rate")
@@ -152,7 +152,7 @@ def tune(
             looked = watch.look(state[1], step) if step % tuning.look == 0 else ""
             if step % tuning.look == 0 and (watch.step == step or not stop):
                 keep(state[1], step)
-            say(f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {line}{looked}")
+            echo(f"{(time.monotonic() - started) / 60:5.1f} min  {progress:4.0%}  step {step}  {line}{looked}")
             last = time.monotonic()
         if watch.over:
             why = f"the score has not become better for {tuning.patience * tuning.look} updates"
@@ -204,7 +204,7 @@ class _Batches:
         widest = max(float((stalk[2] - stalk[0]).max()) for stalk in (example.stalks.T for example in examples))
         self._shape = shape[0], min(shape[1], padded_shape((1, max(_STRIP, round(_BESIDE * widest))))[1])
         self._rng = np.random.default_rng(tuning.seed)
-        self._snips, self._masks = _alike(examples) if tuning.snips else (np.zeros(0), np.zeros(0))
+        self._crops, self._masks = _alike(examples) if tuning.crops else (np.zeros(0), np.zeros(0))
 
     def draw(self) -> Any:
         """Sample a batch for `update_networks`."""
@@ -213,20 +213,20 @@ class _Batches:
             for place in self._rng.integers(len(self._examples), size=self._tuning.batch)
         ]
         strips = None
-        if len(self._snips):
-            places = self._rng.integers(len(self._snips), size=self._tuning.snips)
-            strips = self._snips[places], self._masks[places]
+        if len(self._crops):
+            places = self._rng.integers(len(self._crops), size=self._tuning.crops)
+            strips = self._crops[places], self._masks[places]
         return image_batch(chosen, self._shape), strips
 
 
 def _alike(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
     """Return the stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to their median size."""
-    shapes = sorted(example.snips.shape[1:3] for example in examples for _ in example.snips)
+    shapes = sorted(example.crops.shape[1:3] for example in examples for _ in example.crops)
     if not shapes:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)
     lines, columns = shapes[len(shapes) // 2]
-    alike = [resized_snips(example, (lines, columns)) for example in examples if len(example.snips)]
-    return np.concatenate([each.snips for each in alike]), np.concatenate([each.masks for each in alike])
+    alike = [resize_crops(example, (lines, columns)) for example in examples if len(example.crops)]
+    return np.concatenate([example.crops for example in alike]), np.concatenate([example.masks for example in alike])
 
 
 def _largest(examples: Sequence[Example]) -> tuple[int, int]:
@@ -235,15 +235,15 @@ def _largest(examples: Sequence[Example]) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def heartbeat(words: str, say: Say) -> Iterator[None]:
-    """Report progress through ``say`` at the start and every ten seconds while the context is active."""
+def heartbeat(message: str, echo: Say) -> Iterator[None]:
+    """Report progress through ``echo`` at the start and every ten seconds while the context is active."""
     over, began = threading.Event(), time.monotonic()
 
     def beat() -> None:
         while not over.wait(_HEARTBEAT):
-            say(f"{words}: {time.monotonic() - began:.0f} s")
+            echo(f"{message}: {time.monotonic() - began:.0f} s")
 
-    say(f"{words} ...")
+    echo(f"{message} ...")
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()
     try:

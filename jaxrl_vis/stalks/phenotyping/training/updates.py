@@ -32,7 +32,7 @@ class Schedule(Protocol):
     def average(self) -> float: ...  # noqa: D102
 
 
-def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: Report, every: float) -> int:
+def repeat(update: Update, pool: Pool, plan: Schedule, start_time: float, report: Report, report_interval: float) -> int:
     """Run updates until the plan's steps or minutes are reached.
 
     The learning rate has a linear warm-up over 200 updates and a cosine decay in progress, which follows steps or time.
@@ -41,9 +41,9 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
         update: Update function, see `Update`.
         pool: Pool of examples, already filled with the initial ones.
         plan: Training schedule.
-        started: Start time of the minutes, by `time.monotonic`.
+        start_time: Start time of the minutes, by `time.monotonic`.
         report: Progress callback, see `Report`.
-        every: Minimum interval between reports, s.
+        report_interval: Minimum interval between reports, s.
 
     Returns:
         Number of updates.
@@ -52,10 +52,10 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
         NonFiniteError: A reported loss is not finite.
         RequestError: The time limit was reached before the first update.
     """
-    last_report, step, before = started, 0, None
+    last_report, step, before = start_time, 0, None
     while step < plan.steps:
         pool.fill(0)
-        elapsed = (time.monotonic() - started) / 60.0
+        elapsed = (time.monotonic() - start_time) / 60.0
         progress = max(step / plan.steps, elapsed / plan.minutes if plan.minutes else 0.0)
         if progress >= 1.0:
             break
@@ -67,7 +67,7 @@ def repeat(update: Update, pool: Pool, plan: Schedule, started: float, report: R
             pool.fill(len(pool.examples) + 1)
             continue
         (parts, weights), step = made, step + 1
-        if step % 8 == 0 and time.monotonic() - last_report > every:
+        if step % 8 == 0 and time.monotonic() - last_report > report_interval:
             last_report = time.monotonic()
             losses = {name: float(part) for name, part in parts.items()}
             if not np.isfinite(list(losses.values())).all():

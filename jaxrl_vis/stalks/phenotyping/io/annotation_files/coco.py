@@ -36,14 +36,14 @@ def read_coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
     for number, image in images:
         if isinstance(number, (int, str)):
             by_id.setdefault(number, image)
-    for place, annotation in enumerate(data["annotations"]):
-        found: Annotation = {**annotation, "name": names.get(annotation.get("category_id"), "")}
-        found["source"] = f"{path}: annotation {str(annotation.get('id', place + 1))[:60]}"
-        found["iscrowd"] = int(annotation.get("iscrowd") in (1, True, "1"))
+    for index, annotation in enumerate(data["annotations"]):
+        parsed: Annotation = {**annotation, "name": names.get(annotation.get("category_id"), "")}
+        parsed["source"] = f"{path}: annotation {str(annotation.get('id', index + 1))[:60]}"
+        parsed["iscrowd"] = int(annotation.get("iscrowd") in (1, True, "1"))
         number = annotation.get("image_id")
         if not isinstance(number, (int, str)) or number not in by_id:
-            found["orphan"] = True
-            (images[0][1] if images else Annotated("", None, None, path, [])).annotations.append(found)
+            parsed["orphan"] = True
+            (images[0][1] if images else Annotated("", None, None, path, [])).annotations.append(parsed)
         else:
-            by_id[number].annotations.append(found)
+            by_id[number].annotations.append(parsed)
     return images

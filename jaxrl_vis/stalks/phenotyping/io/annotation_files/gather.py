@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.annotation_files import coco, label_studio, labelme, voc, yolo
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, together
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, merge_groups
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis_envs.documents import parse_json, parse_xml, read_bytes, read_json, read_text
@@ -27,55 +27,60 @@ def gather(folder: Path) -> list[tuple[Any, Annotated]]:
 
     Returns:
         Id and contents of each image. The names of images that exist are paths relative to the folder, missing sizes are read
-        from the image files, and polygons of one group are merged (see `together`).
+        from the image files, and polygons of one group are merged (see `merge_groups`).
 
     Raises:
         RequestError: There are no annotations, a file cannot be read, or an image is ambiguous or annotated twice.
     """
-    found = _read(folder)
+    images = _read(folder)
     index = _Index(folder)
-    for _, image in found:
+    for _, image in images:
         if isinstance(image.name, str):
-            index.settle(image)
-        image.annotations = together(image.annotations)
-    return found
+            index.resolve_name(image)
+        image.annotations = merge_groups(image.annotations)
+    return images
 
 
 def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     path = folder / "annotations.json"
     if path.exists():
-        return _one(path, lambda: _coco(path, read_json(path)), "COCO")
-    found: list[tuple[Any, Annotated]] = []
+        return _convert_errors(path, lambda: _read_coco(path, read_json(path)), "COCO")
+    annotated: list[tuple[Any, Annotated]] = []
     others: list[Path] = []
     names: list[str] | None = None
     numbers = itertools.count()
     images = {image.stem: image for image in _files(folder, _IMAGES) if image.is_file()}
     for file in _files(folder, {".json", ".xml", ".txt"}):
         if file.suffix.lower() == ".json":
-            read = _json(file, numbers)
+            read = _read_json(file, numbers)
         elif file.suffix.lower() == ".xml":
-            read = _xml(file, numbers)
+            read = _read_xml(file, numbers)
         elif file.stem in images and file.name not in yolo.NAMES:
             names = _class_names(folder) if names is None else names
-            read = list(zip(numbers, _one(file, lambda file=file, names=names: _yolo(file, images[file.stem], names), "YOLO")))
+            read = list(
+                zip(
+                    numbers,
+                    _convert_errors(file, lambda file=file, names=names: _read_yolo(file, images[file.stem], names), "YOLO"),
+                )
+            )
         else:
             continue
-        found += read or []
+        annotated += read or []
         others += [file] if read is None else []
     broken = next((file for file in others if file.stem in images), None)
     if broken is not None:  # files with other names, such as a calibration, are allowed
         kinds = "Pascal VOC" if broken.suffix.lower() == ".xml" else "LabelMe"
         raise RequestError(f"{broken} is no annotation of {kinds}, but called as an image is")
-    if not found:
+    if not annotated:
         there = f" ({others[0].name} is none)" if others else ""
         raise RequestError(
             f"there are no annotations in {folder}{there}: put annotations.json of COCO there, or .xml of Pascal VOC, .json of "
             "LabelMe or .txt of YOLO beside each image"
         )
-    return found
+    return annotated
 
 
-def _one(file: Path, read: Any, kind: str) -> Any:
+def _convert_errors(file: Path, read: Any, kind: str) -> Any:
     """Call ``read``, converting errors of the readers to a `RequestError`.
 
     Args:
@@ -94,44 +99,44 @@ def _one(file: Path, read: Any, kind: str) -> Any:
         raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
     except _WRONG as error:
         what = "not COCO: it needs images and annotations" if kind == "COCO" else f"no annotation of {kind}"
-        raise RequestError(f"{file} is {what}{_reason(error)}") from error
+        raise RequestError(f"{file} is {what}{_error_reason(error)}") from error
 
 
-def _reason(error: Exception) -> str:
+def _error_reason(error: Exception) -> str:
     """Return the message of a `ValueError` in parentheses, shortened; empty for other errors."""
     words = " ".join(str(error).split()) if isinstance(error, ValueError) else ""
     return f" ({words[:200]})" if words else ""
 
 
-def _coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
+def _read_coco(path: Path, data: Any) -> list[tuple[Any, Annotated]]:
     if not coco.is_coco(data):
         raise KeyError("images")
     return coco.read_coco(path, data)
 
 
-def _json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+def _read_json(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
     """Read the images of a COCO, LabelMe or Label Studio JSON file; return None if it has another format."""
-    data = _one(file, lambda: parse_json(read_text(file)), "LabelMe")
+    data = _convert_errors(file, lambda: parse_json(read_text(file)), "LabelMe")
     if coco.is_coco(data):
-        read = _one(file, lambda: _coco(file, data), "COCO")
+        read = _convert_errors(file, lambda: _read_coco(file, data), "COCO")
         # Ids may repeat across files.
         return [((str(file), number) if isinstance(number, (int, str)) else number, image) for number, image in read]
     if label_studio.is_label_studio(data):
-        return list(zip(numbers, _one(file, lambda: label_studio.read_label_studio(file, data), "Label Studio")))
+        return list(zip(numbers, _convert_errors(file, lambda: label_studio.read_label_studio(file, data), "Label Studio")))
     if labelme.is_labelme(data):
-        return list(zip(numbers, _one(file, lambda: labelme.read_labelme(file, data), "LabelMe")))
+        return list(zip(numbers, _convert_errors(file, lambda: labelme.read_labelme(file, data), "LabelMe")))
     return None
 
 
-def _xml(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
+def _read_xml(file: Path, numbers: Iterator[int]) -> list[tuple[Any, Annotated]] | None:
     """Read the images of a Pascal VOC or CVAT XML file; return None if it has another format."""
-    root = _one(file, lambda: parse_xml(read_bytes(file)), "Pascal VOC")
+    root = _convert_errors(file, lambda: parse_xml(read_bytes(file)), "Pascal VOC")
     if root.tag not in ("annotation", "annotations"):
         return None
-    return list(zip(numbers, _one(file, lambda: voc.read_xml(file, root), "Pascal VOC")))
+    return list(zip(numbers, _convert_errors(file, lambda: voc.read_xml(file, root), "Pascal VOC")))
 
 
-def _yolo(file: Path, image: Path, names: list[str]) -> list[Annotated]:
+def _read_yolo(file: Path, image: Path, names: list[str]) -> list[Annotated]:
     text = read_text(file, _MAX_BYTES)
     if not yolo.is_yolo(text):
         raise ValueError("its lines are not a class and numbers")
@@ -144,7 +149,7 @@ def _class_names(folder: Path) -> list[str]:
     for name in yolo.NAMES:
         for path in (folder / name, folder.parent / name, *sorted(folder.glob(f"*/{name}"))):
             if path.is_file():
-                return _one(path, lambda path=path: yolo.read_names(path), "YOLO's classes")
+                return _convert_errors(path, lambda path=path: yolo.read_names(path), "YOLO's classes")
     return []
 
 
@@ -186,7 +191,7 @@ class _Index:
             self._by_name.setdefault(path.name.lower(), []).append(path)
             self._by_name.setdefault(path.stem.lower() + "\0", []).append(path)
 
-    def settle(self, image: Annotated) -> None:
+    def resolve_name(self, image: Annotated) -> None:
         """Set ``image.name`` to the path of its file relative to the folder, and its width and height if they are missing.
 
         Modifies ``image`` in place; it is unchanged if no such file exists.
@@ -210,15 +215,15 @@ class _Index:
     def _locate(self, name: str, source: Path) -> Path | None:
         parts = PureWindowsPath(name).parts
         base = parts[-1] if parts else ""
-        beside = [
+        neighbours = [
             path for path in (source.parent.joinpath(*parts), self._folder.joinpath(*parts)) if parts and ".." not in parts
         ]
-        for path in beside:
+        for path in neighbours:
             if path.suffix.lower() in _IMAGES and path in self._by_name.get(base.lower(), []):
                 return path
         stem = Path(base).stem if Path(base).suffix.lower() in _IMAGES else base
-        found = self._by_name.get(base.lower()) or self._by_name.get(f"{stem.lower()}\0", [])
-        near = [path for path in found if path.parent == source.parent] or found
+        candidates = self._by_name.get(base.lower()) or self._by_name.get(f"{stem.lower()}\0", [])
+        near = [path for path in candidates if path.parent == source.parent] or candidates
         exact = [path for path in near if path.name == base] or near
         if len(exact) > 1:
             both = " or ".join(readable(str(path.relative_to(self._folder))) for path in exact[:2])

@@ -6,7 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, Annotation, outlined, turned_box, without_width
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import (
+    Annotated,
+    Annotation,
+    from_outline,
+    turned_box,
+    without_width,
+)
 
 
 def is_label_studio(data: Any) -> bool:
@@ -28,8 +34,8 @@ def read_label_studio(path: Path, data: Any) -> list[Annotated]:
     for number, task in enumerate(data):
         chosen = [one for one in task.get("annotations", [{"result": _short(task)}]) if not one.get("was_cancelled")]
         shapes, sizes = [], set()
-        for place, result in enumerate(chosen[-1]["result"] if chosen else []):
-            source = f"{path}: annotation {place + 1} of task {str(task.get('id', number + 1))[:40]}"
+        for index, result in enumerate(chosen[-1]["result"] if chosen else []):
+            source = f"{path}: annotation {index + 1} of task {str(task.get('id', number + 1))[:40]}"
             sizes.add((result.get("original_width"), result.get("original_height")))
             shapes += _shapes(result, source)
         width, height = sizes.pop() if len(sizes) == 1 else (None, None)
@@ -57,13 +63,13 @@ def _shapes(result: dict[str, Any], source: str) -> list[Annotation]:
     shapes: list[Annotation] = []
     for kind, name in [(key, str(word)) for key in value_kinds for word in value[key]]:
         if kind == "polygonlabels":
-            shapes.append(outlined(name, np.reshape(np.array(value["points"], float), (-1, 2)) * scale, source))
+            shapes.append(from_outline(name, np.reshape(np.array(value["points"], float), (-1, 2)) * scale, source))
         elif kind == "rectanglelabels":
             box = np.array([float(value[part]) for part in ("x", "y", "width", "height")]).reshape(2, 2) * scale
             corners = turned_box((box[1, 0] / 2, box[1, 1] / 2), (box[1, 0], box[1, 1]), 0.0)
             turn = np.radians(float(value.get("rotation") or 0.0))  # about the top left corner
             turned = corners @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-            shapes.append(outlined(name, box[0] + turned, source))
+            shapes.append(from_outline(name, box[0] + turned, source))
         elif kind == "brushlabels":
             shapes.append({"name": name, "problem": "is a mask in Label Studio's own runs: export as COCO", "source": source})
         else:

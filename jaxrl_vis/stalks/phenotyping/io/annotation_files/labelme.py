@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, Annotation, outlined, without_width
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotated, Annotation, from_outline, without_width
 from jaxrl_vis.stalks.phenotyping.io.image_headers import plain_png, size_in
 from jaxrl_vis.stalks.phenotyping.io.images import MAX_PIXELS
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask
@@ -33,7 +33,7 @@ def read_labelme(path: Path, data: Any) -> list[Annotated]:
         ValueError, KeyError, TypeError, AttributeError: The data are not a valid LabelMe file.
     """
     size = int(data["imageWidth"]), int(data["imageHeight"])
-    annotations = [_shape(shape, size, f"{path}: annotation {place + 1}") for place, shape in enumerate(data["shapes"])]
+    annotations = [_shape(shape, size, f"{path}: annotation {index + 1}") for index, shape in enumerate(data["shapes"])]
     # The path may have Windows separators.
     return [Annotated(str(data["imagePath"]).replace("\\", "/").rpartition("/")[2], *size, path, annotations)]
 
@@ -50,7 +50,7 @@ def _shape(shape: dict[str, Any], size: tuple[int, int], source: str) -> Annotat
     if kind == "rectangle":
         low, high = points.min(axis=0), points.max(axis=0)
         points = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    return outlined(name, points, source, shape.get("group_id"))
+    return from_outline(name, points, source, shape.get("group_id"))
 
 
 def _mask(shape: dict[str, Any], points: np.ndarray, size: tuple[int, int]) -> dict[str, Any]:

@@ -28,16 +28,16 @@ def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str
     Raises:
         RequestError: No annotation has such a label.
     """
-    names = Counter(_tidy(annotation.get("name", "")) for annotation in annotations)
+    names = Counter(_clean_name(annotation.get("name", "")) for annotation in annotations)
     if labels:
-        wanted = {_tidy(label).casefold() for label in labels}
+        wanted = {_clean_name(label).casefold() for label in labels}
         taken = {name for name in names if name.casefold() in wanted}
     elif set(names) <= {""}:
         taken = set(names)
     else:
-        taken = {name for name in names if _says_stalk(name)}
+        taken = {name for name in names if _names_a_stalk(name)}
     if not taken and names:
-        there = _listed(names)
+        there = _format_labels(names)
         if labels:
             raise RequestError(f"{source}: nothing is called {', '.join(labels)} there, but {there}: name one with --label")
         example = next((name for name, _ in names.most_common() if name), "stem")
@@ -47,20 +47,20 @@ def choose(annotations: list[dict[str, Any]], labels: Sequence[str], source: str
         )
     left_out = Counter({name: count for name, count in names.items() if name not in taken})
     chosen = Counter({name: count for name, count in names.items() if name in taken})
-    summary = f"stalks: {_listed(chosen)}" + (f"; left out as none: {_listed(left_out)}" if left_out else "")
-    return [annotation for annotation in annotations if _tidy(annotation.get("name", "")) in taken], summary
+    summary = f"stalks: {_format_labels(chosen)}" + (f"; left out as none: {_format_labels(left_out)}" if left_out else "")
+    return [annotation for annotation in annotations if _clean_name(annotation.get("name", "")) in taken], summary
 
 
-def _says_stalk(name: str) -> bool:
+def _names_a_stalk(name: str) -> bool:
     """Return whether a label means stalk and nothing else: ``stalk_2`` and ``sorghum stalk`` do, ``not stalk`` does not."""
     words = {word for word in re.split(r"[^a-z]+", name.casefold()) if word}
     return bool(words & _STALKS) and words <= _STALKS | _CROPS
 
 
-def _tidy(name: Any) -> str:
+def _clean_name(name: Any) -> str:
     return " ".join(str(name).split())[:200]
 
 
-def _listed(names: Counter[str]) -> str:
+def _format_labels(names: Counter[str]) -> str:
     parts = [f"{readable(name) or 'without a name'} ({count})" for name, count in names.most_common(_SHOWN)]
     return ", ".join(parts) + (f" and {len(names) - _SHOWN} others" if len(names) > _SHOWN else "")

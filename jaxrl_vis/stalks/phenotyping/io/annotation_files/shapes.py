@@ -34,7 +34,7 @@ Reader = Callable[[Path, Any], list[Annotated]]
 _NO_WIDTH = "which has no width: draw it as a polygon or a rectangle"
 
 
-def outlined(name: str, points: np.ndarray, source: str, group: Any = None) -> Annotation:
+def from_outline(name: str, points: np.ndarray, source: str, group: Any = None) -> Annotation:
     """Return a polygon annotation with corners [N, 2] in pixels and their bounding box; nothing is checked."""
     low, high = points.min(axis=0), points.max(axis=0)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -42,7 +42,7 @@ def outlined(name: str, points: np.ndarray, source: str, group: Any = None) -> A
     return {"name": name, "bbox": box, "segmentation": [points.ravel().tolist()], "source": source, "group": group}
 
 
-def boxed(name: str, box: list[float], source: str, group: Any = None) -> Annotation:
+def from_box(name: str, box: list[float], source: str, group: Any = None) -> Annotation:
     """Return a box annotation (left, top, width, height), pixels."""
     return {"name": name, "bbox": box, "source": source, "group": group}
 
@@ -59,7 +59,7 @@ def turned_box(centre: tuple[float, float], size: tuple[float, float], angle: fl
     return np.array(centre) + half[:, :1] * across + half[:, 1:] * down
 
 
-def together(annotations: list[Annotation]) -> list[Annotation]:
+def merge_groups(annotations: list[Annotation]) -> list[Annotation]:
     """Merge polygons with the same name and group into one annotation: the visible parts of a partially occluded object.
 
     Modifies the annotations in place: ``group`` is removed, and the ``bbox`` of merged ones is None.
@@ -71,10 +71,10 @@ def together(annotations: list[Annotation]) -> list[Annotation]:
         if not isinstance(group, (int, str)) or isinstance(group, bool) or not isinstance(outlines, list):
             result.append(annotation)
             continue
-        whole = joined.setdefault((annotation["name"], group), annotation)
-        if whole is annotation:
+        merged = joined.setdefault((annotation["name"], group), annotation)
+        if merged is annotation:
             result.append(annotation)
         else:
-            whole["segmentation"] = whole["segmentation"] + outlines
-            whole["bbox"] = None  # computed later from all parts
+            merged["segmentation"] = merged["segmentation"] + outlines
+            merged["bbox"] = None  # computed later from all parts
     return result

@@ -9,8 +9,8 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import (
     Annotated,
     Annotation,
-    boxed,
-    outlined,
+    from_box,
+    from_outline,
     turned_box,
     without_width,
 )
@@ -46,22 +46,22 @@ def _text(node: Element, name: str) -> str:
 
 def _voc_image(path: Path, root: Element) -> Annotated:
     annotations = []
-    for place, element in enumerate(root.iter("object")):
-        name, source = _text(element, "name"), f"{path}: annotation {place + 1}"
+    for index, element in enumerate(root.iter("object")):
+        name, source = _text(element, "name"), f"{path}: annotation {index + 1}"
         if element.find("robndbox") is not None:
             x, y, wide, high, angle = (float(_text(element, f"robndbox/{part}")) for part in ("cx", "cy", "w", "h", "angle"))
             if not np.isfinite([x, y, wide, high, angle]).all():
                 raise ValueError("robndbox")
-            annotations.append(outlined(name, turned_box((x, y), (wide, high), angle), source))
+            annotations.append(from_outline(name, turned_box((x, y), (wide, high), angle), source))
         else:
             # Pixel indices start at 1, and the last ones are inclusive.
             left, top, right, bottom = (float(_text(element, f"bndbox/{edge}")) for edge in _EDGES)
-            annotations.append(boxed(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
-    width, height = (_whole(root.findtext(f"size/{side}")) for side in ("width", "height"))
+            annotations.append(from_box(name, [left - 1.0, top - 1.0, right - left + 1.0, bottom - top + 1.0], source))
+    width, height = (_integer(root.findtext(f"size/{side}")) for side in ("width", "height"))
     return Annotated(_text(root, "filename"), width, height, path, annotations)
 
 
-def _whole(text: str | None) -> int | None:
+def _integer(text: str | None) -> int | None:
     """Parse a number of pixels; return None if it is missing or 0, as labelImg writes an unknown size."""
     return int(text) or None if text is not None and text.strip() else None
 
@@ -69,10 +69,10 @@ def _whole(text: str | None) -> int | None:
 def _cvat_image(path: Path, element: Element) -> Annotated:
     size = int(element.get("width") or 0), int(element.get("height") or 0)
     annotations = []
-    for place, shape in enumerate(element):
+    for index, shape in enumerate(element):
         if shape.tag in ("tag", "attribute"):
             continue
-        name, source = shape.get("label") or "", f"{path}: annotation {place + 1} of {element.get('name')}"
+        name, source = shape.get("label") or "", f"{path}: annotation {index + 1} of {element.get('name')}"
         group = shape.get("group_id") if shape.get("group_id") not in (None, "", "0") else None
         annotations.append(_cvat_shape(shape, size, name, source, group))
     return Annotated(element.get("name") or "", *size, path, annotations)
@@ -90,11 +90,11 @@ def _cvat_shape(shape: Element, size: tuple[int, int], name: str, source: str, g
         angle = np.radians(float(shape.get("rotation") or 0.0))
         if angle:
             centre = ((left + right) / 2, (top + bottom) / 2)
-            return outlined(name, turned_box(centre, (right - left, bottom - top), float(angle)), source, group)
-        return boxed(name, [left, top, right - left, bottom - top], source, group)
+            return from_outline(name, turned_box(centre, (right - left, bottom - top), float(angle)), source, group)
+        return from_box(name, [left, top, right - left, bottom - top], source, group)
     if shape.tag == "polygon":
         points = [list(map(float, point.split(","))) for point in (shape.get("points") or "").split(";") if point]
-        return outlined(name, np.reshape(np.array(points, float), (-1, 2)), source, group)
+        return from_outline(name, np.reshape(np.array(points, float), (-1, 2)), source, group)
     if shape.tag == "mask":
         left, top, wide, high = (int(value) for value in numbers("left", "top", "width", "height"))
         return {

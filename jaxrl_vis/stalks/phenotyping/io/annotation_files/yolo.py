@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotation, boxed, outlined
+from jaxrl_vis.stalks.phenotyping.io.annotation_files.shapes import Annotation, from_box, from_outline
 from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis_envs.documents import read_text
 
@@ -33,7 +33,7 @@ def read_names(path: Path) -> list[str]:
         raise ValueError("it is of key points, not of boxes or outlines")
     if isinstance(names, dict):
         numbered = {float(number): str(name) for number, name in names.items()}
-        return [numbered.get(float(place), str(place)) for place in range(int(max(numbered, default=-1.0)) + 1)][:10_000]
+        return [numbered.get(float(index), str(index)) for index in range(int(max(numbered, default=-1.0)) + 1)][:10_000]
     if isinstance(names, list):
         return [str(name) for name in names]
     raise ValueError("it has no names")
@@ -58,21 +58,21 @@ def read_yolo(path: Path, text: str, names: list[str], size: tuple[int, int]) ->
         ValueError: A line is not in YOLO format, or has coordinates outside the image.
     """
     annotations = []
-    for place, words in enumerate(line.split() for line in text.splitlines() if line.strip()):
-        number, source = int(words[0]), f"{path}: annotation {place + 1}"
+    for index, words in enumerate(line.split() for line in text.splitlines() if line.strip()):
+        number, source = int(words[0]), f"{path}: annotation {index + 1}"
         name = names[number] if number < len(names) else str(number)
         values = [float(word) for word in words[1:]]
         if len(values) in (4, 5):
-            shares: list[Any] = values[:4]  # the fifth is a confidence
+            coordinates: list[Any] = values[:4]  # the fifth is a confidence
         elif len(values) >= 6 and len(values) % 2 == 0:
-            shares = values
+            coordinates = values
         else:
-            raise ValueError(f"line {place + 1} has {len(values)} numbers")
-        if not all(math.isfinite(share) and -_BEYOND <= share <= 1.0 + _BEYOND for share in shares):
-            raise ValueError(f"line {place + 1} holds what is no share of an image")
-        if len(shares) == 4:
-            x, y, wide, high = (share * size[axis % 2] for axis, share in enumerate(shares))
-            annotations.append(boxed(name, [x - wide / 2, y - high / 2, wide, high], source))
+            raise ValueError(f"line {index + 1} has {len(values)} numbers")
+        if not all(math.isfinite(coordinate) and -_BEYOND <= coordinate <= 1.0 + _BEYOND for coordinate in coordinates):
+            raise ValueError(f"line {index + 1} holds what is no share of an image")
+        if len(coordinates) == 4:
+            x, y, wide, high = (coordinate * size[axis % 2] for axis, coordinate in enumerate(coordinates))
+            annotations.append(from_box(name, [x - wide / 2, y - high / 2, wide, high], source))
         else:
-            annotations.append(outlined(name, np.reshape(shares, (-1, 2)) * size, source))
+            annotations.append(from_outline(name, np.reshape(coordinates, (-1, 2)) * size, source))
     return annotations

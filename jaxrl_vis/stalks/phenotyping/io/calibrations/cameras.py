@@ -66,8 +66,8 @@ class RawPair:
         focal = one[0, 0]
         equal = [one[1, 1], other[0, 0], other[1, 1]]
         straight = np.abs(self.rotation - np.eye(3)).max() < _SAME and not np.abs(self.distortions).max(initial=0.0) > _SAME
-        beside = np.abs(self.translation[1:]).max() <= _SAME * max(abs(self.translation[0]), _SAME)
-        if not (straight and beside and np.allclose(equal, focal, rtol=_SAME) and abs(one[1, 2] - other[1, 2]) < 1e-3):
+        horizontal = np.abs(self.translation[1:]).max() <= _SAME * max(abs(self.translation[0]), _SAME)
+        if not (straight and horizontal and np.allclose(equal, focal, rtol=_SAME) and abs(one[1, 2] - other[1, 2]) < 1e-3):
             return None
         left, right = (np.pad(matrix, ((0, 0), (0, 1))) for matrix in (one, other))
         right[0, 3] = focal * self.translation[0]
@@ -107,16 +107,16 @@ def named_size(store: Mapping[str, Any], path: Path) -> Size | None:
     for names in (("image_width", "image_height"), ("width", "height")):
         values = [store.get(name) for name in names]
         if None not in values:
-            return whole(values, path, " and ".join(names))
+            return image_size(values, path, " and ".join(names))
     for name in ("image_size", "imageSize", "resolution"):
         value = store.get(name)
         data = value.get("data") if isinstance(value, dict) else value
         if isinstance(data, list) and len(data) == 2:
-            return whole(data, path, name)
+            return image_size(data, path, name)
     return None
 
 
-def whole(values: list[Any], path: Path, names: str) -> Size:
+def image_size(values: list[Any], path: Path, names: str) -> Size:
     """Convert a width and height to integers.
 
     Args:
@@ -138,7 +138,7 @@ def plain_numbers(text: str) -> list[float]:
     Raises:
         ValueError: One is not a number, or not finite.
     """
-    found = [float(word) for word in text.replace(",", " ").split()]
-    if not all(map(math.isfinite, found)):
+    values = [float(word) for word in text.replace(",", " ").split()]
+    if not all(map(math.isfinite, values)):
         raise ValueError("a number that is not finite")
-    return found
+    return values

@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Rectif
 
 _MATRICES = (("M1", "M2"), ("K1", "K2"), ("cameraMatrix1", "cameraMatrix2"), ("camera_matrix_1", "camera_matrix_2"))
 _DISTORTIONS = (("D1", "D2"), ("distCoeffs1", "distCoeffs2"), ("dist_coeffs_1", "dist_coeffs_2"))
-_MOST_COEFFICIENTS = 14
+_MAX_COEFFICIENTS = 14
 
 
 def read_projections(store: dict[str, Any], path: Path) -> RectifiedPair:
@@ -68,10 +68,10 @@ def _present(store: dict[str, Any], pairs: tuple[tuple[str, str], ...]) -> tuple
 
 def _coefficients(value: Any) -> np.ndarray:
     data = value.get("data") if isinstance(value, dict) else value
-    for count in (4, 5, 8, 12, _MOST_COEFFICIENTS):
-        found = numbers(data, count)
-        if found is not None:
-            return found
+    for count in (4, 5, 8, 12, _MAX_COEFFICIENTS):
+        values = numbers(data, count)
+        if values is not None:
+            return values
     return np.zeros(0)
 
 

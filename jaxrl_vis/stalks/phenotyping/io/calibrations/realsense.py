@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, projection, whole
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Size, image_size, projection
 
 _MODES = 64
 
@@ -34,7 +34,7 @@ def read_table(store: dict[str, Any], path: Path, size: Size | None) -> Rectifie
         values = [_number(store.get(f"rectified.{mode}.{name}")) for name in ("width", "height", "fx", "ppx", "ppy")]
         if None not in values and all(value and value > 0 for value in values[:3]):
             wide, high, focal, x, y = (value or 0.0 for value in values)
-            modes.setdefault(whole([wide, high], path, f"width and height of rectified.{mode}"), (focal, x, y))
+            modes.setdefault(image_size([wide, high], path, f"width and height of rectified.{mode}"), (focal, x, y))
     if not modes:
         raise RequestError(
             f"{path} is of a RealSense camera, but holds no rectified.0.fx and so on: export the whole calibration table"

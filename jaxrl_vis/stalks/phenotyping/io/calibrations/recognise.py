@@ -35,12 +35,12 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPa
         RequestError: There is no calibration, or it cannot be read.
     """
     if path.is_dir():
-        return _in_folder(path, image)
-    found = _read(path, image)
-    if not isinstance(found, list):
-        return found
-    if len(found) == 2:
-        return ros.read_pair(found, [path, path], path)
+        return _find_in_folder(path, image)
+    cameras = _read(path, image)
+    if not isinstance(cameras, list):
+        return cameras
+    if len(cameras) == 2:
+        return ros.read_pair(cameras, [path, path], path)
     pair = both_sides(path)
     if pair is None:
         other = next((name for _, name in partners(path.stem)), None)
@@ -51,7 +51,7 @@ def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPa
         raise RequestError(
             f"there is no calibration {path.with_stem(other)}: name a file of a pair, or a folder with left.yaml and right.yaml"
         )
-    return _of_sides(pair, path, image)
+    return _read_sides(pair, path, image)
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -64,17 +64,17 @@ def named_pair(files: list[Path]) -> Path | None:
     stems = {path: path.stem.lower() for path in files}
     zed_files = [path for path in files if path.suffix.lower() == ".conf"]
     for name in _NAMES:
-        found = [path for path, stem in stems.items() if stem == name or (name == "camchain" and stem.startswith(f"{name}-"))]
-        if found:
-            return found[0]
+        matches = [path for path, stem in stems.items() if stem == name or (name == "camchain" and stem.startswith(f"{name}-"))]
+        if matches:
+            return matches[0]
     return zed_files[0] if zed_files else None
 
 
-def _in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
+def _find_in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
     files = files_in(folder)
     pairs = {pair for pair in map(both_sides, files) if pair is not None}
     if len(pairs) == 1:
-        return _of_sides(pairs.pop(), folder, image)
+        return _read_sides(pairs.pop(), folder, image)
     if len(pairs) > 1:
         names = " and ".join(readable(left.name) for left, _ in sorted(pairs))
         raise RequestError(f"{folder} holds several pairs of calibrations, of {names}: name one of the files")
@@ -99,15 +99,15 @@ def both_sides(path: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _of_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> RectifiedPair | RawPair:
+def _read_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> RectifiedPair | RawPair:
     cameras: list[dict[str, Any]] = []
     for file in pair:
-        found = _read(file, image)
-        if not isinstance(found, list):
-            return found  # this file holds both cameras by itself
-        if len(found) != 1:
+        parsed = _read(file, image)
+        if not isinstance(parsed, list):
+            return parsed  # this file holds both cameras by itself
+        if len(parsed) != 1:
             raise RequestError(f"{file} {_NO_PAIR}")
-        cameras += found
+        cameras += parsed
     return ros.read_pair(cameras, list(pair), path)
 
 
@@ -143,10 +143,10 @@ def _read(path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict
         raise RequestError(
             f"{path} is not a calibration: it is neither YAML nor XML as OpenCV and ROS write it ({why})"
         ) from error
-    return _of_store(store, path, image)
+    return _read_store(store, path, image)
 
 
-def _of_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
+def _read_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
     if isinstance(store, list):
         raise RequestError(f"{path} is not a calibration: it holds a list, not names with values such as P1 and P2")
     if not isinstance(store, dict):
@@ -170,11 +170,11 @@ def _of_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | Raw
 
 def _intrinsics(path: Path) -> dict[str, Any]:
     """Return the contents of intrinsics.yml beside extrinsics.yml of OpenCV's sample; empty if it does not exist."""
-    beside = path.with_name(path.name.replace("extrinsics", "intrinsics"))
-    if beside == path or not beside.is_file():
+    intrinsics = path.with_name(path.name.replace("extrinsics", "intrinsics"))
+    if intrinsics == path or not intrinsics.is_file():
         return {}
     try:
-        store = parse_storage(read_text(beside, _MAX_BYTES))
+        store = parse_storage(read_text(intrinsics, _MAX_BYTES))
     except (OSError, ValueError):
         return {}
     return store if isinstance(store, dict) else {}

@@ -44,7 +44,7 @@ def read_pair(stores: list[dict[str, Any]], files: list[Path], path: Path) -> Re
     sides = ("left", "right")
     (left, size), (right, other) = (_camera(store, file, side) for store, file, side in zip(stores, files, sides))
     if size is not None and other is not None and size != other:
-        raise RequestError(f"{path}: the left image has {_times(size)} pixels and the right one {_times(other)}")
+        raise RequestError(f"{path}: the left image has {_format_size(size)} pixels and the right one {_format_size(other)}")
     return RectifiedPair(left, right, size or other, "m" if any("header" in store for store in stores) else None)
 
 
@@ -64,15 +64,15 @@ def both_in_one(store: dict[str, Any]) -> list[dict[str, Any]] | None:
     for left, right in _SIDES:
         cameras = [store.get(left), store.get(right)]
         if not all(isinstance(camera, dict) for camera in cameras):
-            cameras = [_beginning_with(store, f"{name}.") for name in (left, right)]
+            cameras = [_lines_with_prefix(store, f"{name}.") for name in (left, right)]
         tables = [camera for camera in cameras if isinstance(camera, dict) and is_camera(camera)]
         if len(tables) == 2:
             return tables
     return None
 
 
-def _beginning_with(store: dict[str, Any], begin: str) -> dict[str, Any]:
-    return {name.removeprefix(begin): value for name, value in store.items() if name.startswith(begin)}
+def _lines_with_prefix(store: dict[str, Any], prefix: str) -> dict[str, Any]:
+    return {name.removeprefix(prefix): value for name, value in store.items() if name.startswith(prefix)}
 
 
 def from_print(text: str) -> dict[str, Any] | None:
@@ -88,8 +88,8 @@ def from_print(text: str) -> dict[str, Any] | None:
     binning: dict[str, float] = {}
     for name, value in _PRINTED_NUMBER.findall(text[matrix.end() :]):
         (binning if name.startswith("binning") else region).setdefault(name, float(value))
-    found = {"header": {}, "height": float(size[1]), "width": float(size[2]), "p": plain_numbers(matrix[1])}
-    return {**found, **binning, "roi": region}
+    info = {"header": {}, "height": float(size[1]), "width": float(size[2]), "p": plain_numbers(matrix[1])}
+    return {**info, **binning, "roi": region}
 
 
 def from_table(text: str) -> dict[str, Any] | None:
@@ -105,7 +105,7 @@ def from_table(text: str) -> dict[str, Any] | None:
         return None
     if len(rows) == 2 and "field.P0" in rows[0]:
         cells = dict(zip(rows[0], rows[1]))
-        matrix = [float(cells[f"field.P{place}"]) for place in range(12) if f"field.P{place}" in cells]
+        matrix = [float(cells[f"field.P{index}"]) for index in range(12) if f"field.P{index}" in cells]
         rest = {name: float(cells[f"field.{name}"]) for name in ("height", "width", *_CSV_END[:2]) if f"field.{name}" in cells}
         region = {name: float(cells[f"field.roi.{name}"]) for name in _REGION if f"field.roi.{name}" in cells}
         return {"header": {}, **rest, "P": matrix, "roi": region}
@@ -178,17 +178,17 @@ def _camera(store: dict[str, Any], path: Path, side: str) -> tuple[np.ndarray, S
         return matrix, None
     roi = store.get("roi")
     region = roi if isinstance(roi, dict) else {}
-    x, y, high, wide = (_count(region.get(name), path, f"roi.{name}") for name in _REGION)
+    x, y, high, wide = (_integer_field(region.get(name), path, f"roi.{name}") for name in _REGION)
     if high and wide:
         matrix[:2, 2] -= (x, y)
         size = (wide, high)
-    steps = [max(_count(store.get(f"binning_{axis}"), path, f"binning_{axis}"), 1) for axis in "xy"]
+    steps = [max(_integer_field(store.get(f"binning_{axis}"), path, f"binning_{axis}"), 1) for axis in "xy"]
     matrix[0] /= steps[0]
     matrix[1] /= steps[1]
     return matrix, (max(size[0] // steps[0], 1), max(size[1] // steps[1], 1))
 
 
-def _count(value: Any, path: Path, name: str) -> int:
+def _integer_field(value: Any, path: Path, name: str) -> int:
     if value is None:
         return 0
     if not isinstance(value, float) or not value.is_integer() or not 0 <= value <= 100_000:
@@ -196,5 +196,5 @@ def _count(value: Any, path: Path, name: str) -> int:
     return int(value)
 
 
-def _times(size: Size) -> str:
+def _format_size(size: Size) -> str:
     return f"{size[0]} x {size[1]}"

@@ -21,8 +21,8 @@ def seconds_in(stem: str) -> float | None:
     parts = _PARTS.search(stem)
     if parts is not None:
         return float(parts[1])
-    whole = _WHOLE.search(stem)
-    return None if whole is None else int(whole[1]) * _DIGITS[len(whole[1])]
+    stamp = _WHOLE.search(stem)
+    return None if stamp is None else int(stamp[1]) * _DIGITS[len(stamp[1])]
 
 
 def nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, str]:
@@ -37,19 +37,19 @@ def nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, 
     if not left or not right:
         return {}
     reach = min(_interval(list(times.values())) for times in (left, right)) / 2
-    there = _nearest_of(left, right)
-    back = _nearest_of(right, left)
+    there = _find_nearest(left, right)
+    back = _find_nearest(right, left)
     return {name: other for name, other in there.items() if back[other] == name and abs(left[name] - right[other]) <= reach}
 
 
-def _nearest_of(names: Mapping[str, float], others: Mapping[str, float]) -> dict[str, str]:
+def _find_nearest(names: Mapping[str, float], others: Mapping[str, float]) -> dict[str, str]:
     ordered = sorted(others.items(), key=lambda item: item[1])
-    found, place = {}, 0
+    matched, place = {}, 0
     for name, time in sorted(names.items(), key=lambda item: item[1]):
         while place + 1 < len(ordered) and abs(ordered[place + 1][1] - time) <= abs(ordered[place][1] - time):
             place += 1
-        found[name] = ordered[place][0]
-    return found
+        matched[name] = ordered[place][0]
+    return matched
 
 
 def _interval(times: list[float]) -> float:

@@ -44,7 +44,7 @@ def cells(path: Path, text: str) -> tuple[list[str], list[tuple[int, list[str]]]
         RequestError: The text is not a table.
     """
     lines = text.splitlines()
-    first = next((place for place, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), len(lines))
+    first = next((index for index, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), len(lines))
     comment = next((line.lstrip("# ") for line in reversed(lines[:first]) if line.strip(" #")), "")
     head = lines[first] if first < len(lines) else ""
     if re.match(r"\s*[-+.\d]", head) and comment:

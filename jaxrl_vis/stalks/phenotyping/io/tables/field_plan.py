@@ -55,57 +55,57 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
     table = [
         [unescape_cell(row[place].strip()) if place < len(row) else "" for place in range(len(columns))] for _, row in rows
     ]
-    by_column = [(place, _matched([row[place] for row in table], plots)) for place in ids]
-    place, matched = max(by_column, key=lambda found: len(found[1]), default=(None, {}))
+    by_column = [(place, _match_names([row[place] for row in table], plots)) for place in ids]
+    place, matched = max(by_column, key=lambda match: len(match[1]), default=(None, {}))
     if not matched:
-        matched, place = _by_range(small, table, plots), None
+        matched, place = _match_by_range(small, table, plots), None
     if not matched:
         raise RequestError(
-            _none_there(path, [columns[one] for one in ids], [row[ids[0]] for row in table] if ids else [], plots)
+            _no_plot_message(path, [columns[one] for one in ids], [row[ids[0]] for row in table] if ids else [], plots)
         )
-    kept = [one for one in range(len(columns)) if one != place and small[one] not in _OBSERVED]
+    others = [one for one in range(len(columns)) if one != place and small[one] not in _OBSERVED]
     plan: dict[str, dict[str, str]] = {}
     for plot, numbers in matched.items():
         values: dict[str, str] = {}
-        for one in kept:
+        for one in others:
             said = {table[number][one] for number in numbers if table[number][one]}
             if len(said) > 1 and len(numbers) < len(table):
                 both = " and ".join(sorted(said)[:2])
                 raise RequestError(f"{path} says two things of {columns[one]} of plot {readable(plot)}: {both}")
             values[columns[one]] = said.pop() if len(said) == 1 else ""
         plan[plot] = values
-    return [columns[one] for one in kept], plan
+    return [columns[one] for one in others], plan
 
 
-def _matched(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[int]]:
+def _match_names(names: Sequence[str], plots: Sequence[str]) -> dict[str, list[int]]:
     """Return the row indices of each plot, by the first method of comparing names that matches and tells the plots apart.
 
     Args:
         names: Identifier in each row.
         plots: Names of the plots.
     """
-    for way in (str, _last, _number):
+    for normalise in (str, _last_component, _number):
         rows: dict[str, list[int]] = {}
         for number, name in enumerate(names):
-            if name and way(name):
-                rows.setdefault(way(name), []).append(number)
-        found = {plot: rows[way(plot)] for plot in plots if way(plot) in rows}
-        if found and len({way(plot) for plot in found}) == len(found):
-            return found
+            if name and normalise(name):
+                rows.setdefault(normalise(name), []).append(number)
+        matched = {plot: rows[normalise(plot)] for plot in plots if normalise(plot) in rows}
+        if matched and len({normalise(plot) for plot in matched}) == len(matched):
+            return matched
     return {}
 
 
-def _last(name: str) -> str:
+def _last_component(name: str) -> str:
     return re.split(r"[/\\]", name)[-1].casefold()
 
 
 def _number(name: str) -> str:
     """Return the last number in a plot's name, without leading zeros; empty if there is none."""
-    found = re.findall(r"\d+", _last(name))
-    return str(int(found[-1])) if found and len(found[-1]) < 20 else ""
+    numbers = re.findall(r"\d+", _last_component(name))
+    return str(int(numbers[-1])) if numbers and len(numbers[-1]) < 20 else ""
 
 
-def _by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plots: Sequence[str]) -> dict[str, list[int]]:
+def _match_by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plots: Sequence[str]) -> dict[str, list[int]]:
     """Return the row indices of the plots whose names hold the numbers of their range and of their row or column."""
     places = {name: columns.index(name) for name in ("range", "row", "column", "col", "pass") if name in columns}
     across = [name for name in places if name != "range"]
@@ -116,17 +116,17 @@ def _by_range(columns: Sequence[str], table: Sequence[Sequence[str]], plots: Seq
         for number, row in enumerate(table)
         for other in across
     }
-    found = {}
+    matched = {}
     for plot in plots:
         said = {word.lower(): str(int(number)) for word, number in re.findall(r"([A-Za-z]+)[ _-]*(\d{1,9})", plot)}
         for other in across:
             key = (said.get("range", ""), other, said.get(other, said.get({"column": "col"}.get(other, other), "")))
             if key in rows and all(key):
-                found[plot] = rows[key]
-    return found
+                matched[plot] = rows[key]
+    return matched
 
 
-def _none_there(path: Path, columns: Sequence[str], names: Sequence[str], plots: Sequence[str]) -> str:
+def _no_plot_message(path: Path, columns: Sequence[str], names: Sequence[str], plots: Sequence[str]) -> str:
     own = ", ".join(map(readable, plots[:_SHOWN]))
     if not columns:
         return f"{path} names no plots: it needs a column plot_id (or plot, or range and row) with names as {own}"

@@ -40,7 +40,7 @@ _POSITIONS = (
 )
 _GLOBE = (("latitude", "longitude"), ("lat", "lon"), ("lat", "lng"), ("field.latitude", "field.longitude"))
 _EARTH = 6_371_000.0  # m, radius
-_MOST_SECONDS = 1e11  # maximum of time_s: larger numbers are in another unit
+_MAX_SECONDS = 1e11  # maximum of time_s: larger numbers are in another unit
 _NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 _PRINTED_STAMP = re.compile(r"\bsecs?: *(\d{1,12})\s+n(?:ano)?secs?: *(\d{1,9})\b")
 _PRINTED_PLACE = re.compile(rf"\bposition:\s+x: *{_NUMBER}\s+y: *{_NUMBER}\s+z: *{_NUMBER}")
@@ -80,11 +80,11 @@ def read_odometries(plots: Sequence[PlotFolder], speed: float | None) -> dict[st
     tables = {plot.name: _read(odometry_file(plot.folder)) for plot in plots}
     if speed is not None and not any(table and table.distances is None for table in tables.values()):
         raise RequestError("--speed goes with an odometry.csv that holds times (time_s) and no distance_m: leave it out")
-    return {plot.name: _of_pairs(plot, tables[plot.name], speed) for plot in plots}
+    return {plot.name: _pair_distances(plot, tables[plot.name], speed) for plot in plots}
 
 
 def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, float] | None:
-    """Read the distance driven at each pair, by the pair's name, m; None if unknown, see `why_no_odometry`.
+    """Read the distance driven at each pair, by the pair's name, m; None if unknown, see `odometry_fault`.
 
     Args:
         plot: Plot, whose folder may hold ``odometry.csv`` or one of the alternatives, see `odometry_file`.
@@ -96,28 +96,28 @@ def read_odometry(plot: PlotFolder, speed: float | None = None) -> dict[str, flo
     Raises:
         RequestError: The file cannot be read, states neither distances nor times, or its rows cannot be matched with the pairs.
     """
-    return _of_pairs(plot, _read(odometry_file(plot.folder)), speed)
+    return _pair_distances(plot, _read(odometry_file(plot.folder)), speed)
 
 
-def why_no_odometry(plot: PlotFolder, driven: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
+def odometry_fault(plot: PlotFolder, distances: Mapping[str, float] | None, pairs: Sequence[PairFiles]) -> str | None:
     """Return a message that states why the distance driven is unknown; None if it is known.
 
     Args:
         plot: The plot.
-        driven: Its odometry, from `read_odometry`.
+        distances: Its odometry, from `read_odometry`.
         pairs: The pairs for which it must be known.
     """
     path = odometry_file(plot.folder)
-    if driven is None:
+    if distances is None:
         return f"{path} holds times only: give the robot's speed with --speed" if path.exists() else f"there is no {path}"
-    unknown = [pair.name if pair.left is None else readable(pair.left.name) for pair in pairs if pair.name not in driven]
+    unknown = [pair.name if pair.left is None else readable(pair.left.name) for pair in pairs if pair.name not in distances]
     if not unknown:
         return None
     others = f" and {len(unknown) - 3} others" if len(unknown) > 3 else ""
     return f"{path} has no row for {', '.join(unknown[:3])}{others}: its column left must name them"
 
 
-def _of_pairs(plot: PlotFolder, table: _Table | None, speed: float | None) -> dict[str, float] | None:
+def _pair_distances(plot: PlotFolder, table: _Table | None, speed: float | None) -> dict[str, float] | None:
     if table is None:
         return None
     if table.distances is not None:
@@ -127,10 +127,10 @@ def _of_pairs(plot: PlotFolder, table: _Table | None, speed: float | None) -> di
     else:
         values = (table.times + table.start) * speed if abs(table.start) < 1e6 else table.times * speed
     if table.names is not None:
-        return _by_name(plot, table.names, values)
+        return _distances_by_name(plot, table.names, values)
     if len(values) == len(plot.pairs):
         return {pair.name: float(value) for pair, value in zip(plot.pairs, values)}
-    by_time = _by_time(plot, table, values)
+    by_time = _distances_by_time(plot, table, values)
     if by_time is None:
         raise RequestError(
             f"{table.path} has {len(values)} rows for {len(plot.pairs)} pairs, so nobody can tell which is which: "
@@ -139,7 +139,7 @@ def _of_pairs(plot: PlotFolder, table: _Table | None, speed: float | None) -> di
     return by_time
 
 
-def _by_name(plot: PlotFolder, names: list[str], values: np.ndarray) -> dict[str, float]:
+def _distances_by_name(plot: PlotFolder, names: list[str], values: np.ndarray) -> dict[str, float]:
     """Return the distances of rows that name a left image, with or without its path and suffix, in any case if unambiguous."""
     exact: dict[str, str] = {}
     loose: dict[str, set[str]] = {}
@@ -159,7 +159,7 @@ def _by_name(plot: PlotFolder, names: list[str], values: np.ndarray) -> dict[str
     return driven
 
 
-def _by_time(plot: PlotFolder, table: _Table, values: np.ndarray) -> dict[str, float] | None:
+def _distances_by_time(plot: PlotFolder, table: _Table, values: np.ndarray) -> dict[str, float] | None:
     """Interpolate distances at the timestamps in the names of the left images; None if there are none, or no usable times.
 
     Images more than the median interval before the first or after the last row are left out.
@@ -183,10 +183,10 @@ def _read(path: Path) -> _Table | None:
     if not path.exists():
         return None
     text = read_table_text(path, _MAX_ODOMETRY)
-    return _printed(path, text) or _tabled(path, text)
+    return _parse_printed(path, text) or _parse_table(path, text)
 
 
-def _printed(path: Path, text: str) -> _Table | None:
+def _parse_printed(path: Path, text: str) -> _Table | None:
     """Parse printed ROS messages with odometry or GPS fixes; return None if the text holds none.
 
     Raises:
@@ -194,8 +194,8 @@ def _printed(path: Path, text: str) -> _Table | None:
     """
     messages = re.split(r"^---\s*$", text, flags=re.MULTILINE)
     for pattern in (_PRINTED_PLACE, _PRINTED_GLOBE):
-        found = [(_PRINTED_STAMP.search(message), pattern.search(message)) for message in messages]
-        rows = [(stamp, place) for stamp, place in found if place is not None]
+        matches = [(_PRINTED_STAMP.search(message), pattern.search(message)) for message in messages]
+        rows = [(stamp, place) for stamp, place in matches if place is not None]
         if not rows:
             continue
         places = np.array([[float(number) for number in place.groups()] for _, place in rows])
@@ -203,12 +203,12 @@ def _printed(path: Path, text: str) -> _Table | None:
             raise RequestError(f"{path} holds something that is no number: distances and times must be finite numbers")
         stamps = [int(stamp[1]) + int(stamp[2]) * 1e-9 for stamp, _ in rows if stamp is not None]
         times = np.array(stamps) - stamps[0] if len(stamps) == len(rows) else None
-        metres = places if pattern is _PRINTED_PLACE else _on_plane(places)
-        return _Table(path, None, times, stamps[0] if times is not None else 0.0, _along(metres))
+        metres = places if pattern is _PRINTED_PLACE else _project_to_plane(places)
+        return _Table(path, None, times, stamps[0] if times is not None else 0.0, _project_on_path(metres))
     return None
 
 
-def _tabled(path: Path, text: str) -> _Table:
+def _parse_table(path: Path, text: str) -> _Table:
     """Parse odometry from a table.
 
     Raises:
@@ -225,8 +225,8 @@ def _tabled(path: Path, text: str) -> _Table:
         hint = f" (its column {said} does not say its unit)" if said else ""
         raise RequestError(f"{path} needs a column distance_m, or time_s and --speed{hint}")
 
-    def column(place: int) -> np.ndarray:
-        return np.array([_number(row[place] if place < len(row) else "", path, line, comma) for line, row in rows], float)
+    def column(index: int) -> np.ndarray:
+        return np.array([_parse_number(row[index] if index < len(row) else "", path, line, comma) for line, row in rows], float)
 
     names = None if left is None else [unescape_cell(row[left].strip()) if left < len(row) else "" for _, row in rows]
     distances: np.ndarray | None = None
@@ -234,19 +234,19 @@ def _tabled(path: Path, text: str) -> _Table:
         distances = column(metres[0][0]) * metres[0][1]
     elif places is not None:
         values = np.stack([column(columns.index(name)) for name in places if name in columns], axis=1)
-        distances = _along(_on_plane(values) if places in _GLOBE else values) if len(values) else np.zeros(0)
+        distances = _project_on_path(_project_to_plane(values) if places in _GLOBE else values) if len(values) else np.zeros(0)
     times, start = None, 0.0
     if time is not None and (distances is None or names is None):
-        times, start = _seconds(column(time), columns[time], path)
+        times, start = _parse_seconds(column(time), columns[time], path)
     return _Table(path, names, times, start, distances)
 
 
 def _time_column(columns: list[str]) -> int | None:
-    named = [place for place, name in enumerate(columns) if _TIME.fullmatch(name) or name in (*_ROS_TIMES, *_PLAIN_TIMES)]
+    named = [index for index, name in enumerate(columns) if _TIME.fullmatch(name) or name in (*_ROS_TIMES, *_PLAIN_TIMES)]
     return named[0] if named else None
 
 
-def _seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, float]:
+def _parse_seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, float]:
     """Convert times to s; return them relative to the first one, and the first one.
 
     Args:
@@ -259,7 +259,7 @@ def _seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, flo
     """
     match = _TIME.fullmatch(name)
     largest = float(np.abs(values).max(initial=0.0))
-    if match and match[1] == "s" and largest > _MOST_SECONDS:
+    if match and match[1] == "s" and largest > _MAX_SECONDS:
         unit = "ns" if largest > 1e17 else "us" if largest > 1e14 else "ms"
         raise RequestError(f"{path}: {name} holds {largest:.0f}, which are no seconds: name the column time_{unit} or mend it")
     if match:
@@ -272,13 +272,13 @@ def _seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarray, flo
     return (values - start) * factor, start * factor
 
 
-def _on_plane(degrees: np.ndarray) -> np.ndarray:
+def _project_to_plane(degrees: np.ndarray) -> np.ndarray:
     """Project latitudes and longitudes [N, 2], degrees, to positions [N, 2] in m relative to the first one."""
     turned = np.radians(degrees - degrees[:1])
     return _EARTH * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
 
 
-def _along(places: np.ndarray) -> np.ndarray:
+def _project_on_path(places: np.ndarray) -> np.ndarray:
     """Return distances [N] along the straight line fitted to positions [N, 2 or 3], from the first one; NaN if any is invalid.
 
     Lateral deviations from the line do not count. The direction of travel is positive.
@@ -292,7 +292,7 @@ def _along(places: np.ndarray) -> np.ndarray:
     return along - along[0]
 
 
-def _number(cell: str, path: Path, line: int, comma: bool) -> float:
+def _parse_number(cell: str, path: Path, line: int, comma: bool) -> float:
     text = unescape_cell(cell.strip())
     try:
         value = float(text.replace(",", ".") if comma else text)

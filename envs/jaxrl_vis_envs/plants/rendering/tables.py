@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 
 from jaxrl_vis_envs.plants.cameras import Calibration, Pose
-from jaxrl_vis_envs.plants.surfaces import Surfaces
+from jaxrl_vis_envs.plants.rendering.surfaces import Surfaces
 
 NEAR, FAR = 0.15, 6.0
 """Minimum and maximum rendered depth, m."""
@@ -88,26 +88,26 @@ def build_view(surfaces: Surfaces, pose: Pose, camera: Calibration, shift: float
     triangle_boxes, visible_triangles = triangle_boxes[in_sight], candidates[in_sight]
     triangles = _triangle_table(surfaces, visible_triangles, corners[in_sight], pose)
 
-    cone_list, cone_ranges = _lists(cone_boxes, columns, lines)
-    triangle_list, triangle_ranges = _lists(triangle_boxes, columns, lines)
+    cone_list, cone_ranges = _list_by_tile(cone_boxes, columns, lines)
+    triangle_list, triangle_ranges = _list_by_tile(triangle_boxes, columns, lines)
     line, column = np.divmod(np.arange(columns * lines), columns)
     return View(
-        cones=_padded(cones, _CONES),
-        cone_instance=_padded(surfaces.cone_stalk[visible_cones], _CONES),
-        cone_material=_padded(surfaces.cone_material[visible_cones], _CONES),
-        triangles=_padded(triangles, _TRIANGLES),
-        triangle_instance=_padded(surfaces.triangle_instance[visible_triangles], _TRIANGLES),
-        triangle_material=_padded(surfaces.triangle_material[visible_triangles], _TRIANGLES),
-        materials=_padded(surfaces.materials, _MATERIALS),
+        cones=_pad_rows(cones, _CONES),
+        cone_instance=_pad_rows(surfaces.cone_stalk[visible_cones], _CONES),
+        cone_material=_pad_rows(surfaces.cone_material[visible_cones], _CONES),
+        triangles=_pad_rows(triangles, _TRIANGLES),
+        triangle_instance=_pad_rows(surfaces.triangle_instance[visible_triangles], _TRIANGLES),
+        triangle_material=_pad_rows(surfaces.triangle_material[visible_triangles], _TRIANGLES),
+        materials=_pad_rows(surfaces.materials, _MATERIALS),
         tiles=(tile * np.stack([column, line], axis=1)).astype(np.int32),
         cone_ranges=cone_ranges,
         triangle_ranges=triangle_ranges,
-        cone_list=_padded(cone_list, _LIST),
-        triangle_list=_padded(triangle_list, _LIST),
+        cone_list=_pad_rows(cone_list, _LIST),
+        triangle_list=_pad_rows(triangle_list, _LIST),
     )
 
 
-def _padded(table: np.ndarray, minimum: int) -> np.ndarray:
+def _pad_rows(table: np.ndarray, minimum: int) -> np.ndarray:
     """Append zero rows to a table, up to ``minimum`` rows or the smallest sufficient multiple of it by a power of two."""
     size = minimum
     while size < len(table):
@@ -150,7 +150,7 @@ def _in_sight(boxes: np.ndarray, columns: int, lines: int) -> np.ndarray:
     return (boxes[:, 0] < columns) & (boxes[:, 1] < lines) & (boxes[:, 2] >= 0) & (boxes[:, 3] >= 0)
 
 
-def _lists(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.ndarray]:
+def _list_by_tile(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the table rows visible in each tile, tile by tile, and the range [N, 2] of each tile's part."""
     first = np.maximum(boxes[:, :2], 0)
     last = np.minimum(boxes[:, 2:], [columns - 1, lines - 1])

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 
-def hashed(*words: jax.Array) -> jax.Array:
+def hash_words(*words: jax.Array) -> jax.Array:
     """Hash uint32 arrays into one pseudo-random uint32 array."""
     value = jnp.uint32(0x9E3779B9)
     for word, factor in zip(words, (0x85EBCA6B, 0xC2B2AE35, 0x27D4EB2F, 0x165667B1)):

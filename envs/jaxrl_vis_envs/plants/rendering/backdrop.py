@@ -59,8 +59,8 @@ def _outdoors(rng: np.random.Generator) -> np.ndarray:
     elevation = ((_HORIZON - np.arange(SHAPE[0])) / _HORIZON * REACH[0])[:, None, None]
     zenith = np.array([0.25, 0.45, 0.95]) * rng.uniform(0.5, 1.3)
     haze = np.array([0.85, 0.92, 1.0]) * rng.uniform(0.7, 1.6)
-    share = np.exp(-np.clip(elevation, 0.0, None) / rng.uniform(0.15, 0.8))
-    picture = zenith + (haze - zenith) * share
+    fraction = np.exp(-np.clip(elevation, 0.0, None) / rng.uniform(0.15, 0.8))
+    picture = zenith + (haze - zenith) * fraction
     cover = rng.uniform(0.0, 1.0)
     clouds = 0.6 * smooth_noise(rng, (30, 90)) + 0.4 * smooth_noise(rng, (10, 25))
     thick = np.clip((clouds - (1.0 - cover)) / 0.25, 0.0, 1.0)[..., None]
@@ -155,10 +155,10 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
     if not paths:
         raise ValueError("scene.photographs needs photographs that packages ship: pip install scikit-image, or scikit-learn")
     with Image.open(paths[rng.integers(len(paths))]) as opened:
-        whole = np.asarray(opened.convert("RGB"))
-    tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in whole.shape[:2])
-    line, column = rng.integers(0, whole.shape[0] - tall + 1), rng.integers(0, whole.shape[1] - wide + 1)
-    part = Image.fromarray(whole[line : line + tall, column : column + wide])
+        photograph = np.asarray(opened.convert("RGB"))
+    tall, wide = (int(length * rng.uniform(0.5, 1.0)) for length in photograph.shape[:2])
+    line, column = rng.integers(0, photograph.shape[0] - tall + 1), rng.integers(0, photograph.shape[1] - wide + 1)
+    part = Image.fromarray(photograph[line : line + tall, column : column + wide])
     part = part.resize((SHAPE[1], SHAPE[0]), Image.Resampling.BILINEAR)
     values = (np.asarray(part) / 255.0) ** 2.2
     return values[:, ::-1] if rng.random() < 0.5 else values
@@ -166,9 +166,9 @@ def _photograph(rng: np.random.Generator) -> np.ndarray:
 
 def photograph_files() -> list[Path]:
     """Return the paths of the photographs shipped with scikit-image and scikit-learn, in fixed order; empty without them."""
-    found = []
+    paths = []
     for package, folder in _PHOTOGRAPHS:
         spec = importlib.util.find_spec(package)
         if spec is not None and spec.origin is not None:
-            found += sorted((Path(spec.origin).parent / folder).glob("*.jpg"))
-    return found
+            paths += sorted((Path(spec.origin).parent / folder).glob("*.jpg"))
+    return paths

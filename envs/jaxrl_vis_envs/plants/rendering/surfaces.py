@@ -91,7 +91,9 @@ def build(plot: Plot) -> Surfaces:
         for ribbon, paint in flat_things:
             strips.append(_triangles(ribbon, len(materials)))
             materials.append(paint)
-    return Surfaces(**_joined(cones, _NO_CONES), **_joined(strips, _NO_TRIANGLES), materials=np.array(materials, np.float32))
+    return Surfaces(
+        **_concatenate(cones, _NO_CONES), **_concatenate(strips, _NO_TRIANGLES), materials=np.array(materials, np.float32)
+    )
 
 
 _NO_CONES = {"start": (0, 3), "end": (0, 3), "radii": (0, 2), "arcs": (0, 2), "sheath": (0, 2), "node": (0, 2), "oval": (0, 2),
@@ -100,7 +102,7 @@ _NO_TRIANGLES = {"corners": (0, 3, 3), "along": (0, 3), "across": (0, 3), "offse
                  "triangle_instance": (0,), "triangle_material": (0,)}  # fmt: skip
 
 
-def _joined(parts: list[dict[str, np.ndarray]], empty: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
+def _concatenate(parts: list[dict[str, np.ndarray]], empty: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     if not parts:
         return {name: np.zeros(shape, np.int32 if len(shape) == 1 else float) for name, shape in empty.items()}
     return {name: np.concatenate([part[name] for part in parts]) for name in empty}
