@@ -103,7 +103,7 @@ class Learner:
         resolved = resolve(self.config, horizon)
         if resolved.method.reward == "oracle" and self.config.run.algorithm != "contrastive" and not state_size:
             raise RequestError(
-                "method oracle needs true states: give state_size, threshold, and states to add; or use indicator_balance_filter"
+                "method oracle needs true states: give state_size, threshold and states, or use indicator_balance_filter"
             )
         shape = observation_shape if len(observation_shape) == 1 else (observation_shape[2], *observation_shape[:2])
         self._spec = jax.ShapeDtypeStruct(shape, jnp.uint8 if len(shape) == 3 else jnp.float32)

@@ -70,6 +70,7 @@ class Camera:
         for geom in range(model.ngeom):
             if model.geom(geom).name in _UNSEEN or model.body(model.geom_bodyid[geom]).name == "robot0:mocap":
                 model.geom_rgba[geom, 3] = 0.0
+        model.vis.quality.offsamples = 0  # without antialiasing, which takes longer than the rest
         self._renderer = mujoco.Renderer(model, SIZE, SIZE)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._renderer.scene.flags[flag] = False

@@ -5,7 +5,7 @@
     MUJOCO_GL=egl python -m benchmarks.tasks.host_learning --list
 
 Live, the learner plays 40,000 steps, or until three evaluations in a row show a success of at least 0.9, and takes 25 gradient
-steps after each episode of 50. Recorded, it takes 10,000 gradient
+steps after each episode of 50. Recorded, it takes 5,000 gradient
 steps on 1,000 episodes of a behaviour that goes towards the goal in half of its steps, with noise, and anywhere in the others.
 ``make tables`` writes the records, one file for each cell, into docs/indicator_rewards.md.
 """
@@ -86,7 +86,7 @@ class Size:
     updates_per_episode: int = 25
     interval: int = 2500
     episodes: int = 1000
-    updates: int = 10_000
+    updates: int = 5000
     eval_episodes: int = 50
 
 
