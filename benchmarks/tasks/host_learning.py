@@ -39,7 +39,7 @@ _SMALL: dict[str, Any] = {
     "hidden_sizes": (128, 128),
 }
 _SEEDS, _NOISES, _EVALUATION_SEED, _BEHAVIOUR_SEED = (100, 101, 102), (2, 5), 10_000, 20_000
-_WANTED, _IN_A_ROW = 0.9, 3
+WANTED, IN_A_ROW = 0.9, 3
 _LATEST = 20
 """Number of the last updates' metrics that a record averages."""
 
@@ -129,7 +129,7 @@ def live(cell: Cell, size: Size) -> dict[str, Any]:
         if episode * HORIZON % size.interval == 0:
             rows.append({"env_steps": episode * HORIZON, "success": evaluate(learner, judge, size.eval_episodes)})
             print(cell.name, rows[-1], latest(metrics), f"{time.monotonic() - began:.0f} s", flush=True)
-            if len(rows) >= _IN_A_ROW and min(row["success"] for row in rows[-_IN_A_ROW:]) >= _WANTED:
+            if len(rows) >= IN_A_ROW and min(row["success"] for row in rows[-IN_A_ROW:]) >= WANTED:
                 break
     for each in (robot, judge):
         each.close()
