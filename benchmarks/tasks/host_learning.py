@@ -31,6 +31,7 @@ from jaxrl_vis.host.files import write_atomically
 RESULTS = Path("benchmarks") / "results" / "studies" / "host"
 _SMALL: dict[str, Any] = {
     "preset": "cpu",
+    "batch_size": 64,
     "encoders": "shared",
     "target_encoder": False,
     "random_shift": 1,
@@ -87,7 +88,8 @@ class Size:
     interval: int = 2500
     episodes: int = 1000
     updates: int = 5000
-    eval_episodes: int = 50
+    eval_episodes: int = 20
+    final_episodes: int = 100
 
 
 def cells() -> list[Cell]:
@@ -131,9 +133,10 @@ def live(cell: Cell, size: Size) -> dict[str, Any]:
             print(cell.name, rows[-1], latest(metrics), f"{time.monotonic() - began:.0f} s", flush=True)
             if len(rows) >= IN_A_ROW and min(row["success"] for row in rows[-IN_A_ROW:]) >= WANTED:
                 break
+    success = evaluate(learner, judge, size.final_episodes)
     for each in (robot, judge):
         each.close()
-    return {"rows": rows, "success": rows[-1]["success"], "shares": latest(metrics), "seconds": time.monotonic() - began}
+    return {"rows": rows, "success": success, "shares": latest(metrics), "seconds": time.monotonic() - began}
 
 
 def record(path: Path, noise: int, size: Size) -> None:
@@ -167,10 +170,11 @@ def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
         if updates % (size.updates // 4) == 0:
             rows.append({"updates": updates, "success": evaluate(learner, judge, size.eval_episodes)})
             print(cell.name, rows[-1], metrics[-1], f"{time.monotonic() - began:.0f} s", flush=True)
+    success = evaluate(learner, judge, size.final_episodes)
     judge.close()
     return {
         "rows": rows,
-        "success": rows[-1]["success"],
+        "success": success,
         "success_of_behaviour": float(np.mean(episodes["reached"])),
         "shares": latest(metrics),
         "seconds": time.monotonic() - began,

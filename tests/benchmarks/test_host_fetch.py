@@ -81,7 +81,18 @@ def test_what_is_missing_is_named(monkeypatch):
 @pytest.mark.usefixtures("hosted")
 def test_cells_leave_records_that_a_table_is_written_from(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(host_learning, "_SMALL", {"preset": "debug"})
-    small = ["--steps", "200", "--interval", "100", "--eval-episodes", "2", "--updates-per-episode", "2"]
+    small = [
+        "--steps",
+        "200",
+        "--interval",
+        "100",
+        "--eval-episodes",
+        "2",
+        "--final-episodes",
+        "2",
+        "--updates-per-episode",
+        "2",
+    ]
     small += ["--episodes", "4", "--updates", "400", "--results", str(tmp_path), "--recordings", str(tmp_path)]
     names = ["live_tolerance_noise2_seed100", "recorded_cloning_noise0_seed100"]
     assert host_learning.main(["--cells", *names, *small]) == 0
@@ -90,7 +101,9 @@ def test_cells_leave_records_that_a_table_is_written_from(tmp_path, capsys, monk
     assert 0.0 <= live["shares"]["false_positive_share"] <= 1.0 and live["versions"]["mujoco"]
     assert recorded["success_of_behaviour"] in (0.0, 0.25, 0.5, 0.75, 1.0) and len(recorded["rows"]) == 4
     table = host_table.rows(tmp_path)
-    assert "| live | `indicator_tolerance` | 2 | 100 | never |" in table and "| recorded | behaviour cloning | 0 | 100 |" in table
+    assert (
+        "| live | `indicator_tolerance` | 2 | 100 | never |" in table and "| recorded | behaviour cloning | 0 | 100 |" in table
+    )
     capsys.readouterr()
     assert host_learning.main(["--cells", names[0], *small]) == 0 and not capsys.readouterr().out  # it has its record
     assert host_learning.main(["--cells", "live_magic"]) == 2
