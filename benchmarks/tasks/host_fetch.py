@@ -40,6 +40,12 @@ class Episode(NamedTuple):
     is_reached: bool
 
 
+def with_noise(image: np.ndarray, noise: float, draw: np.random.Generator) -> np.ndarray:
+    """Return images [...] uint8 with Gaussian noise of the standard deviation ``noise``, grey levels."""
+    noisy = image + np.float32(noise) * draw.standard_normal(image.shape, np.float32) if noise else image
+    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
 def make_env() -> Any:
     """Make the environment, without its time limit.
 
@@ -70,8 +76,9 @@ class Camera:
         for geom in range(model.ngeom):
             if model.geom(geom).name in _UNSEEN or model.body(model.geom_bodyid[geom]).name == "robot0:mocap":
                 model.geom_rgba[geom, 3] = 0.0
-        model.vis.quality.offsamples = 0  # without antialiasing, which takes longer than the rest
-        self._renderer = mujoco.Renderer(model, SIZE, SIZE)
+        # Means of 2x2 pixels are antialiased in a third of the time of OpenGL's four samples on a CPU.
+        model.vis.quality.offsamples = 0
+        self._renderer = mujoco.Renderer(model, 2 * SIZE, 2 * SIZE)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._renderer.scene.flags[flag] = False
         self._view, self._options = mujoco.MjvCamera(), mujoco.MjvOption()
@@ -82,7 +89,8 @@ class Camera:
     def image(self) -> np.ndarray:
         """Render an image [32, 32, 3] uint8."""
         self._renderer.update_scene(self._data, self._view, self._options)
-        return self._renderer.render()
+        fine = self._renderer.render().reshape(SIZE, 2, SIZE, 2, 3)
+        return np.uint8((np.uint16(fine).sum((1, 3)) + 2) // 4)
 
     def close(self) -> None:
         """Free the GL context."""
@@ -110,11 +118,7 @@ class HostFetch:
         return self._env.step(np.asarray(action, np.float32))[0]["achieved_goal"]
 
     def _image(self) -> np.ndarray:
-        image = self._camera.image()
-        if not self._noise:
-            return image.copy()
-        noisy = image + self._noise * self._draw.standard_normal(image.shape, np.float32)
-        return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+        return with_noise(self._camera.image(), self._noise, self._draw)
 
     def episode(self, policy: Policy) -> Episode:
         """Roll out an episode."""
