@@ -1,4 +1,4 @@
-"""Table of docs/algorithms.md: forms of contrastive RL on FetchReach from states, from run folders in ``results/contrastive``."""
+"""Table of docs/algorithms.md: forms of contrastive RL on FetchReach from states, from the runs in ``results/contrastive``."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ def forms_table(results: Path) -> str | None:
         return None
     rows = sorted((_row(folder) for folder in folders), key=lambda row: row[0])
     lines = [
-        "| form | loss | networks | gradient steps for 1,000 steps | seeds | mean success to 25.6 k steps | success at the end |",
+        "| form | loss | networks | gradient steps in 1,000 steps | seeds | mean success | success at the end |",
         "|---|---|---|---|---|---|---|",
         *(line for _, line, _ in rows),
         "",

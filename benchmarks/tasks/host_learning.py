@@ -23,7 +23,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from benchmarks.tasks.host_fetch import ACTION_SIZE, HORIZON, SIZE, THRESHOLD, HostFetch, with_noise
+from benchmarks.tasks.host_fetch import ACTION_SIZE, HORIZON, SHAPE, THRESHOLD, HostFetch, with_noise
 from jaxrl_vis import indicator
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
@@ -116,7 +116,7 @@ def latest(metrics: list[dict[str, float]]) -> dict[str, float]:
 
 def live(cell: Cell, size: Size) -> dict[str, Any]:
     """Learn online; return success by steps."""
-    learner = indicator.Learner((SIZE, SIZE, 3), ACTION_SIZE, HORIZON, capacity=size.steps // HORIZON, **cell.options())
+    learner = indicator.Learner(SHAPE, ACTION_SIZE, HORIZON, capacity=size.steps // HORIZON, **cell.options())
     robot, judge, draw = HostFetch(cell.noise, cell.seed), HostFetch(cell.noise, 0), np.random.default_rng(cell.seed)
 
     def explore(image: np.ndarray, goal: np.ndarray, _: np.ndarray) -> np.ndarray:
@@ -162,7 +162,7 @@ def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
         record(path, size)
     with np.load(path) as arrays:
         episodes = {name: arrays[name] for name in arrays.files}
-    learner = indicator.Learner((SIZE, SIZE, 3), ACTION_SIZE, HORIZON, capacity=size.episodes, **cell.options())
+    learner = indicator.Learner(SHAPE, ACTION_SIZE, HORIZON, capacity=size.episodes, **cell.options())
     draw = np.random.default_rng(cell.seed)
     for number in range(size.episodes):
         seen, goal = (with_noise(episodes[name][number], cell.noise, draw) for name in ("observations", "goals"))
