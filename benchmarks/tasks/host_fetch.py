@@ -1,7 +1,7 @@
 """FetchReach of Gymnasium-Robotics on the host: stepped and rendered by MuJoCo, without MJX and without our renderer.
 
 Images are 32x32 depth from MuJoCo's OpenGL renderer (``MUJOCO_GL=egl`` or ``osmesa`` without a screen), in the view of
-``contrastive_rl``, with 8 bits for 0.4 to 1.4 m: colours of so few pixels hardly show how far the gripper is from the camera. Goal images show the arm after ten actions of a proportional controller. Success means a distance of at most
+``contrastive_rl``, with 8 bits for 0.25 to 1.25 m: colours of so few pixels hardly show how far the gripper is from the camera. Goal images show the arm after ten actions of a proportional controller. Success means a distance of at most
 5 cm at the last step.
 """
 
@@ -15,7 +15,7 @@ from jaxrl_vis.errors import RequestError
 
 ENV, HORIZON, THRESHOLD, ACTION_SIZE = "FetchReach-v4", 50, 0.05, 4
 SHAPE = (32, 32, 1)
-_NEAR, _FAR = 0.4, 1.4
+_NEAR, _FAR = 0.25, 1.25
 
 # Their triangles are half of all, and out of the camera's sight.
 _UNSEEN = ("robot0:estop_link", "robot0:laser_link")
