@@ -5,7 +5,7 @@
     MUJOCO_GL=egl python -m benchmarks.tasks.host_learning --list
 
 Live, the learner plays 40,000 steps, or until three evaluations in a row show a success of at least 0.9, and takes 25 gradient
-steps after each episode of 50. Recorded, it takes 5,000 gradient steps on 1,000 episodes of a behaviour that goes towards the
+steps after each episode of 50. Recorded, it takes 15,000 gradient steps on 1,000 episodes of a behaviour that goes towards the
 goal in half of its steps, with noise, and anywhere in the others. ``make tables`` writes the records, one file for each cell,
 into docs/indicator_rewards.md. Gymnasium-Robotics needs an older MuJoCo than this project, in an environment of its own; the
 learner itself imports none.
@@ -88,7 +88,7 @@ class Size:
     updates_per_episode: int = 25
     interval: int = 2500
     episodes: int = 1000
-    updates: int = 5000
+    updates: int = 15_000
     eval_episodes: int = 20
     final_episodes: int = 100
 
