@@ -56,7 +56,7 @@ def make_env() -> Any:
     """
     try:
         import gymnasium
-        import gymnasium_robotics
+        import gymnasium_robotics  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise RequestError("FetchReach on the host needs Gymnasium-Robotics: pip install gymnasium-robotics") from error
     gymnasium.register_envs(gymnasium_robotics)
@@ -90,7 +90,7 @@ class Camera:
         """Render an image [32, 32, 1] uint8."""
         self._renderer.update_scene(self._data, self._view, self._options)
         share = (self._renderer.render()[..., None] - _NEAR) / (_FAR - _NEAR)
-        return np.uint8(np.round(255.0 * np.clip(share, 0.0, 1.0)))
+        return np.round(255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
 
     def close(self) -> None:
         """Free the GL context."""
