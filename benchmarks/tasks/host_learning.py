@@ -170,7 +170,7 @@ def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
     judge, rows, metrics, began = HostFetch(cell.noise, 0), [], [], time.monotonic()
     for updates in range(100, size.updates + 1, 100):
         metrics.append(learner.update(100))
-        if updates % (size.updates // 4) == 0:
+        if updates % (size.updates // 5) == 0:
             rows.append({"updates": updates, "success": evaluate(learner, judge, size.eval_episodes)})
             print(cell.name, rows[-1], metrics[-1], f"{time.monotonic() - began:.0f} s", flush=True)
     success = evaluate(learner, judge, size.final_episodes)

@@ -93,14 +93,14 @@ def test_cells_leave_records_that_a_table_is_written_from(tmp_path, capsys, monk
         "--updates-per-episode",
         "2",
     ]
-    small += ["--episodes", "4", "--updates", "400", "--results", str(tmp_path), "--recordings", str(tmp_path)]
+    small += ["--episodes", "4", "--updates", "500", "--results", str(tmp_path), "--recordings", str(tmp_path)]
     names = ["live_exact_noise0_seed100", "recorded_tolerance_noise2_seed100"]
     assert host_learning.main(["--cells", *names, *small]) == 0
     live, recorded = (json.loads((tmp_path / f"{name}.json").read_text()) for name in names)
     assert [row["env_steps"] for row in live["rows"]] == [100, 200] and live["size"]["steps"] == 200
     assert 0.0 <= live["shares"]["false_positive_share"] <= 1.0 and live["versions"]["mujoco"]
     assert 0.0 <= recorded["shares"]["false_negative_share"] <= 1.0
-    assert recorded["success_of_behaviour"] in (0.0, 0.25, 0.5, 0.75, 1.0) and len(recorded["rows"]) == 4
+    assert recorded["success_of_behaviour"] in (0.0, 0.25, 0.5, 0.75, 1.0) and len(recorded["rows"]) == 5
     table = host_table.rows(tmp_path)
     assert "| live | `indicator_balance_filter` | 0 | 100 | never |" in table
     assert "| recorded | `indicator_tolerance` | 2 | 100 |" in table
