@@ -1,8 +1,9 @@
 """FetchReach of Gymnasium-Robotics on the host: stepped and rendered by MuJoCo, without MJX and without our renderer.
 
 Images are 32x32 depth from MuJoCo's OpenGL renderer (``MUJOCO_GL=egl`` or ``osmesa`` without a screen), in the view of
-``contrastive_rl``, with 8 bits for 0.25 to 1.25 m: colours of so few pixels hardly show how far the gripper is from the camera. Goal images show the arm after ten actions of a proportional controller. Success means a distance of at most
-5 cm at the last step.
+``contrastive_rl``, with 8 bits for 0.25 to 1.25 m: colours of so few pixels hardly show how far the gripper is from the camera.
+Goal images show the arm after ten actions of a proportional controller. Success means a distance of at most 5 cm at the last
+step.
 """
 
 from collections.abc import Callable
