@@ -12,6 +12,6 @@
     soak/         random faults injected into real runs
     results/      records
 
-`ship.py` adds a trained policy to the package and `exported.py` evaluates those that ship, `same_numbers.py` compares two revisions
-bit for bit, and `install_smoke_test.py` runs the commands of a new user.
+`ship.py` adds a trained policy to the package, `exported.py` evaluates those that ship, `same_numbers.py` compares two
+revisions bit for bit, and `install_smoke_test.py` runs the commands of a new user.
 """

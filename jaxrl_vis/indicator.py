@@ -65,7 +65,15 @@ class Learner:
     """
 
     def __init__(
-        self, observation_shape: tuple[int, ...], action_size: int, horizon: int, capacity: int = 1000, **options: Any
+        self,
+        observation_shape: tuple[int, ...],
+        action_size: int,
+        horizon: int,
+        capacity: int = 1000,
+        *,
+        state_size: int = 0,
+        threshold: float = 0.0,
+        **options: Any,
     ) -> None:
         """Initialise networks and an empty replay.
 
@@ -74,13 +82,16 @@ class Learner:
             action_size: A, number of action components.
             horizon: T, number of steps in an episode.
             capacity: Number of episodes that the replay holds.
+            state_size: Size of true states, where they are known: for method ``oracle``, and for metrics of other rewards'
+                errors. 0 if they are not.
+            threshold: Distance of true states up to which a goal counts as reached, in their unit.
             **options: Options of `jaxrl-vis train`, by name: ``preset`` (``cpu`` if not given), ``seed``, ``method``
                 (``indicator_balance_filter``, or with a ``tolerance`` ``indicator_tolerance``), ``algorithm``, ...
 
         Raises:
             RequestError: A size or an option is invalid, or an option needs true states.
         """
-        if len(observation_shape) not in (1, 3) or min(*observation_shape, action_size, horizon, capacity) < 1:
+        if len(observation_shape) not in (1, 3) or min(*observation_shape, action_size, horizon, capacity, state_size + 1) < 1:
             raise RequestError(
                 f"observations are images (H, W, C) or vectors (S,), not {observation_shape}; sizes are at least 1"
             )
@@ -90,11 +101,14 @@ class Learner:
         if self.config.run.seeds != 1 or self.config.run.devices != 1:
             raise RequestError("a learner on the host has one seed and one device")
         resolved = resolve(self.config, horizon)
-        if resolved.method.reward == "oracle" and self.config.run.algorithm != "contrastive":
-            raise RequestError("method oracle needs true states, which recordings do not have: use indicator_balance_filter")
+        if resolved.method.reward == "oracle" and self.config.run.algorithm != "contrastive" and not state_size:
+            raise RequestError(
+                "method oracle needs true states: give state_size, threshold and states, or use indicator_balance_filter"
+            )
         shape = observation_shape if len(observation_shape) == 1 else (observation_shape[2], *observation_shape[:2])
         self._spec = jax.ShapeDtypeStruct(shape, jnp.uint8 if len(shape) == 3 else jnp.float32)
         self._given_shape, self._action_size, self._horizon = tuple(observation_shape), action_size, horizon
+        self._state_size = state_size
         auxiliary = make_auxiliary(self.config, self._spec, action_size, 1, compute_dtype(self.config))
         if auxiliary.tasks:
             raise RequestError("a learner on the host has no auxiliary losses: leave out aux_tasks")
@@ -103,10 +117,10 @@ class Learner:
         maker = find("algorithm", wanted, train_step.ALGORITHMS, self.config.environment.env_folder)
         self._algorithm = call("algorithm", wanted, maker, setup, of=Algorithm)
         self._replay = Replay(capacity, 1, horizon)
-        self._sampler = Sampler(self.config, resolved, self._replay, threshold=0.0)
+        self._sampler = Sampler(self.config, resolved, self._replay, threshold)
         self._key = jax.random.key(self.config.run.seed)
         self._train = TrainState(jax.jit(self._algorithm.init)(self._key), normalizer.init(self._spec))
-        self._state: ReplayState = self._replay.init(self._spec, 1, action_size)
+        self._state: ReplayState = self._replay.init(self._spec, max(1, state_size), action_size)
         self._updates: dict[int, Callable[..., Any]] = {}
         self.episodes, self._calls = 0, 0
 
@@ -117,24 +131,30 @@ class Learner:
             raise RequestError(f"{name} must be {wanted} of the shape {shape}, not {array.dtype} of {array.shape}")
         return array.astype(dtype)
 
-    def add(self, observations: Any, actions: Any, goal: Any = None) -> None:
+    def add(self, observations: Any, actions: Any, goal: Any = None, states: Any = None) -> None:
         """Add an episode to the replay, replacing the oldest one once it is full, and update the observation statistics.
 
         Args:
             observations: [T+1, ...] observations before the first action and after each one.
             actions: [T, A] executed actions in [-1, 1]; others are clipped.
             goal: [...] goal of the episode; None if it had none: the last observation is used instead.
+            states: [T+2, state_size] true states of the observations and, last, of the goal; None unless there is a
+                ``state_size``.
 
         Raises:
             RequestError: A shape or dtype is wrong, or a value is not finite.
         """
+        if (states is None) != (self._state_size == 0):
+            raise RequestError("states are needed where a learner has a state_size, and only there")
         dtype = np.dtype(self._spec.dtype)
         seen = self._checked("observations", observations, (self._horizon + 1, *self._given_shape), dtype)
         done = self._checked("actions", actions, (self._horizon, self._action_size), np.dtype(np.float32))
         aim = seen[-1] if goal is None else self._checked("goal", goal, self._given_shape, dtype)
+        true = np.zeros((self._horizon + 2, 1)) if states is None else states
+        shape = (self._horizon + 2, max(1, self._state_size))
         episode = Episodes(
             observations=_planar(np.concatenate([seen, aim[None]]))[None],  # type: ignore[arg-type]
-            states=np.zeros((1, self._horizon + 2, 1), np.float32),  # type: ignore[arg-type]
+            states=self._checked("states", true, shape, np.dtype(np.float32))[None],  # type: ignore[arg-type]
             actions=np.clip(done, -1.0, 1.0)[None],  # type: ignore[arg-type]
         )
         self._state, self._train = self._insert(self._state, self._train, episode, self.episodes)
@@ -170,7 +190,8 @@ class Learner:
         compiled = self._updates.setdefault(count, jax.jit(update, donate_argnums=0))
         self._train, metrics = compiled(self._train, self._state, key, self.episodes - 1)
         self._calls += 1
-        known = {name: value for name, value in metrics.items() if not name.removeprefix("train/").startswith(_NEED_TRUTH)}
+        unknown = () if self._state_size else _NEED_TRUTH
+        known = {name: value for name, value in metrics.items() if not name.removeprefix("train/").startswith(unknown)}
         return {name: float(value) for name, value in jax.device_get(known).items()}
 
     def act(self, observation: Any, goal: Any) -> np.ndarray:

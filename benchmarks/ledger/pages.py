@@ -8,7 +8,9 @@ from benchmarks.claims import pages as claims
 from benchmarks.ledger import (
     ablations,
     comparison_table,
+    contrastive_table,
     exported_table,
+    host_table,
     pixels_table,
     platforms_table,
     render_table,
@@ -51,6 +53,8 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
     "docs/phenotyping.md": {"lenses": stalks_table.lens_table, "coverage": stalks_table.coverage_table},
     "docs/export.md": {"policies": exported_table.exported_table},
+    "docs/algorithms.md": {"forms": contrastive_table.forms_table},
+    "docs/indicator_rewards.md": {"host": host_table.host_table},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table, "training": pixels_table.training_table},
     "docs/where_it_ran.md": {"platforms": platforms_table.platforms_table, "not run": platforms_table.not_run_table},
     "docs/weighting.md": {

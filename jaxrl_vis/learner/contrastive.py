@@ -14,6 +14,8 @@ and is penalised for large actions (``action_penalty``) instead of being rewarde
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -86,10 +88,25 @@ def make(setup: Setup) -> Algorithm:
     Raises:
         RequestError: The configuration sets rewards, auxiliary losses or goals that the algorithm does not support.
     """
+    form = setup.config.contrastive.contrastive_form
+    return build(setup, functools.partial(contrastive_loss, form=form), stabilised=form == "stable")
+
+
+def build(setup: Setup, loss: Callable[[jax.Array], jax.Array], stabilised: bool) -> Algorithm:
+    """Build contrastive RL with any loss of the logits.
+
+    Args:
+        setup: Configuration and task.
+        loss: Logits [B, B] float32, as for `contrastive_loss` -> loss [] float32.
+        stabilised: True for heads with layer normalisation and cold initialisation.
+
+    Raises:
+        RequestError: As in `make`.
+    """
     _check(setup)
-    config, form = setup.config, setup.config.contrastive.contrastive_form
+    config = setup.config
     networks = Networks(config, setup.observation_spec, setup.action_size, 0.0)
-    policy, head = make_policy(networks), networks.head(config.contrastive.representation_size, stabilised=form == "stable")
+    policy, head = make_policy(networks), networks.head(config.contrastive.representation_size, stabilised=stabilised)
     latent = networks.latent_size
 
     def init(key: jax.Array) -> Agent:
@@ -115,7 +132,7 @@ def make(setup: Setup) -> Algorithm:
             latents = encode(critic)
             of_pairs, of_goals = represent(critic, latents, batch.action)
             logits = of_pairs @ of_goals.T
-            return contrastive_loss(logits, form), (logits, latents)
+            return loss(logits), (logits, latents)
 
         def of_actor(actor: Params, critic_latents: jax.Array) -> tuple[jax.Array, jax.Array]:
             latents = encode(actor) if "encoder" in actor else critic_latents

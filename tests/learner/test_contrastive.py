@@ -10,6 +10,7 @@ import probe_environments as probes
 import pytest
 from learners import begin, experienced, train_iteration
 
+from benchmarks.tasks import contrastive_forms
 from jaxrl_vis.config import preset, validate
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.algorithm import Batches, Setup
@@ -124,6 +125,17 @@ def test_a_gradient_step_is_its_transcription(form):
     # Slopes of 0 but for rounding have either sign: a bias of psi that all logits of a row share.
     found = after.actor, after.critic
     jax.tree.map(lambda ours, theirs: np.testing.assert_allclose(ours, theirs, atol=2e-4), found, expected)
+
+
+def test_forms_between_change_the_loss_or_the_networks_alone():
+    for make_form, is_cold in ((contrastive_forms.nce_stabilised, True), (contrastive_forms.infonce_plain, False)):
+        heads = make_form(setup(config())).init(jax.random.key(3)).critic
+        assert ("normalization_0" in heads["sa"]) == is_cold
+        assert (float(np.abs(heads["g"]["output"]["kernel"]).max()) < 2e-12) == is_cold
+    # Three positives at 1, six negatives at -2, a mean each.
+    logits = jnp.full((3, 3), -2.0) + 3.0 * jnp.eye(3)
+    expected = np.log1p(np.exp(-1.0)) + np.log1p(np.exp(-2.0))
+    assert float(contrastive_forms.balanced_loss(logits)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_goals_follow_geometrically():

@@ -83,6 +83,26 @@ def test_states_are_observations_too():
     assert learner.act(np.zeros(2), np.ones(2)).shape == (1,)
 
 
+def test_true_states_pay_the_oracle_and_measure_other_rewards():
+    observations, actions, _, _ = record(120)
+    positions = np.concatenate([np.zeros((120, 1)), actions[..., 0], actions[:, -1:, 0]], axis=1)[..., None]
+    learners = [
+        indicator.Learner((SIZE, SIZE, 1), 1, HORIZON, state_size=1, threshold=0.15, **options, **OPTIONS)
+        for options in ({"method": "oracle"}, {"tolerance": 255.0})
+    ]
+    for learner in learners:
+        for episode in range(120):
+            learner.add(observations[episode], actions[episode], states=positions[episode])
+    learners[0].update(400)
+    assert success(learners[0]) >= 0.9
+    metrics = learners[1].update(4)  # with this tolerance all images are equal
+    assert metrics["train/false_positive_share"] == 1.0 and metrics["train/positive_share"] == 1.0
+    with pytest.raises(RequestError, match="states are needed where a learner has a state_size"):
+        learners[0].add(observations[0], actions[0])
+    with pytest.raises(RequestError, match=r"states must be finite numbers of the shape \(6, 1\)"):
+        learners[0].add(observations[0], actions[0], states=positions[0, :-1])
+
+
 def test_mistakes_get_one_line(tmp_path):
     with pytest.raises(RequestError, match="oracle needs true states"):
         indicator.Learner((2,), 1, 3, method="oracle")

@@ -41,8 +41,8 @@ class Choice(NamedTuple):
         shift: [B, 2] int32, see `Batch`; or None.
         target_key: [] a typed key, for targets of auxiliary tasks; or None.
         clutter_end: [] float32, see `reward_errors`; or None.
-        is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached; None
-            if none is, or if true states have decided that (``goal_episode``).
+        is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached;
+            None if none is, or if true states have decided that (``goal_episode``).
     """
 
     indices: Indices
@@ -138,7 +138,7 @@ class Sampler:
         return choice._replace(goal_episode=jnp.where(is_replaceable, jnp.roll(episode, 1), episode))
 
     def _replace_reached_goals(self, batch: Batch, is_replaceable: jax.Array) -> Batch:
-        """Replace the goals that ``is_replaceable`` [B] allows, and that are reached before the action, by the next transition's."""
+        """Replace those goals in ``is_replaceable`` [B] that are reached before the action by the next transition's."""
         before = batch.observation_t if self.as_goal is None else jax.vmap(self.as_goal)(batch.observation_t)
         is_replaceable = is_replaceable & (self._reward(batch, before, 1.0, 0.0) > 0.0)
 
