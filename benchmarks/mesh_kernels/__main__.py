@@ -88,7 +88,7 @@ def warp_row(name: str, setting: Setting, repeats: int) -> Row:
         **WARP[name],
     )
     blank = mjw.make_data(setting.mj_model, nworld=1)
-    datas = [warp._with_poses(blank, batch) for batch in setting.batches]
+    datas = [warp._set_poses(blank, batch) for batch in setting.batches]
 
     def launch(data: Any) -> None:
         mjw.refit_bvh(model, data, context)

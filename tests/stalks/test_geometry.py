@@ -52,6 +52,10 @@ def test_images_are_resized_by_the_focal_length_and_not_by_their_width():
     assert resize(np.pad(whole, ((0, 0), (500, 555), (0, 0))), settings, pixels_per_metre)[0].shape[:2] == (676, 1688)
     assert resize(whole, settings, 0.6 * pixels_per_metre)[0].shape[:2] == (1127, 1407)  # a wider lens: enlarged
     assert resize(whole, settings, 1.66 * pixels_per_metre)[0].shape[:2] == (407, 508)
+    # A lens within a few per cent of those of training is treated as one of them.
+    training = np.zeros((2704, 3376, 3), np.uint8)
+    assert [resize(training, settings, scale * 2710)[0].shape[:2] for scale in (0.95, 1.05)] == [(676, 844)] * 2
+    assert resize(training, settings, 1.25 * 2710)[0].shape[:2] == (541, 675)
     # Networks that learned from images of unknown cameras have no resolution.
     assert resize(whole[:, :900], dataclasses.replace(settings, pixels_per_metre=0.0), pixels_per_metre)[0].shape[1] == 844
 

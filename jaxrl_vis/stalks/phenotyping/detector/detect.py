@@ -12,6 +12,9 @@ from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, roi_align, strip_half_width, suppress
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import PADDING, STRIDE, Detector
 
+# Relative difference of resolutions up to which a camera counts as one of training, where images were reduced by exactly four:
+# with 0.988 to 1.024 times that factor, F1 on 12 images of the shifted family was 0.952 instead of 0.969.
+_SAME_CAMERA = 0.06
 GRID = (14, 7)
 """Height and width of the pooled features of a region."""
 
@@ -62,12 +65,17 @@ class Settings:
     def scale_for(self, width: int, pixels_per_metre: float | None) -> float:
         """Return the factor by which an image is resized before detection.
 
+        Cameras whose resolution is close to that of the training cameras have exactly their factor.
+
         Args:
             width: Width of the image, pixels.
             pixels_per_metre: Resolution at the row; None if the camera is unknown, which is then assumed to cover the same
                 width of the row as the training cameras.
         """
-        return self.pixels_per_metre / pixels_per_metre if pixels_per_metre and self.pixels_per_metre else self.width / width
+        if not pixels_per_metre or not self.pixels_per_metre:
+            return self.width / width
+        factor, usual = self.pixels_per_metre / pixels_per_metre, self.width / self.full_width
+        return usual if abs(factor / usual - 1.0) <= _SAME_CAMERA else factor
 
     def detector(self, dtype: Any = jnp.float32) -> Detector:
         """Return the detector of these settings, with convolutions in ``dtype``."""
