@@ -210,7 +210,11 @@ def compare(name: str, recording: Recording) -> list[Figure]:
 
 
 def _take(recording: Recording, *keys: str) -> list[np.ndarray]:
-    """Return the arrays under ``keys``, actions first, and check that their numbers and lengths of sequences agree."""
+    """Return the arrays under ``keys``: actions [N, T, ...] first, then states [N, T + 1, ...].
+
+    Raises:
+        NothingToCompareError: An array is missing or has another shape.
+    """
     missing = [key for key in keys if key not in recording]
     if missing:
         raise NothingToCompareError(f"the recording lacks {', '.join(missing)}; it holds {', '.join(recording)}")

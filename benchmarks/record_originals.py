@@ -1,4 +1,4 @@
-"""Record the original environments, for comparison by benchmarks/parity.py.
+"""Record trajectories of the original environments, for comparison by benchmarks/parity.py.
 
     python benchmarks/record_originals.py ENV FILE.npz [--sequences 24] [--seed 0] [--lower 0] [--control]
 
@@ -7,9 +7,9 @@ with the MuJoCo release of the originals: later ones treat the weld that moves F
 
     pip install gymnasium-robotics==1.4.2 dm_control==1.0.27 mujoco==3.2.7
 
-Actions alternate between three kinds: independent, held for ten steps, and autocorrelated. ``--lower`` is subtracted from the
-third component of each: .25 moves FetchReach's gripper to the table. FetchPush's actions are those of a scripted pusher that
-observes the object or, with ``--control``, of one that passes over it.
+Sequences cycle through three kinds of actions: independent, held for ten steps, and autocorrelated. ``--lower`` is subtracted
+from the third component of each: .25 moves FetchReach's gripper to the table. FetchPush's actions are those of a scripted
+pusher that observes the object or, with ``--control``, of one that passes over it.
 """
 
 import argparse

@@ -36,7 +36,7 @@ def renderer_parity(results: Path) -> str:
 
 
 def soak(results: Path) -> str | None:
-    """Write the table of docs/reliability.md from the records in ``soak``, added up; None without records."""
+    """Return the table of docs/reliability.md, summed over the records in ``soak``, as Markdown; None if there are none."""
     from benchmarks.soak.record import Record, added
 
     pieces = sorted((results / "soak").glob("*.json"))

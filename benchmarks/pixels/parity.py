@@ -20,13 +20,13 @@ ENVIRONMENTS, STEPS = 4, 20  # starts, and random actions from each to a second 
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Images of one task.
+    """Images of one task from both renderers.
 
     Attributes:
         camera: Name of the camera.
-        ours: Frames of NumPy arrays: `ENVIRONMENTS` starts, then as many after random actions.
-        theirs: The same poses by `mujoco.Renderer`.
-        tally: Differences.
+        ours: Our frames (NumPy): `ENVIRONMENTS` initial states, then the states of the same environments after random actions.
+        theirs: The same states rendered by `mujoco.Renderer`.
+        tally: Accumulated differences between the two.
     """
 
     camera: str

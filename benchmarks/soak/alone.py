@@ -1,6 +1,7 @@
-"""Faults with a run, a study or plots of their own: a non-finite number, and killed workers of pools.
+"""Faults injected into a run, study or set of plots of their own: a non-finite number, or a killed run, job or pool worker.
 
-Each is a function of an empty folder, a random generator and the results of undisturbed commands; it raises `Broken`.
+Each is a function of the folder to create, a random generator and the results of undisturbed commands. It raises `Broken` if
+the command does not handle the fault, and `NotStruck` if it finished first.
 """
 
 import dataclasses

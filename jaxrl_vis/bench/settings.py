@@ -11,7 +11,10 @@ from jaxrl_vis_envs import registry
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Settings of a benchmark. None and the empty tuple stand for device-dependent defaults.
+    """Settings of a benchmark.
+
+    If None or empty, ``envs``, ``image_size`` and ``pixels`` depend on the device, and ``preset``, ``batch_size`` and
+    ``data_devices`` are the defaults of the benchmark.
 
     Attributes:
         env: Name of the environment.
@@ -24,8 +27,8 @@ class Settings:
         devices: Number of devices.
         data_devices: Number of devices that share each learner; see `Config`.
         repeats: Maximum number of timed repeats; see `timing.measure`.
-        aux_tasks, weighting: Auxiliary losses of the gradient steps, and their weighting.
-        scene: Scene of `scenes.models`, or path of an MJCF file, to render instead of an environment.
+        aux_tasks, weighting: Auxiliary losses of the gradient steps, empty for none, and their weighting.
+        scene: Scene of `scenes.models`, or path of an MJCF file, to render instead of ``env``; None to render ``env``.
         on_accelerator: True if JAX runs on an accelerator; set by `for_this_device`.
     """
 

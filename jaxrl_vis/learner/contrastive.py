@@ -64,7 +64,12 @@ def contrastive_loss(logits: jax.Array, form: str) -> jax.Array:
 
 
 def _check(setup: Setup) -> None:
-    """Raise a RequestError for options that this algorithm ignores, and for goals that it cannot learn from."""
+    """Check that the configuration has no rewards, auxiliary losses or goals of another kind, and one device per learner.
+
+    Raises:
+        RequestError: It sets a reward or auxiliary losses, which this algorithm ignores, another sampling of goals than
+            geometric future states, or several devices per learner.
+    """
     config = setup.config
     if config.reward.method != "oracle":
         raise RequestError(f"contrastive reads no rewards: leave out --method {config.reward.method}")

@@ -23,7 +23,7 @@ def depth_colours(depth: np.ndarray, near: float, far: float) -> np.ndarray:
 
 
 def label_colours(labels: np.ndarray, geoms: int, sky: tuple[int, int, int]) -> np.ndarray:
-    """Map geom ids to colours that differ between neighbours: hues are multiples of the golden ratio.
+    """Map geom ids to colours. Hues are spaced by the golden ratio, so that consecutive ids are easy to tell apart.
 
     Args:
         labels: [H, W] int; ids below 0 and from ``geoms`` on are sky.

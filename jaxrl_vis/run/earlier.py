@@ -73,7 +73,7 @@ def is_evaluated(folder: RunFolder, seeds: Collection[int], restored: Restored) 
 
 
 def last_evaluation(restored: Restored) -> int:
-    """Return the last evaluated iteration according to a checkpoint; 0 if there is none."""
+    """Return the iteration of the last scheduled evaluation before a checkpoint; 0 if there was none, or none is recorded."""
     since = restored.progress.get("since_evaluation")
     return 0 if since is None else restored.iteration - len(since)
 

@@ -61,7 +61,7 @@ class Layout:
 
     @property
     def devices(self) -> list[Any]:
-        """Devices of this process."""
+        """Devices of this process that the run uses."""
         return jax.devices()[:1] if self.mesh is None else list(self.mesh.local_devices)
 
     @property

@@ -47,7 +47,7 @@ def card(
     name_here: str | None = None,
     remark: str = "",
 ) -> str:
-    """Return the text of the card.
+    """Return the text of the model card (README.md).
 
     Args:
         config: Configuration of the run.
@@ -56,7 +56,7 @@ def card(
         scores: Scores by seed; empty if none was evaluated at the iteration of the weights.
         unit: Unit of distances.
         pictures: Image files by caption.
-        name_here: Name of the policy in the package; None for a separate folder, with metrics.jsonl.
+        name_here: Name of the policy if it ships with the package; None if the folder stands alone and includes metrics.jsonl.
         remark: Additional sentence about the scores.
     """
     task, name = config.environment.env, f"{config.environment.env}, {config.reward.method}, {config.run.algorithm}"

@@ -1,19 +1,19 @@
-"""Tiers of orbax checkpoints: light ones often, full ones rarely, and the best one.
+"""Tiers of checkpoints: light ones often, full ones rarely, and the best one.
 
     checkpoints/light/<iteration>/   train         networks, targets, optimisers, statistics: enough for eval and play
     checkpoints/best/<iteration>/    train         as light, of the best evaluation: never resumed from, and only one is kept
     checkpoints/full/<iteration>/    train, rest   with the replay, keys and iteration: for an exact resume
-    checkpoints/recent/                            the same against a kill, where it is cheap, see `recent`
+    checkpoints/recent/                            full state in a cheaper format, for resuming after a kill; see `recent`
 
 Each checkpoint has a manifest: names, shapes, dtypes and checksums of all arrays, and the host's progress. orbax makes a folder
 appear under its final name only when it is complete; the checksums detect later damage, such as a flipped byte, which would
 otherwise be restored silently. After the background write, SHA256SUMS (`sums`) is added for `verification`, also of data that
 is never restored. The newest two light ones and the newest two full ones are kept.
 
-A run resumes from the newest valid checkpoint of all tiers; if several are equally new, from the full, the recent or the light
-one, in this order. Nothing newer is ever deleted: a damaged checkpoint is moved to checkpoints/damaged/, and one of another
-run, identified by the run's id in its manifest, to checkpoints/foreign/. One that is written again waits in
-checkpoints/replaced/ until the new one is complete.
+A run resumes from the newest valid full, recent or light checkpoint; ties are broken in this order. Checkpoints newer than the
+one resumed from are never deleted: damaged ones are moved to checkpoints/damaged/, and those of another run, identified by
+the run's id in the manifest, to checkpoints/foreign/. While a checkpoint is rewritten, the old copy is kept in
+checkpoints/replaced/.
 """
 
 import contextlib

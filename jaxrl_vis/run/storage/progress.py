@@ -13,9 +13,10 @@ class Progress:
     """Host side of a run's state.
 
     Attributes:
-        wall_s, compile_s: Time spent by earlier processes, s.
+        wall_s: Wall-clock time of earlier processes, s; a saved copy includes the process that saved it.
+        compile_s: Compilation time of all processes so far, s.
         since_evaluation: train/* and other metrics of every iteration since the last scheduled evaluation.
-        evaluation_due: True if the evaluation at the end of the iteration was prevented by a signal.
+        evaluation_due: True while the evaluation at the current iteration is still to be run, or its rows are not yet written.
         filtered: Number of consecutive evaluations with too large a fraction of filtered negatives.
         replay_lost_at: Last iteration at which the run resumed without its replay; None if it never did.
     """

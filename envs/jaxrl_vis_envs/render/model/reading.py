@@ -291,7 +291,7 @@ def planes_clear_from_behind(mj_model: mujoco.MjModel, camera_id: int, camera: C
 
 
 def transparency(alpha: np.ndarray, clear_planes: np.ndarray) -> np.ndarray:
-    """Return the transparency [N] of objects: CLEAR by alpha, CLEAR_FROM_BEHIND for ``clear_planes``, else SOLID."""
+    """Classify objects [N]: CLEAR if alpha is below `OPAQUE`, else CLEAR_FROM_BEHIND for ``clear_planes``, else SOLID."""
     return np.where(alpha < OPAQUE, CLEAR, np.where(clear_planes, CLEAR_FROM_BEHIND, SOLID))
 
 

@@ -1,6 +1,6 @@
-"""Forward and backward kernels of the encoder's first layers (`kernels.encoder`; `kernels.jvp` has a third).
+"""Forward and backward GPU kernels of the encoder's first layers, see `kernels.encoder`; the third kernel is in `kernels.jvp`.
 
-Each has an equivalent in plain JAX, as a reference and for processes without such a GPU.
+Each has an equivalent in plain JAX, as a reference and for processes without a GPU that runs the kernels.
 """
 
 import functools
@@ -30,10 +30,11 @@ _MIN_PROGRAMS = 256  # about two for each of a large GPU's processors
 
 
 class Weights(NamedTuple):
-    """Weights of the layers in the layout that the kernels multiply, float32.
+    """Weights of the first three layers, float32, in the layout that the GPU kernels read.
 
     Attributes:
-        kernels: [16 C', 4 F1] for a quarter, where C' is C padded to a power of two; [4 F1, F2]; [4 F2, F3].
+        kernels: [16 C', 4 F1], applied to each quarter of a patch; [4 F1, F2]; [4 F2, F3]. C' is the number of channels padded
+            to a power of two, and Fi the number of features of layer i.
         biases: [4 F1]; [F2]; [F3].
     """
 

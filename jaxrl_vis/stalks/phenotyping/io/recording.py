@@ -226,7 +226,11 @@ def _pixels(message: Any, source: str) -> np.ndarray:
 
 
 def _write_odometry(path: Path, kinds: dict[str, str], messages: Any) -> None:
-    """Write the robot's positions with timestamps in ns; nothing if there is no topic with finite ones."""
+    """Write the robot's finite positions with timestamps in ns.
+
+    They are read from the first Odometry topic, or else from the first NavSatFix topic (shortest name first); nothing is
+    written if neither has any.
+    """
     for kind, columns in zip(_ODOMETRY, ("x_m,y_m,z_m", "latitude,longitude")):
         topics = sorted((topic for topic, of in kinds.items() if of == kind), key=lambda topic: (len(topic), topic))
         if not topics:
