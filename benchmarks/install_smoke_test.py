@@ -30,7 +30,7 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ("01_quickstart", "02_new_environment")
 TINY = "--preset debug --env-steps 400"
 # Parts of names of inherited variables, which configure the access to registries; all others are dropped.
-_KEPT = ("PIP_", "UV_", "SSL", "CA_BUNDLE", "PROXY")
+_KEPT_VARIABLE_PARTS = ("PIP_", "UV_", "SSL", "CA_BUNDLE", "PROXY")
 _SHOWN_LINES = 4  # lines of a command's output that are shown
 
 
@@ -97,7 +97,9 @@ def new_shell(folder: Path, python: Path) -> Shell:
     for name in ("python3", python.name):
         if not (folder / "bin" / name).exists():
             (folder / "bin" / name).symlink_to(python)
-    inherited = {name: value for name, value in os.environ.items() if any(part in name.upper() for part in _KEPT)}
+    inherited = {
+        name: value for name, value in os.environ.items() if any(part in name.upper() for part in _KEPT_VARIABLE_PARTS)
+    }
     return Shell(
         folder / "work",
         {

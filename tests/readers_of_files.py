@@ -46,12 +46,14 @@ def read_calibration(folder: Path) -> None:
 
 def read_cameras(folder: Path) -> None:
     """What any program says of two cameras, rectified or not."""
-    from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair
+    from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import UnrectifiedPair
     from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import read_cameras
 
     files = list(folder.iterdir())
     found = read_cameras(files[0] if len(files) == 1 else folder)
-    arrays = (found.matrices, found.distortions, found.rotation) if isinstance(found, RawPair) else (found.left, found.right)
+    arrays = (
+        (found.matrices, found.distortions, found.rotation) if isinstance(found, UnrectifiedPair) else (found.left, found.right)
+    )
     assert all(np.isfinite(array).all() for array in arrays)
     assert found.size is None or all(type(side) is int and 1 <= side <= 100_000 for side in found.size)
 

@@ -277,7 +277,7 @@ def _choices() -> Iterator[Sentence]:
         for other in ("none", "ol_aux_5")
     }
     quote = (
-        "better than none on all three tasks. OL-AUX-5 is better on the hand and level on the other two within these budgets"
+        "better than none on all three tasks. OL-AUX-5 is better on the hand and on par on the other two within these budgets"
     )
     by_task = dict(zip(tasks, against["ol_aux_5"], strict=True))
     holds = against["none"] == ["better"] * 3 and by_task == {FETCH: "level", HAND: "worse", FINGER: "level"}
@@ -293,7 +293,7 @@ def _choices() -> Iterator[Sentence]:
     nearer = [ours[task].median(metric=DISTANCE) < oracle[task].median(metric=DISTANCE) for task in (FETCH, SAWYER)]
     near = all(abs(ours[task].median() - oracle[task].median()) < 0.05 for task in ours)
     quote = (
-        "FetchReach, the Sawyer and Reacher end about as successful as with true states, and on the first two nearer to the "
+        "FetchReach, the Sawyer and Reacher end about as successful as with true states, and on the first two closer to the "
         "goal"
     )
     yield Sentence(REWARDS, quote, ours[FETCH].name, near and all(nearer))

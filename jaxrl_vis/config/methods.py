@@ -63,7 +63,7 @@ METHODS: dict[str, Method] = {
 
 MethodName = Annotated[str, Names(tuple(METHODS))]
 # Loss weightings, grouped by their inputs (`jaxrl_vis.weighting`) and by the options that apply to them.
-MAIN_WEIGHTINGS = ("none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation")
+MAIN_LOSS_WEIGHTINGS = ("none", "none_log", "sum", "fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation")
 LOSS_WEIGHTINGS = ("uniform", "random", "uncertainty", "imtl_l", "dwa", "geometric_mean", "stch", "famo")
 GRAMIAN_WEIGHTINGS = (
     "auxinash",
@@ -86,7 +86,7 @@ EPS_WEIGHTINGS = ("fixed", "balance", "cosine", "ol_aux", "ol_aux_ablation", *GR
 LIMITED_WEIGHTINGS = ("ol_aux", "ol_aux_ablation", "gradnorm", *LOSS_WEIGHTINGS, *GRAMIAN_WEIGHTINGS)
 
 WeightingName = Annotated[
-    str, Names((*MAIN_WEIGHTINGS, *LOSS_WEIGHTINGS, "gradnorm", *GRAMIAN_WEIGHTINGS, *DIRECTION_WEIGHTINGS))
+    str, Names((*MAIN_LOSS_WEIGHTINGS, *LOSS_WEIGHTINGS, "gradnorm", *GRAMIAN_WEIGHTINGS, *DIRECTION_WEIGHTINGS))
 ]
 AuxTaskName = Annotated[str, Names(("forward_dynamics", "inverse_dynamics", "egomotion", "autoencoder", "optical_flow"))]
 ALGORITHMS = ("ddpg", "td3", "contrastive")

@@ -299,7 +299,7 @@ def test_misuse_is_refused_in_one_line():
 
 
 @pytest.mark.parametrize(
-    ("adapter", "library", "mend"),
+    ("adapter", "library", "hint"),
     [
         ("brax", "brax", "pip install brax"),
         ("brax_viewer", "brax", "pip install brax"),

@@ -211,7 +211,7 @@ def test_what_is_no_fault_of_the_disk_is_not_told_as_one(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("number", "mend", "is_moved"),
+    ("number", "hint", "is_moved"),
     [(errno.ENOSPC, "make room", False), (errno.EACCES, "fix that", False), (errno.ENOENT, "", True)],
 )
 def test_advice_after_a_fault_of_the_disk_can_be_followed(tmp_path, monkeypatch, number, hint, is_moved):

@@ -118,7 +118,7 @@ def test_a_file_that_names_no_equal_array_is_refused(same: object, package: Path
 
 
 def test_what_is_too_large_is_not_shipped(made: tuple[Path, Path], package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.ship.MOST_BYTES", 100)
+    monkeypatch.setattr("benchmarks.ship.MAX_BYTES", 100)
     with pytest.raises(RequestError, match="ship one of"):
         ship(made[0], "large", episodes=2)
     assert [path.name for path in package.iterdir()] == ["told"], "nothing is left of it"

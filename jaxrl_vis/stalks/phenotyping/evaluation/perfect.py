@@ -30,12 +30,12 @@ def perfect_detections(stalks: Iterable[Mapping[str, Any]], instance: np.ndarray
             continue
         slope, offset = np.polyfit(line + upper, column + first, 1)
         axis = (float(offset + slope * top), float(offset + slope * bottom))
-        above = _upper(np.array([left, top, right, bottom, *axis]) + 0.5, instance, stalk["stalk"])
+        above = _upper_mask(np.array([left, top, right, bottom, *axis]) + 0.5, instance, stalk["stalk"])
         detections.append(Detection((left, top, right, bottom), axis, 1.0, mask, (upper, first), above))
     return sorted(detections, key=lambda detection: sum(detection.axis))
 
 
-def _upper(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndarray, tuple[int, int]] | None:
+def _upper_mask(stalk: np.ndarray, instance: np.ndarray, index: int) -> tuple[np.ndarray, tuple[int, int]] | None:
     """Return the true mask of a stalk around the upper height, and its corner; None if that is outside the image.
 
     Args:

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Size
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import Size, UnrectifiedPair
 from jaxrl_vis.stalks.phenotyping.io.calibrations.recognise import both_sides, files_in, named_pair, read_cameras
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
@@ -44,7 +44,7 @@ def read_calibration(path: Path, unit: str | None = None, image: Path | None = N
             that unit.
     """
     cameras = read_cameras(path, image)
-    pair = cameras.if_rectified() if isinstance(cameras, RawPair) else cameras
+    pair = cameras.if_rectified() if isinstance(cameras, UnrectifiedPair) else cameras
     if pair is None:
         raise RequestError(
             f"{path} is of {cameras.program} and says how the cameras were built, not how their images were rectified: rectify "

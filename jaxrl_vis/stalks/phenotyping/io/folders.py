@@ -172,7 +172,7 @@ def _pairs(folder: Path, patterns: Patterns | None) -> tuple[PairFiles, ...]:
     files = [
         PairFiles(name, by_side.get("left"), by_side.get("right"), by_side.get("disparity")) for name, by_side in sides.items()
     ]
-    return tuple(sorted(files, key=lambda pair: _natural(pair.name)))
+    return tuple(sorted(files, key=lambda pair: _natural_sort_key(pair.name)))
 
 
 def _add_pair(sides: _Sides, name: str, side: str, path: Path) -> None:
@@ -352,6 +352,6 @@ def image_files(folder: Path, suffixes: set[str] = _IMAGES) -> list[Path]:
     return [path for path in paths if not path.name.startswith(".")]  # macOS leaves a file ._NAME beside each image
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
+def _natural_sort_key(name: str) -> list[tuple[int, int, str]]:
     """Return a key for natural sorting: 2 before 10."""
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]

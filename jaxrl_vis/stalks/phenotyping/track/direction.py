@@ -14,7 +14,7 @@ from jaxrl_vis_envs.plants import Calibration
 
 _ALONG, _DEPTH = 0.006, 0.02  # m: maximum differences of two sightings of one stalk after motion compensation
 _MIN_SHARED = 4  # minimum number of shared stalks of two pairs to be compared
-_SHARED_FRACTION = 0.75  # minimum shared fraction of the smaller pair's stalks: so many do not match by chance
+_MIN_SHARED_FRACTION = 0.75  # minimum shared fraction of the smaller pair's stalks: so many do not match by chance
 _MAX_STEP_FRACTION = 0.5  # of those: a pair contradicts the odometry if its step matches fewer
 _MIN_CONTRADICTIONS = 0.25  # minimum fraction of the comparable pairs that contradict the odometry
 _MIN_LINKED = 0.3  # minimum fraction of all sightings that are linked in reverse: fewer may be so by chance
@@ -80,7 +80,7 @@ def _is_contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
     for first, second, step in zip(frames, frames[1:], np.diff(places)):
         best, own, possible = _count_shared(_places(first), _places(second), float(step))
         compared += possible >= _MIN_SHARED
-        if best >= max(_MIN_SHARED, _SHARED_FRACTION * possible):
+        if best >= max(_MIN_SHARED, _MIN_SHARED_FRACTION * possible):
             judged += 1
             against += own < _MAX_STEP_FRACTION * best
     return against > max(judged / 2, _MIN_CONTRADICTIONS * compared)

@@ -35,7 +35,7 @@ class RectifiedPair:
 
 
 @dataclasses.dataclass(frozen=True)
-class RawPair:
+class UnrectifiedPair:
     """Two unrectified cameras, whose images must be rectified before stereo matching.
 
     Attributes:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, camera_matrix, named_size, numbers
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import UnrectifiedPair, camera_matrix, named_size, numbers
 
 _MODELS = {"radtan": False, "plumb_bob": False, "equidistant": True, "none": False}
 
@@ -16,7 +16,7 @@ def is_chain(store: dict[str, Any]) -> bool:
     return isinstance(store.get("cam0"), dict) and "intrinsics" in store["cam0"]
 
 
-def read_chain(store: dict[str, Any], path: Path) -> RawPair:
+def read_chain(store: dict[str, Any], path: Path) -> UnrectifiedPair:
     """Convert the first two cameras of a chain; lengths are in metres.
 
     Args:
@@ -52,4 +52,4 @@ def read_chain(store: dict[str, Any], path: Path) -> RawPair:
         raise RequestError(f"{path}: cam0 and cam1 differ in resolution or in distortion model: calibrate them alike")
     pose = pose.reshape(4, 4)
     both = np.stack(matrices), np.stack(distortions)
-    return RawPair(*both, fisheye[0], pose[:3, :3], pose[:3, 3], sizes[0], "m", "kalibr")
+    return UnrectifiedPair(*both, fisheye[0], pose[:3, :3], pose[:3, 3], sizes[0], "m", "kalibr")

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, RectifiedPair, Unit, named_size, numbers
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, Unit, UnrectifiedPair, named_size, numbers
 
 _MATRICES = (("M1", "M2"), ("K1", "K2"), ("cameraMatrix1", "cameraMatrix2"), ("camera_matrix_1", "camera_matrix_2"))
 _DISTORTIONS = (("D1", "D2"), ("distCoeffs1", "distCoeffs2"), ("dist_coeffs_1", "dist_coeffs_2"))
@@ -38,7 +38,7 @@ def read_projections(store: dict[str, Any], path: Path) -> RectifiedPair:
     return RectifiedPair(matrices[0], matrices[1], named_size(store, path), _unit(store, path))
 
 
-def read_raw(store: dict[str, Any], path: Path) -> RawPair | None:
+def read_raw(store: dict[str, Any], path: Path) -> UnrectifiedPair | None:
     """Return the unrectified cameras; None unless there are two camera matrices, R and T. Distortions may be missing.
 
     Args:
@@ -59,7 +59,7 @@ def read_raw(store: dict[str, Any], path: Path) -> RawPair | None:
         row[: coefficients.size] = coefficients
     both = np.stack([matrices[0], matrices[1]]).reshape(2, 3, 3)
     size, unit = named_size(store, path), _unit(store, path)
-    return RawPair(both, padded, False, rotation.reshape(3, 3), translation, size, unit, "OpenCV")
+    return UnrectifiedPair(both, padded, False, rotation.reshape(3, 3), translation, size, unit, "OpenCV")
 
 
 def _present(store: dict[str, Any], pairs: tuple[tuple[str, str], ...]) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.io.calibrations import kalibr, kitti, middlebury, opencv, realsense, ros, zed
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, RectifiedPair
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RectifiedPair, UnrectifiedPair
 from jaxrl_vis.stalks.phenotyping.io.file_storage import parse_storage
 from jaxrl_vis.stalks.phenotyping.io.images import image_size
 from jaxrl_vis.stalks.phenotyping.io.names import readable
@@ -23,7 +23,7 @@ _NO_PAIR = (
 )
 
 
-def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | RawPair:
+def read_cameras(path: Path, image: Path | None = None) -> RectifiedPair | UnrectifiedPair:
     """Read the cameras of a calibration in any supported format.
 
     Args:
@@ -70,7 +70,7 @@ def named_pair(files: list[Path]) -> Path | None:
     return zed_files[0] if zed_files else None
 
 
-def _find_in_folder(folder: Path, image: Path | None) -> RectifiedPair | RawPair:
+def _find_in_folder(folder: Path, image: Path | None) -> RectifiedPair | UnrectifiedPair:
     files = files_in(folder)
     pairs = {pair for pair in map(both_sides, files) if pair is not None}
     if len(pairs) == 1:
@@ -99,7 +99,7 @@ def both_sides(path: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _read_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> RectifiedPair | RawPair:
+def _read_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> RectifiedPair | UnrectifiedPair:
     cameras: list[dict[str, Any]] = []
     for file in pair:
         parsed = _read(file, image)
@@ -111,7 +111,7 @@ def _read_sides(pair: tuple[Path, Path], path: Path, image: Path | None) -> Rect
     return ros.read_pair(cameras, list(pair), path)
 
 
-def _read(path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
+def _read(path: Path, image: Path | None) -> RectifiedPair | UnrectifiedPair | list[dict[str, Any]]:
     """Read a file: a pair, or the contents of one or two ROS cameras.
 
     Raises:
@@ -146,7 +146,7 @@ def _read(path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict
     return _read_store(store, path, image)
 
 
-def _read_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | RawPair | list[dict[str, Any]]:
+def _read_store(store: Any, path: Path, image: Path | None) -> RectifiedPair | UnrectifiedPair | list[dict[str, Any]]:
     if isinstance(store, list):
         raise RequestError(f"{path} is not a calibration: it holds a list, not names with values such as P1 and P2")
     if not isinstance(store, dict):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import RawPair, Size, camera_matrix
+from jaxrl_vis.stalks.phenotyping.io.calibrations.cameras import Size, UnrectifiedPair, camera_matrix
 
 _SIZES: dict[str, Size] = {
     "2K": (2208, 1242),
@@ -27,7 +27,7 @@ def is_settings(text: str) -> bool:
     return "[LEFT_CAM_" in text and "[STEREO]" in text
 
 
-def read_settings(text: str, path: Path, size: Size | None) -> RawPair:
+def read_settings(text: str, path: Path, size: Size | None) -> UnrectifiedPair:
     """Parse the cameras at one image size.
 
     Args:
@@ -64,4 +64,6 @@ def read_settings(text: str, path: Path, size: Size | None) -> RawPair:
     if not all(map(math.isfinite, values)) or max(map(abs, values)) > 1e9:
         raise RequestError(f"{path} is of a ZED camera, but not all of its numbers are finite")
     rotation = cv2.Rodrigues(np.array(turns))[0]
-    return RawPair(np.stack(matrices), np.array(bent), False, rotation, np.array(shift), _SIZES[mode], "mm", "a ZED camera")
+    return UnrectifiedPair(
+        np.stack(matrices), np.array(bent), False, rotation, np.array(shift), _SIZES[mode], "mm", "a ZED camera"
+    )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 _WHOLE = re.compile(r"(?:^|[^\d.])(\d{10}|\d{13}|\d{16}|\d{19})$")  # s, ms, us, ns since 1970
 _PARTS = re.compile(r"(?:^|[^\d.])(\d{1,10}\.\d{2,9})$")
 _SPLIT = re.compile(r"(?:^|[^\d.])(\d{10})[_-](\d{9})$")  # seconds and nanoseconds, as separated by rosbag's tools
-_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
+_UNIT_BY_DIGITS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}
 
 
 def seconds_in(stem: str) -> float | None:
@@ -22,7 +22,7 @@ def seconds_in(stem: str) -> float | None:
     if parts is not None:
         return float(parts[1])
     stamp = _WHOLE.search(stem)
-    return None if stamp is None else int(stamp[1]) * _DIGITS[len(stamp[1])]
+    return None if stamp is None else int(stamp[1]) * _UNIT_BY_DIGITS[len(stamp[1])]
 
 
 def nearest(left: Mapping[str, float], right: Mapping[str, float]) -> dict[str, str]:
