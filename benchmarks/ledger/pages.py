@@ -13,6 +13,7 @@ from benchmarks.ledger import (
     host_table,
     pixels_table,
     platforms_table,
+    push_table,
     render_table,
     result_tables,
     scaling_table,
@@ -56,6 +57,7 @@ PAGES: dict[str, dict[str, Writer]] = {
     "docs/algorithms.md": {"forms": contrastive_table.forms_table},
     "docs/indicator_rewards.md": {"host": host_table.host_table},
     "docs/pixels.md": {"tasks": pixels_table.tasks_table, "training": pixels_table.training_table},
+    "docs/tasks.md": {"push on a GPU": push_table.gpu_table, "push on a CPU": push_table.cpu_table},
     "docs/where_it_ran.md": {"platforms": platforms_table.platforms_table, "not run": platforms_table.not_run_table},
     "docs/weighting.md": {
         "digits": weighting_table.digits_table,
