@@ -9,10 +9,11 @@ import pytest
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants import SHIFTED, TRAINING
 from jaxrl_vis_envs.plants.field import generator
-from jaxrl_vis_envs.plants.pairs import Sequence, daylight
+from jaxrl_vis_envs.plants.pairs import Sequence, daylight, grass
 from jaxrl_vis_envs.plants.rendering import backdrop
+from jaxrl_vis_envs.plants.rendering.blades import Blades, cover_with_blades
 from jaxrl_vis_envs.plants.rendering.degrading import degrade
-from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, OBJECT, build
+from jaxrl_vis_envs.plants.rendering.surfaces import GROUND, NOTHING, OBJECT, build
 from jaxrl_vis_envs.plants.scene import Scene
 from jaxrl_vis_envs.plants.settling import settle
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -143,6 +144,43 @@ def test_backdrops(monkeypatch):
         backdrop.draw_backdrop(np.random.default_rng(0), False, True, 1.0)
 
 
+def one_blade() -> Blades:
+    """A blade 2 m before a camera at the origin that looks along z, 20 cm tall: 100 to 50 rows below the centre."""
+    points = np.array([[[0.0, 0.4, 2.0], [0.0, 0.3, 2.0], [0.0, 0.2, 2.0]]])
+    return Blades(points, np.array([0.02]), np.array([[3.0, 2.0, 1.0]]))
+
+
+def test_a_blade_stands_where_it_projects_in_the_colour_of_its_ground():
+    radiance, depth = np.full((301, 201, 3), 0.1, np.float32), np.full((301, 201), 5.0, np.float32)
+    ground = np.full((301, 201), GROUND, np.int32)
+    for baseline in (0.0, 0.1):
+        camera = (np.array([baseline, 0.0, 0.0]), np.eye(3), 500.0, (100.0, 150.0))
+        changed = cover_with_blades(radiance, ground, depth, one_blade(), camera) != radiance
+        line, column = np.nonzero(changed.any(axis=2))
+        assert (line.min(), line.max()) == (200, 250)
+        assert np.median(column) == 100 - 500 * baseline / 2
+        assert abs(np.ptp(column[line == 250]) - 5) <= 1 and np.ptp(column[line == 205]) <= 2
+    covered = cover_with_blades(radiance, ground, depth, one_blade(), camera)
+    np.testing.assert_allclose(covered[240, 75], [0.3, 0.2, 0.1], rtol=1e-5)
+
+
+def test_a_blade_is_hidden_by_what_is_nearer():
+    radiance, depth = np.full((301, 201, 3), 0.1, np.float32), np.full((301, 201), 5.0, np.float32)
+    depth[:230] = 1.5
+    instance = np.where(depth < 2, 7, GROUND).astype(np.int32)
+    covered = cover_with_blades(radiance, instance, depth, one_blade(), (np.zeros(3), np.eye(3), 500.0, (100.0, 150.0)))
+    line, _ = np.nonzero((covered != radiance).any(axis=2))
+    assert (line.min(), line.max()) == (230, 250)
+
+
+def test_blades_grow_on_grass_by_day_only():
+    with_grass = [grass(plants.draw(by_day(grass=1.0, indoors=0), seed).family, seed) for seed in range(8)]
+    grown = [blades for blades in with_grass if blades is not None]
+    assert 3 <= len(grown) < 8 and all(len(blades.points) > 500 for blades in grown)
+    assert all(np.ptp(blades.points[:, 0, 2]) == 0 < blades.points[:, 2, 2].min() for blades in grown)
+    assert grass(plants.draw(by_day(grass=0.0), 3).family, 3) is None and grass(TRAINING, 3) is None
+
+
 @pytest.mark.parametrize("path", sorted(FAMILIES.glob("*.toml")), ids=lambda path: path.stem)
 def test_families_of_the_benchmarks_can_be_read(path):
     family = plants.read(path)
@@ -152,5 +190,7 @@ def test_families_of_the_benchmarks_can_be_read(path):
 def test_values_of_a_scene_are_checked():
     with pytest.raises(ValueError, match="scene.lens must be from 20 to 130"):
         by_day(lens=(10, 50))
+    with pytest.raises(ValueError, match="scene.pitch must be from -30 to 60"):
+        by_day(pitch=(-40, 5))
     with pytest.raises(ValueError, match="scene.jpeg must run from low to high"):
         by_day(jpeg=(90, 50))

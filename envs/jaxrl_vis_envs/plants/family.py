@@ -230,7 +230,7 @@ def _check_value(label: str, example: Any, value: Any) -> None:
         raise ValueError(f"{label} must be a range, (low, high), got {value!r}")
     ends: tuple[Any, Any] = value if isinstance(example, tuple) else (value, value)
     low, high = ends
-    if not (is_number(low) and is_number(high)) or low < 0:
+    if not (is_number(low) and is_number(high)) or (low < 0 <= _BOUNDS.get(label, (0.0,))[0]):
         raise ValueError(f"{label} must be finite and at least 0, got {value}")
     if isinstance(example, int) and not isinstance(value, numbers.Integral):
         raise ValueError(f"{label} must be a whole number, got {value}")
@@ -280,7 +280,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "rig.calibration_error": (0, 0.2),
     "rig.distance": (0.3, 5.0),
     "rig.camera_height": (0.05, 3.0),
-    "rig.pitch": (0, 60),
+    "rig.pitch": (-30, 60),
     "rig.pitch_sd": (0, 20),
     "rig.frames": (1, 10000),
     "rig.stretch": (0, 50),

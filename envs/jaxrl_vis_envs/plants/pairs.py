@@ -13,11 +13,14 @@ from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Plot, generator
 from jaxrl_vis_envs.plants.rendering import drawing, imaging, shading, tables
 from jaxrl_vis_envs.plants.rendering.backdrop import draw_backdrop
+from jaxrl_vis_envs.plants.rendering.blades import Blades, cover_with_blades, draw_blades
 from jaxrl_vis_envs.plants.rendering.degrading import degrade
 from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, Surfaces, build
 
 _FLASH = np.array([0.05, -0.10, -0.02])
 """Position of the flash in the left camera's frame, m: above the middle of the pair."""
+_MOWN = 0.25
+"""Fraction of plots with grass whose grass has no visible blades."""
 
 
 @functools.lru_cache(maxsize=2)
@@ -36,6 +39,15 @@ def daylight(family: Family, seed: int) -> shading.Day | None:
     backdrop = draw_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
     values = (sun, strength * warm, scene.sky[0] * blue, np.array(shadow), backdrop)
     return shading.Day(*(jnp.asarray(value, jnp.float32) for value in values))
+
+
+@functools.lru_cache(maxsize=2)
+def grass(family: Family, seed: int) -> Blades | None:
+    """Sample the blades of grass of a plot from its settled family; None at night, on other ground, and on mown grass."""
+    rng = generator(family, seed, "grass")
+    if family.scene.share <= 0 or family.scene.grass <= 0 or rng.random() < _MOWN:
+        return None
+    return draw_blades(rng, family.layout.plot_length, family.rig.distance)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +138,11 @@ class Sequence:
         )
         shot = shading.Shot(*(jnp.asarray(value, jnp.float32) for value in values), day=daylight(family, self.plot.seed))
         radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, settings.samples)
+        blades = grass(family, self.plot.seed)
+        if blades is not None:
+            camera = (pose.position + offset @ pose.rotation, pose.rotation, true.focal, true.centre)
+            covered = cover_with_blades(*map(np.asarray, (radiance, instance, depth)), blades, camera)
+            radiance = jnp.asarray(covered)
         gain = 2.0 * gains[frame, side]
         if shot.day is not None:
             gain *= 0.5 * family.scene.brightness[0] / max(float(radiance.mean()), 1e-4)

@@ -40,7 +40,7 @@ class Scene:
     """Height of the cameras, m."""
     lens: Range = (50.0, 110.0)
     """Horizontal field of view, degrees."""
-    pitch: Range = (0.0, 25.0)
+    pitch: Range = (-12.0, 25.0)
     """Downward pitch of the cameras, degrees."""
     yaw: Range = (0.0, 40.0)
     """Angle between the cameras' view and the direction across the row, degrees to either side."""
@@ -72,7 +72,7 @@ BOUNDS: dict[str, Range] = {
     "scene.distance": (0.3, 4.0),
     "scene.camera_height": (0.05, 3.0),
     "scene.lens": (20.0, 130.0),
-    "scene.pitch": (0.0, 60.0),
+    "scene.pitch": (-30.0, 60.0),
     "scene.yaw": (0.0, 75.0),
     "scene.roll": (0.0, 45.0),
     "scene.objects": (0.0, 100.0),
