@@ -141,8 +141,8 @@ class Sequence:
         blades = grass(family, self.plot.seed)
         if blades is not None:
             camera = (pose.position + offset @ pose.rotation, pose.rotation, true.focal, true.centre)
-            covered = cover_with_blades(*map(np.asarray, (radiance, instance, depth)), blades, camera)
-            radiance = jnp.asarray(covered)
+            arrays = np.asarray(radiance), np.asarray(instance), np.asarray(depth)
+            radiance = jnp.asarray(cover_with_blades(*arrays, blades, camera))
         gain = 2.0 * gains[frame, side]
         if shot.day is not None:
             gain *= 0.5 * family.scene.brightness[0] / max(float(radiance.mean()), 1e-4)
