@@ -70,6 +70,7 @@ class _Pool(Pool[Example]):
     def __init__(self, sources: list[Iterator[Example]], plan: Plan) -> None:
         self._plan = plan
         self.crops: list[tuple[int, int]] = []
+        self._crops_by_shape: dict[tuple[int, ...], list[tuple[int, int]]] = {}
         self._largest = (0, 0)
         super().__init__(sources, plan.images)
 
@@ -77,7 +78,9 @@ class _Pool(Pool[Example]):
         """Add an example and its stalk crops."""
         height, width = example.image.shape[:2]
         self._largest = max(self._largest[0], height), max(self._largest[1], width)
-        self.crops += [(len(self.examples), index) for index in range(len(example.crops))]
+        crops = [(len(self.examples), index) for index in range(len(example.crops))]
+        self.crops += crops
+        self._crops_by_shape.setdefault(example.crops.shape[1:3], []).extend(crops)
         super().add(example)
 
     def images(self, rng: np.random.Generator) -> Images:
@@ -91,7 +94,7 @@ class _Pool(Pool[Example]):
             return None
         # All crops of a batch have one shape, that of a randomly sampled crop.
         shape = self.examples[self.crops[rng.integers(len(self.crops))][0]].crops.shape[1:3]
-        alike = [place for place in self.crops if self.examples[place[0]].crops.shape[1:3] == shape]
+        alike = self._crops_by_shape[shape]
         chosen = [alike[place] for place in rng.integers(len(alike), size=self._plan.crops)]
         return (
             np.stack([self.examples[image].crops[place] for image, place in chosen]),
