@@ -1,10 +1,12 @@
 """Tables of docs/tasks.md: FetchPush learned from states, from the runs in ``results/push``."""
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.ledger.markers import WIDTH
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.run.storage.metrics import read_rows
 
@@ -24,7 +26,7 @@ def gpu_table(results: Path) -> str | None:
 
 
 def _table(folder: Path) -> str | None:
-    """Write at most ten evaluations of a run, with the lowest and highest success of its seeds; None without the folder."""
+    """Write at most ten evaluations of a run, with the minimum and maximum success of its seeds; None without the folder."""
     if not folder.is_dir():
         return None
     rows = [row for row in read_rows(folder / "metrics.jsonl") if SUCCESS in row]
@@ -56,9 +58,10 @@ def _row(columns: Sequence[Sequence[float]]) -> str:
 
 
 def _caption(folder: Path, seeds: Sequence[int], last: dict, reached: int | None) -> str:
-    """Say what was run, when all seeds reached 0.95 for good, and how long it took."""
+    """Write the number of seeds, revision, device and duration of a run, and when all of its seeds reached 0.95 for good."""
     record = read_record(folder)
-    count = f"{len(seeds)} seeds in one program, mean (lowest to highest)" if len(seeds) > 1 else "One seed"
+    count = f"{len(seeds)} seeds in one program, mean (minimum to maximum)" if len(seeds) > 1 else "One seed"
     milestone = "" if reached is None else f" Every seed stays at 0.95 or above from {reached:,} steps on."
     minutes = last["time/wall_s"] / 60
-    return f"{count}; {record['git_revision'][:7]} on {record['device']['name']}, {minutes:.0f} minutes in all.{milestone}"
+    text = f"{count}; {record['git_revision'][:7]} on {record['device']['name']}, {minutes:.0f} minutes in all.{milestone}"
+    return textwrap.fill(text, WIDTH)
