@@ -1,0 +1,196 @@
+"""Contacts between boxes in scalars (`partial_arithmetic`), one contact per lane: the arithmetic of `physics.box_contacts`.
+
+Each lane computes all candidates of its pair, and keeps the one that reaches farthest towards its own corner.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxrl_vis_envs.physics.scalar.boxes.box_model import CONTACTS, CORNERS, LaneContacts, Side
+from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
+from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
+from jaxrl_vis_envs.physics.scalar.partial_arithmetic import (
+    Vector,
+    add,
+    choose,
+    combine,
+    dot,
+    minus,
+    plus,
+    scale,
+    subtract,
+    times,
+)
+
+_FAR = 1.0  # distance that represents no contact, m
+_NONE = -1e30  # reach of a candidate outside of the overlap
+
+
+class _Box(NamedTuple):
+    """Position, axes (three vectors) and half-size of a box in the world."""
+
+    position: Vector
+    axes: tuple[Vector, Vector, Vector]
+    half_size: Vector
+
+
+class _Candidate(NamedTuple):
+    """Point of the other face, in its half edges, and True if it lies in the overlap of the faces."""
+
+    x: Any
+    y: Any
+    is_inside: Any
+
+
+def contact_points(contacts: LaneContacts, frames: LinkFrames) -> ContactPoint:
+    """Return the contacts of all lanes; normals point from the first box to the second."""
+    one, other = (_place(side, frames) for side in contacts.sides)
+    reference, other, is_first = _reference_first(one, other)
+    offset = _into(reference.axes, subtract(other.position, reference.position))
+    other = _nearest_face_last(reference, other)
+    columns = [_into(reference.axes, axis) for axis in other.axes]
+    side = jnp.where(offset[2] >= 0, 1.0, -1.0)
+    towards = jnp.where(columns[2][2] >= 0, 1.0, -1.0)
+    centre = subtract(offset, scale(columns[2], side * towards * other.half_size[2]))
+    edges = scale(columns[0], other.half_size[0]), scale(columns[1], other.half_size[1])
+    x, y, exists = _farthest(contacts, _candidates(centre, edges, reference.half_size))
+    point = add(centre, scale(edges[0], x), scale(edges[1], y))
+    distance = minus(side * point[2], reference.half_size[2])
+    point = point[0], point[1], point[2] - 0.5 * side * distance
+    normal = scale(reference.axes[2], jnp.where(is_first, side, -side))
+    position = add(reference.position, combine(reference.axes, point))
+    return ContactPoint(jnp.where(exists, distance, _FAR), position, normal)
+
+
+def _place(side: Side, frames: LinkFrames) -> _Box:
+    """Return the box of a side in each lane."""
+    position, axes = side.position, list(side.axes)
+    for is_here, frame in side.moving:
+        place = frames.point(frame.link, frame.position)
+        turned = [frames.direction(frame.link, frame.rotation[:, axis]) for axis in range(3)]
+        condition = is_here > 0.5 if not isinstance(is_here, float) else is_here == 1.0
+        position = tuple(choose(condition, *pair) for pair in zip(place, position, strict=True))
+        axes = [
+            tuple(choose(condition, *pair) for pair in zip(new, old, strict=True)) for new, old in zip(turned, axes, strict=True)
+        ]
+    return _Box(position, tuple(axes), side.half_size)  # type: ignore[arg-type] - of three
+
+
+def _into(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
+    """Express a vector in the frame with these axes."""
+    return dot(axes[0], vector), dot(axes[1], vector), dot(axes[2], vector)
+
+
+def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
+    """Order two boxes, and turn the axes of the first so that its face farthest from the other is across the last axis.
+
+    Returns:
+        The boxes in order, and True where the order is the given one.
+    """
+    offset = subtract(other.position, one.position)
+    turn = [[dot(axis, across) for across in other.axes] for axis in one.axes]
+    best, face = None, None
+    for number in range(6):
+        box, axis = (one, number) if number < 3 else (other, number - 3)
+        extents = [times(_abs(turn[axis][k] if number < 3 else turn[k][axis]), (other, one)[number // 3].half_size[k]) for k in range(3)]
+        apart = minus(minus(_abs(dot(box.axes[axis], offset)), box.half_size[axis]), plus(*extents))
+        if best is None:
+            best, face = apart, 0.0 * apart
+        else:
+            is_farther = apart > best
+            best, face = jnp.where(is_farther, apart, best), jnp.where(is_farther, float(number), face)
+    is_first = face < 3.0
+    axis = jnp.where(is_first, face, face - 3.0)
+    pairs = [(_choose_box(is_first, one, other)), (_choose_box(is_first, other, one))]
+    return _turn_axes(pairs[0], axis), pairs[1], is_first
+
+
+def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
+    """Turn the axes of the other box so that its face nearest to the reference is across the last axis."""
+    best, axis = None, None
+    for number in range(3):
+        along = _abs(dot(reference.axes[2], other.axes[number]))
+        if best is None:
+            best, axis = along, 0.0 * along
+        else:
+            is_nearer = along > best
+            best, axis = jnp.where(is_nearer, along, best), jnp.where(is_nearer, float(number), axis)
+    return _turn_axes(other, axis)
+
+
+def _choose_box(condition: Any, one: _Box, other: _Box) -> _Box:
+    def pick(left: Any, right: Any) -> Any:
+        if isinstance(left, tuple):
+            return tuple(pick(a, b) for a, b in zip(left, right, strict=True))
+        same = isinstance(left, float) and isinstance(right, float) and left == right
+        return left if same else choose(condition, left, right)
+
+    return _Box(*pick(tuple(one), tuple(other)))
+
+
+def _turn_axes(box: _Box, axis: Any) -> _Box:
+    """Permute the axes of a box cyclically, so that ``axis`` is the last."""
+    is_zero, is_one = axis < 0.5, (axis > 0.5) & (axis < 1.5)
+
+    def pick(parts: tuple[Any, ...], place: int) -> Any:
+        return jnp.where(is_zero, parts[(place + 1) % 3], jnp.where(is_one, parts[(place + 2) % 3], parts[place]))
+
+    axes = [tuple(pick(tuple(own[part] for own in box.axes), place) for part in range(3)) for place in range(3)]
+    return _Box(box.position, tuple(axes), tuple(pick(box.half_size, place) for place in range(3)))  # type: ignore[arg-type]
+
+
+def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector) -> list[_Candidate]:
+    """Return 24 points: the corners of the other face, those of the reference, and the crossings of their edges."""
+    (a, c, _), (b, d, _) = edges
+    inverse = 1.0 / (a * d - b * c)
+    places: list[tuple[Any, Any]] = list(CORNERS)
+    for x, y in CORNERS:
+        gap = minus(times(x, half_size[0]), centre[0]), minus(times(y, half_size[1]), centre[1])
+        places.append(((d * gap[0] - b * gap[1]) * inverse, (a * gap[1] - c * gap[0]) * inverse))
+    for edge in range(2):
+        for axis in range(2):
+            slope = edges[edge][axis]
+            is_along = slope == 0
+            inverse = 1.0 / jnp.where(is_along, 1.0, slope)
+            for end, sign in CORNERS:
+                rest = sign * half_size[axis] - centre[axis] - end * edges[1 - edge][axis]
+                place = jnp.where(is_along, 2.0, rest * inverse)
+                places.append((place, end) if edge == 0 else (end, place))
+    found = []
+    for x, y in places:
+        # Crossings and corners lie on the edges up to rounding.
+        inside = [_abs(part) <= 1.0 + 1e-5 for part in (x, y) if not isinstance(part, float)]
+        for axis in range(2):
+            point = plus(centre[axis], times(edges[0][axis], x), times(edges[1][axis], y))
+            inside.append(_abs(point) <= half_size[axis] + 1e-7)
+        is_inside = inside[0]
+        for more in inside[1:]:
+            is_inside = is_inside & more
+        found.append(_Candidate(x, y, is_inside))
+    return found
+
+
+def _farthest(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
+    """Return the candidate that reaches farthest towards each lane's corner, and if it is one that no corner before has."""
+    like = 0.0 * (candidates[4].x + contacts.number)
+    own, place_x, place_y, index = like + _NONE, like, like, like
+    reaches, chosen = [like + _NONE] * (CONTACTS - 1), [like] * (CONTACTS - 1)
+    for number, (x, y, is_inside) in enumerate(candidates):
+        reach = jnp.where(is_inside, plus(times(contacts.corner[0], x), times(contacts.corner[1], y)), _NONE)
+        is_farther = reach > own
+        own, index = jnp.where(is_farther, reach, own), jnp.where(is_farther, float(number), index)
+        place_x, place_y = jnp.where(is_farther, x, place_x), jnp.where(is_farther, y, place_y)
+        for corner, (along, across) in enumerate(CORNERS[: CONTACTS - 1]):
+            reach = jnp.where(is_inside, plus(times(along, x), times(across, y)), _NONE)
+            is_farther = reach > reaches[corner]
+            reaches[corner] = jnp.where(is_farther, reach, reaches[corner])
+            chosen[corner] = jnp.where(is_farther, float(number), chosen[corner])
+    exists = own > _NONE
+    for corner, other in enumerate(chosen):
+        exists = exists & ((other != index) | (contacts.number <= corner))
+    return place_x, place_y, exists
+
+
+def _abs(number: Any) -> Any:
+    return abs(number) if isinstance(number, float) else jnp.abs(number)
