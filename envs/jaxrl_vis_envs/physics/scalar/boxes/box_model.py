@@ -186,7 +186,7 @@ def _as_rows(part: Any, table: list[np.ndarray]) -> Any:
 
 def _free_body(model: mjx.Model, tree: ScalarModel) -> FreeBody:
     body = int(model.jnt_bodyid[-1])
-    mass, inertia = float(model.body_mass[body]), floats(np.asarray(model.body_inertia)[body])
+    mass, inertia = float(np.asarray(model.body_mass)[body]), floats(np.asarray(model.body_inertia)[body])
     armature = np.asarray(model.dof_armature)[-FREE_JOINTS:]
     return FreeBody(
         mass=floats(np.array([mass] * 3 + list(inertia)) + armature),
