@@ -101,7 +101,7 @@ def warp_kernel(
         compute: Function from ``constants``, an episode's inputs and the rows of ``table`` to the episode's outputs; scalars are
             [32] float32, one per lane. Inputs are the same in all lanes, and outputs have to be.
         constants: Constants of the kernel.
-        table: [R, 32] float32, a number per lane in each row.
+        table: [R, 32], a number per lane in each row.
         outputs: Number of outputs.
         interpret: Run the kernel without a GPU, slowly.
 

@@ -67,7 +67,7 @@ def simulate_arrays(
         return [jnp.broadcast_to(number, (LANES,)) for number in numbers]
 
     start, poses = JointState(*map(spread, state)), [] if mocap is None else spread(mocap.reshape(-1))
-    table = list(jnp.asarray(model.table))
+    table = list(jnp.asarray(model.table, jnp.float32))
     end = box_steps.simulate(model, table, start, spread(control), spread(applied), timestep, count, poses)
     return JointState(*(jnp.stack([number[0] for number in part]) for part in end))
 

@@ -104,7 +104,7 @@ class BoxModel(NamedTuple):
         body: The free body.
         free_index: Index of its link, as that of a mocap body (`links.mocap_link`).
         contacts: Contacts, with `LaneRow` for the numbers that vary.
-        table: [R, 32] float32, these numbers.
+        table: [R, 32] float64, these numbers.
         coupled: Pairs (row, column) of degrees of freedom, row >= column, that move the boxes of a common pair.
     """
 
@@ -154,7 +154,7 @@ def build_box_model(model: mjx.Model) -> BoxModel:
     coupled = [(row, column) for row in joints for column in range(row + 1)]
     coupled = [(row, column) for row, column in coupled if np.any(lanes.signs[row] * lanes.signs[column])]
     numbers = _as_rows(lanes, table)
-    return BoxModel(tree, _free_body(model, tree), model.nmocap, numbers, np.array(table, np.float32), tuple(coupled))
+    return BoxModel(tree, _free_body(model, tree), model.nmocap, numbers, np.array(table), tuple(coupled))
 
 
 def with_rows(part: Any, rows: list[Any]) -> Any:
@@ -170,13 +170,12 @@ def with_rows(part: Any, rows: list[Any]) -> Any:
 def _as_rows(part: Any, table: list[np.ndarray]) -> Any:
     """Replace arrays [32] by a number, if all elements are the same, or by a `LaneRow`; extend ``table`` by new rows."""
     if isinstance(part, np.ndarray):
-        row = part.astype(np.float32)
         if np.all(part == part[0]):
             return float(part[0])
         for index, other in enumerate(table):
-            if np.array_equal(row, other):
+            if np.array_equal(part, other):
                 return LaneRow(index)
-        table.append(row)
+        table.append(part)
         return LaneRow(len(table) - 1)
     if not isinstance(part, tuple) or isinstance(part, FixedFrame):
         return part
