@@ -58,8 +58,8 @@ def lanes_of_numpy() -> Iterator[None]:
     with arithmetic_of(np), pytest.MonkeyPatch.context() as patch:
         for module in (box_faces, lane_newton, lane_rows, box_steps):
             patch.setattr(module, "jnp", np)
-        for module in (lane_newton, box_steps):
-            patch.setattr(module, "jax", SimpleNamespace(lax=lax))
+        for module in (lane_newton, lane_rows, box_steps):
+            patch.setattr(module, "jax", SimpleNamespace(lax=lax, tree=jax.tree))
         for module in (dynamics, box_steps):
             patch.setattr(module, "sine_and_cosine", lambda angle: (np.sin(angle), np.cos(angle)))
         yield
@@ -133,9 +133,8 @@ def test_a_step_of_the_push():
     drawn = visited._asdict()
     drawn["mocap"] = np.concatenate([visited.mocap_pos[:, 0], visited.mocap_quat[:, 0]], axis=1)
     error = np.abs(step_of(env.mj_model, drawn).velocity - theirs.qvel).max(axis=1)
-    print(np.sort(error)[[10,60,120,180,200,210,220,230,239]], theirs.contacts.mean())
     assert (theirs.contacts >= 8).sum() > 30
-    assert np.median(error) < 1e-6 and (error < 1e-5).mean() > 0.85
+    assert (error < 1e-9).mean() > 0.85
 
 
 def lowered_push(exact: bool | None) -> str:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxrl_vis_envs.physics.scalar.boxes.box_model import CONTACTS, CORNERS, LaneContacts, Side
 from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
 from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
+from jaxrl_vis_envs.physics.scalar.links import FixedFrame
 from jaxrl_vis_envs.physics.scalar.partial_arithmetic import (
     Vector,
     add,
@@ -43,9 +44,26 @@ class _Candidate(NamedTuple):
     is_inside: Any
 
 
-def contact_points(contacts: LaneContacts, frames: LinkFrames) -> ContactPoint:
-    """Return the contacts of all lanes; normals point from the first box to the second."""
-    one, other = (_place(side, frames) for side in contacts.sides)
+class Place(NamedTuple):
+    """Position and axes (three vectors) of a box in the world."""
+
+    position: Vector
+    axes: tuple[Vector, Vector, Vector]
+
+
+def places(contacts: LaneContacts, frames: LinkFrames) -> list[list[Place]]:
+    """Return the places of the boxes that move, for each side."""
+    return [[_place(frame, frames) for _, frame in side.moving] for side in contacts.sides]
+
+
+def _place(frame: FixedFrame, frames: LinkFrames) -> Place:
+    x, y, z = (frames.direction(frame.link, frame.rotation[:, axis]) for axis in range(3))
+    return Place(frames.point(frame.link, frame.position), (x, y, z))
+
+
+def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> ContactPoint:
+    """Return the contacts of all lanes, from the result of `places`; normals point from the first box to the second."""
+    one, other = (_box(side, moving) for side, moving in zip(contacts.sides, places, strict=True))
     reference, other, is_first = _reference_first(one, other)
     offset = _into(reference.axes, subtract(other.position, reference.position))
     other = _nearest_face_last(reference, other)
@@ -63,18 +81,13 @@ def contact_points(contacts: LaneContacts, frames: LinkFrames) -> ContactPoint:
     return ContactPoint(jnp.where(exists, distance, _FAR), position, normal)
 
 
-def _place(side: Side, frames: LinkFrames) -> _Box:
+def _box(side: Side, moving: list[Place]) -> _Box:
     """Return the box of a side in each lane."""
-    position, axes = side.position, list(side.axes)
-    for is_here, frame in side.moving:
-        place = frames.point(frame.link, frame.position)
-        turned = [frames.direction(frame.link, frame.rotation[:, axis]) for axis in range(3)]
-        condition = is_here > 0.5 if not isinstance(is_here, float) else is_here == 1.0
-        position = tuple(choose(condition, *pair) for pair in zip(place, position, strict=True))
-        axes = [
-            tuple(choose(condition, *pair) for pair in zip(new, old, strict=True)) for new, old in zip(turned, axes, strict=True)
-        ]
-    return _Box(position, tuple(axes), side.half_size)  # type: ignore[arg-type] - of three
+    place = Place(side.position, side.axes)  # type: ignore[arg-type] - of three
+    for (is_here, _), other in zip(side.moving, moving, strict=True):
+        condition = is_here == 1.0 if isinstance(is_here, float) else is_here > 0.5
+        place = _choose_parts(condition, other, place)
+    return _Box(*place, side.half_size)  # type: ignore[arg-type] - of three
 
 
 def _into(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
@@ -102,8 +115,7 @@ def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
             best, face = jnp.where(is_farther, apart, best), jnp.where(is_farther, float(number), face)
     is_first = face < 3.0
     axis = jnp.where(is_first, face, face - 3.0)
-    pairs = [(_choose_box(is_first, one, other)), (_choose_box(is_first, other, one))]
-    return _turn_axes(pairs[0], axis), pairs[1], is_first
+    return _turn_axes(_choose_parts(is_first, one, other), axis), _choose_parts(is_first, other, one), is_first
 
 
 def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
@@ -119,14 +131,13 @@ def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
     return _turn_axes(other, axis)
 
 
-def _choose_box(condition: Any, one: _Box, other: _Box) -> _Box:
-    def pick(left: Any, right: Any) -> Any:
-        if isinstance(left, tuple):
-            return tuple(pick(a, b) for a, b in zip(left, right, strict=True))
-        same = isinstance(left, float) and isinstance(right, float) and left == right
-        return left if same else choose(condition, left, right)
-
-    return _Box(*pick(tuple(one), tuple(other)))
+def _choose_parts(condition: Any, one: Any, other: Any) -> Any:
+    """Select between two tuples of the same structure, part by part."""
+    if isinstance(one, tuple):
+        parts = [_choose_parts(condition, *pair) for pair in zip(one, other, strict=True)]
+        return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
+    is_same = isinstance(one, float) and isinstance(other, float) and one == other
+    return one if is_same else choose(condition, one, other)
 
 
 def _turn_axes(box: _Box, axis: Any) -> _Box:
