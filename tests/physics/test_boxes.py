@@ -17,7 +17,7 @@ from jaxrl_vis_envs.compiling.compilation import KERNELS_VARIABLE, kernels, trac
 from jaxrl_vis_envs.physics import mjx_model, scalar
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.physics.scalar import dynamics, triton_scalars
-from jaxrl_vis_envs.physics.scalar.boxes import box_faces, box_kernel, box_model, box_steps, lane_newton, lane_rows
+from jaxrl_vis_envs.physics.scalar.boxes import box_faces, box_kernel, box_model, box_steps, lane_newton, lane_rows, own_block
 from jaxrl_vis_envs.physics.scalar.boxes.box_model import LANES
 from jaxrl_vis_envs.physics.scalar.steps import JointState
 
@@ -58,7 +58,7 @@ def lanes_of_numpy() -> Iterator[None]:
     with arithmetic_of(np), pytest.MonkeyPatch.context() as patch:
         for module in (box_faces, lane_newton, lane_rows, box_steps):
             patch.setattr(module, "jnp", np)
-        for module in (lane_newton, lane_rows, box_steps):
+        for module in (lane_newton, own_block, box_steps):
             patch.setattr(module, "jax", SimpleNamespace(lax=lax, tree=jax.tree))
         for module in (dynamics, box_steps):
             patch.setattr(module, "sine_and_cosine", lambda angle: (np.sin(angle), np.cos(angle)))

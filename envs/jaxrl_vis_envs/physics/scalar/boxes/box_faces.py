@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxrl_vis_envs.physics.scalar.boxes.box_model import CONTACTS, CORNERS, LaneContacts, Side
+from jaxrl_vis_envs.physics.scalar.boxes.own_block import in_own_block
 from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
 from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
 from jaxrl_vis_envs.physics.scalar.links import FixedFrame
@@ -72,13 +73,16 @@ def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> Contact
     towards = jnp.where(columns[2][2] >= 0, 1.0, -1.0)
     centre = subtract(offset, scale(columns[2], side * towards * other.half_size[2]))
     edges = scale(columns[0], other.half_size[0]), scale(columns[1], other.half_size[1])
-    x, y, exists = _farthest(contacts, _candidates(centre, edges, reference.half_size))
+    zero = 0.0 * centre[0]
+    x, y, exists = in_own_block(
+        lambda face: _farthest(contacts, _candidates(*face)), (centre, edges, reference.half_size), (zero, zero, zero)
+    )
     point = add(centre, scale(edges[0], x), scale(edges[1], y))
     distance = minus(side * point[2], reference.half_size[2])
     point = point[0], point[1], point[2] - 0.5 * side * distance
     normal = scale(reference.axes[2], jnp.where(is_first, side, -side))
     position = add(reference.position, combine(reference.axes, point))
-    return ContactPoint(jnp.where(exists, distance, _FAR), position, normal)
+    return ContactPoint(jnp.where(exists > 0.5, distance, _FAR), position, normal)
 
 
 def _box(side: Side, moving: list[Place]) -> _Box:
@@ -183,7 +187,7 @@ def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector)
 
 
 def _farthest(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
-    """Return the candidate that reaches farthest towards each lane's corner, and if it is one that no corner before has."""
+    """Return the candidate that reaches farthest towards each lane's corner, and 1 if no corner before has it, else 0."""
     like = 0.0 * (candidates[4].x + contacts.number)
     own, place_x, place_y, index = like + _NONE, like, like, like
     reaches, chosen = [like + _NONE] * (CONTACTS - 1), [like] * (CONTACTS - 1)
@@ -200,7 +204,7 @@ def _farthest(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any
     exists = own > _NONE
     for corner, other in enumerate(chosen):
         exists = exists & ((other != index) | (contacts.number <= corner))
-    return place_x, place_y, exists
+    return place_x, place_y, jnp.where(exists, 1.0, 0.0)
 
 
 def _abs(number: Any) -> Any:

@@ -1,14 +1,13 @@
 """Jacobians, stiffness and reference accelerations of contacts in lanes (`box_model`)."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from jaxrl_vis_envs.physics.scalar import contacts as contact_frames
 from jaxrl_vis_envs.physics.scalar.boxes import box_faces
 from jaxrl_vis_envs.physics.scalar.boxes.box_model import FREE_JOINTS, BoxModel, LaneContacts
+from jaxrl_vis_envs.physics.scalar.boxes.own_block import in_own_block
 from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
 from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
 from jaxrl_vis_envs.physics.scalar.partial_arithmetic import (
@@ -52,8 +51,11 @@ def contact_rows(model: BoxModel, contacts: LaneContacts, frames: LinkFrames, ve
         velocity: Velocities of all degrees of freedom.
         free: Link of the free body.
     """
-    point = _in_own_block(
-        lambda places: box_faces.contact_points(contacts, places), box_faces.places(contacts, frames), 0.0 * velocity[0]
+    zero = 0.0 * velocity[0]
+    point = in_own_block(
+        lambda places: box_faces.contact_points(contacts, places),
+        box_faces.places(contacts, frames),
+        ContactPoint(zero, (zero,) * 3, (zero,) * 3),
     )
     directions = contact_frames.contact_axes(point.normal)
     jacobian = _tree_jacobian(model, contacts, frames, point, directions)
@@ -71,19 +73,6 @@ def contact_rows(model: BoxModel, contacts: LaneContacts, frames: LinkFrames, ve
     offset = [times(damping, speed) for speed in components(jacobian, velocity)]
     offset[0] = plus(offset[0], times(spring, impedance, violation))
     return LaneRows(jacobian, offset, stiffness, times(stiffness, contacts.has_torsion))
-
-
-def _in_own_block(find: Callable[[Any], ContactPoint], inputs: Any, zero: Any) -> ContactPoint:
-    """Call a function in a loop of one turn, which is no longer there in machine code; ``zero`` is 0 in all lanes.
-
-    For each selection, Triton visits all operations that the selection depends on, up to the arguments of a block. The hundreds
-    of selections among candidates here would have it visit the whole step as often, which took two thirds of the time to
-    compile the kernel.
-    """
-    no_inputs = jax.tree.map(lambda _: zero, inputs)  # arguments that a loop does not change would not remain its arguments
-    nowhere = ContactPoint(zero, (zero,) * 3, (zero,) * 3)
-    state = 0, jax.tree.map(lambda number: zero + number, inputs), nowhere
-    return jax.lax.while_loop(lambda state: state[0] < 1, lambda state: (state[0] + 1, no_inputs, find(state[1])), state)[2]
 
 
 def components(jacobian: list[tuple[Any, Any, Any, Any]], column: Column) -> Column:
