@@ -2,10 +2,10 @@
 
     python -m benchmarks.profiling.launches [TASK ...] [--environments 64]
 
-A control step is compiled for a CPU with the MJX engine, one physics step after the other, and its fused operations are counted:
-those of a loop as often as it turns. On a GPU some are fused or split differently, but each remaining one is a launch, which takes
-2 to 3 us however little it computes. Where the scalar engine has a kernel for the task (`physics.scalar`), all physics steps
-become one launch, and only those outside of the loop over them remain.
+A control step is compiled for a CPU with the MJX engine, one physics step after the other, and its operations are counted after
+fusion: those of a loop as often as it turns. A GPU fuses some differently, but each of the rest is a launch, however little it
+computes. Where the scalar engine has a kernel for the task (`physics.scalar`), all physics steps become one launch, and only
+the operations outside of the loop over them remain.
 """
 
 import argparse
@@ -34,8 +34,8 @@ def count_launches(program: str) -> tuple[Counts, Counts, int]:
     """Count the operations of an optimized HLO program by kind.
 
     Returns:
-        Operations outside of the loop with the most operations in all, those of one turn of that loop, and its turns. Operations
-        of other loops count as often as these turn; those whose turns depend on data count as one turn and as "open loop".
+        Operations outside of the loop with the most operations, those of one turn of that loop, and its turns. Operations of
+        other loops count as often as these turn; loops whose turns depend on data count as one turn and as "open loop".
     """
     computations: dict[str, list[str]] = {}
     entry = name = ""

@@ -189,7 +189,10 @@ REFUSED = {
     "other exponent": ('solref=".03 .8"', 'solimp=".9 .95 .001 .5 3"'),
     "sphere": ('<geom name="finger" size=".012 .01 .008"/>', '<geom name="finger" type="sphere" size=".01"/>'),
     "centre of mass": ('<geom name="box" size=".03 .02 .025"/>', '<geom name="box" pos=".01 0 0" size=".03 .02 .025"/>'),
-    "child": ('<geom name="box" size=".03 .02 .025"/>', '<geom name="box" size=".03 .02 .025"/><body><geom size=".1 .1 .1"/></body>'),
+    "child": (
+        '<geom name="box" size=".03 .02 .025"/>',
+        '<geom name="box" size=".03 .02 .025"/><body><geom size=".1 .1 .1"/></body>',
+    ),
     "joint after it": ("</worldbody>", '<body><joint axis="0 1 0"/><geom size=".1 .1 .1"/></body></worldbody>'),
     "sensor": ("</mujoco>", '<sensor><jointpos joint="swing"/></sensor></mujoco>'),
     "dry friction": ('armature=".01"', 'armature=".01" frictionloss=".1"'),

@@ -1,4 +1,4 @@
-"""The scalar engine: a subset of MuJoCo's physics written out in scalars, for GPUs with one thread or, for boxes, one warp per episode.
+"""The scalar engine: a subset of MuJoCo's physics written out in scalars, for GPUs with a thread or warp per episode.
 
     supports    checks if a model lies in the subset
     simulate    takes physics steps: on NVIDIA GPUs all of them in one kernel, elsewhere in plain JAX

@@ -273,7 +273,9 @@ def build_scalar_model(model: mjx.Model) -> ScalarModel:
         rest=floats(np.asarray(model.qpos0)[:joints]),
         armature=floats(np.asarray(model.dof_armature)[:joints]),
         damping=floats(np.asarray(model.dof_damping)[:joints]),
-        springs=tuple(zip(floats(np.asarray(model.jnt_stiffness)[:joints]), floats(np.asarray(model.qpos_spring)[:joints]), strict=True)),
+        springs=tuple(
+            zip(floats(np.asarray(model.jnt_stiffness)[:joints]), floats(np.asarray(model.qpos_spring)[:joints]), strict=True)
+        ),
         tendon_masses=tuple((joints, float(mass)) for joints, mass in zip(tendons, armature, strict=True)),
         gravity=np.asarray(model.opt.gravity, np.float64) * has_gravity,
         actuators=tuple(_actuator(model, index) for index in range(model.nu)),

@@ -1,5 +1,7 @@
 """One scalar per thread in Pallas kernels (Triton) of thousands of operations: loads, stores and the launch.
 
+Episodes have a thread each (`episode_kernel`) or a warp (`warp_kernel`).
+
 Triton analyses the whole program once for each load and store to distribute it over the threads of a block, so a kernel with
 500 loads takes minutes to compile. Here each thread loads and stores its own scalars by inline PTX, which Triton does not
 analyse. This needs a primitive that Pallas lacks and that is added here: the address of an array.
@@ -98,8 +100,8 @@ def warp_kernel(
 
     Args:
         name: Name of the kernel.
-        compute: Function from ``constants``, an episode's inputs and the rows of ``table`` to the episode's outputs; scalars are
-            [32] float32, one per lane. Inputs are the same in all lanes, and outputs have to be.
+        compute: Function from ``constants``, an episode's inputs and the rows of ``table`` to its outputs; scalars are [32]
+            float32, one per lane. Inputs are the same in all lanes, and outputs have to be.
         constants: Constants of the kernel.
         table: [R, 32], a number per lane in each row.
         outputs: Number of outputs.
@@ -127,7 +129,14 @@ def warp_kernel(
 
 @functools.lru_cache(maxsize=16)
 def _trace_warp_kernel(
-    name: str, compute: Compute, constants: Hashable, rows: int, outputs: int, interpret: bool, shape: tuple[int, int], mesh: Any
+    name: str,
+    compute: Compute,
+    constants: Hashable,
+    rows: int,
+    outputs: int,
+    interpret: bool,
+    shape: tuple[int, int],
+    mesh: Any,
 ) -> Callable[..., list[jax.Array]]:
     """Trace the kernel for inputs of a ``shape`` [B, I]; see `_trace_kernel`."""
     del mesh
@@ -144,7 +153,14 @@ def _trace_warp_kernel(
 
 
 def _warp_kernel(
-    inputs: Any, table: Any, results: Any, done: Any, *, compute: Callable[..., Iterable[Any]], constants: Hashable, interpret: bool
+    inputs: Any,
+    table: Any,
+    results: Any,
+    done: Any,
+    *,
+    compute: Callable[..., Iterable[Any]],
+    constants: Hashable,
+    interpret: bool,
 ) -> None:
     program = pl.program_id(0)
     if interpret:

@@ -3,6 +3,7 @@
 Scalars of the episode are the same in all lanes, so that the rest of the scalar engine serves here, too. From the bottom:
 
     box_model      constants of a model, and the models that are supported
+    own_block      parts of the kernel that compile faster apart
     box_faces      contacts of boxes, one per lane
     lane_rows      Jacobians, stiffness and reference accelerations of the contacts
     lane_newton    Newton's method, with sums over the lanes

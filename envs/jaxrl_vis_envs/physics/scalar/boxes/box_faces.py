@@ -106,17 +106,13 @@ def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
         The boxes in order, and True where the order is the given one.
     """
     offset = subtract(other.position, one.position)
-    turn = [[dot(axis, across) for across in other.axes] for axis in one.axes]
-    best, face = None, None
-    for number in range(6):
-        box, axis = (one, number) if number < 3 else (other, number - 3)
-        extents = [times(_abs(turn[axis][k] if number < 3 else turn[k][axis]), (other, one)[number // 3].half_size[k]) for k in range(3)]
-        apart = minus(minus(_abs(dot(box.axes[axis], offset)), box.half_size[axis]), plus(*extents))
-        if best is None:
-            best, face = apart, 0.0 * apart
-        else:
-            is_farther = apart > best
-            best, face = jnp.where(is_farther, apart, best), jnp.where(is_farther, float(number), face)
+    turn = [[_abs(dot(axis, across)) for across in other.axes] for axis in one.axes]
+    gaps = []
+    for box, opposite, rows in ((one, other, turn), (other, one, list(zip(*turn, strict=True)))):
+        for axis, extent, row in zip(box.axes, box.half_size, rows, strict=True):
+            reach = plus(*(times(*pair) for pair in zip(row, opposite.half_size, strict=True)))
+            gaps.append(minus(minus(_abs(dot(axis, offset)), extent), reach))
+    face = _greatest(gaps)
     is_first = face < 3.0
     axis = jnp.where(is_first, face, face - 3.0)
     return _turn_axes(_choose_parts(is_first, one, other), axis), _choose_parts(is_first, other, one), is_first
@@ -124,15 +120,16 @@ def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
 
 def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
     """Turn the axes of the other box so that its face nearest to the reference is across the last axis."""
-    best, axis = None, None
-    for number in range(3):
-        along = _abs(dot(reference.axes[2], other.axes[number]))
-        if best is None:
-            best, axis = along, 0.0 * along
-        else:
-            is_nearer = along > best
-            best, axis = jnp.where(is_nearer, along, best), jnp.where(is_nearer, float(number), axis)
-    return _turn_axes(other, axis)
+    return _turn_axes(other, _greatest([_abs(dot(reference.axes[2], axis)) for axis in other.axes]))
+
+
+def _greatest(numbers: list[Any]) -> Any:
+    """Return the index of the first of the greatest numbers, as float32."""
+    best, index = numbers[0], 0.0 * numbers[0]
+    for place, number in enumerate(numbers[1:], start=1):
+        is_greater = number > best
+        best, index = jnp.where(is_greater, number, best), jnp.where(is_greater, float(place), index)
+    return index
 
 
 def _choose_parts(condition: Any, one: Any, other: Any) -> Any:

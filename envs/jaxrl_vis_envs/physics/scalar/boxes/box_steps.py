@@ -125,4 +125,3 @@ def _turned(quaternion: Column, spin: Column, timestep: float) -> Column:
 def _as_arrays(matrix: dict, like: Any) -> dict:
     """Convert known numbers to arrays, which loops can carry."""
     return {key: 0.0 * like + value if isinstance(value, float) else value for key, value in matrix.items()}
-

@@ -132,8 +132,10 @@ def _constraint_slope(problem: LaneProblem, residual: _Residual) -> Column:
     for row, (ahead, back, one, other) in enumerate(_edges(problem, residual.parts), start=1):
         pulls[0] = pulls[0] + (one * ahead + other * back)
         pulls[row] = one * ahead - other * back
-    slope = [sum_lanes(total(p * g for p, g in zip(pulls, parts, strict=True) if not _is_known(g)))
-             for parts in problem.contacts.jacobian]
+    slope = [
+        sum_lanes(total(p * g for p, g in zip(pulls, parts, strict=True) if not _is_known(g)))
+        for parts in problem.contacts.jacobian
+    ]
     for entries, x, stiffness in zip(problem.jacobian, residual.rows, _acting(problem, residual.rows), strict=True):
         for joint, entry in entries.items():
             slope[joint] = slope[joint] + entry * (stiffness * x)
