@@ -38,7 +38,7 @@ BOXES = """
       </body>
     </body>
     <body name="box" pos="0 0 .1">
-      <joint type="free" damping=".01" armature=".002"/>
+      <joint name="free" type="free" damping=".01" armature=".002"/>
       <geom name="box" size=".03 .02 .025"/>
     </body>
   </worldbody>
@@ -195,6 +195,13 @@ REFUSED = {
     ),
     "joint after it": ("</worldbody>", '<body><joint axis="0 1 0"/><geom size=".1 .1 .1"/></body></worldbody>'),
     "sensor": ("</mujoco>", '<sensor><jointpos joint="swing"/></sensor></mujoco>'),
+    "pair of a mocap body": (
+        '<geom name="table" size=".3 .2 .05" pos=".1 0 0" euler="0 .1 0"/>',
+        '<body mocap="true"><geom name="table" size=".3 .2 .05"/></body>',
+    ),
+    "weld of the free body": ("</mujoco>", '<equality><weld body1="box" body2="arm"/></equality></mujoco>'),
+    "motor of the free body": ("</actuator>", '<motor joint="free"/></actuator>'),
+    "contacts disabled": ("<default>", '<option><flag contact="disable"/></option><default>'),
     "dry friction": ('armature=".01"', 'armature=".01" frictionloss=".1"'),
 }
 

@@ -133,16 +133,23 @@ def supports(model: mjx.Model) -> bool:
     turn = np.asarray(model.body_iquat)[body]
     is_centred = np.allclose(np.asarray(model.body_ipos)[body], 0.0) and np.allclose(np.abs(turn), [1, 0, 0, 0])
     is_pyramid = np.isin(model.pair_dim, [3, 4]).all() and np.all(np.asarray(model.pair_solimp)[:, 4] == 2)
-    return bool(is_alone and is_centred and is_pyramid and _moves_in_pairs(model)) and scalar_model.has_simple_tree(model)
+    # The free body has contacts only.
+    is_pulled = np.any(np.asarray(model.actuator_trnid)[:, 0] == len(is_free) - 1) if model.nu else False
+    is_tied = body in np.concatenate([model.eq_obj1id, model.eq_obj2id])
+    is_simple = is_alone and is_centred and is_pyramid and not is_pulled and not is_tied
+    return bool(is_simple) and _has_simple_pairs(model) and scalar_model.has_simple_tree(model)
 
 
-def _moves_in_pairs(model: mjx.Model) -> bool:
-    """Return True if each pair has a box that moves, and no other disabled part."""
+def _has_simple_pairs(model: mjx.Model) -> bool:
+    """Return True if each pair has a box that moves, no box belongs to a mocap body, and contacts are enabled."""
     _, frames = links.build_links(model)
-    pairs = zip(model.pair_geom1, model.pair_geom2, strict=True)
-    moved = all(any(frames[model.geom_bodyid[geom]].link != WORLD for geom in pair) for pair in pairs)
+    free = links.mocap_link(model.nmocap)
+    for pair in zip(model.pair_geom1, model.pair_geom2, strict=True):
+        joined = [frames[model.geom_bodyid[geom]].link for geom in pair]
+        if joined == [WORLD, WORLD] or any(link < WORLD and link != free for link in joined):
+            return False
     disabled = int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    return moved and not int(model.opt.disableflags) & disabled
+    return not int(model.opt.disableflags) & disabled
 
 
 def build_box_model(model: mjx.Model) -> BoxModel:
