@@ -158,9 +158,6 @@ ON_A_CPU = {
 @pytest.mark.parametrize("name", ON_A_CPU)
 def test_the_engine_of_each_task(name):
     model = mjx.put_model(environments.make(name).mj_model)
-    if name == "FetchPush":  # boxes and a free joint
-        assert newton.supports(model) and not scalar.supports(model)
-        return
     assert scalar.supports(model)
     assert mjx_model.prefers_scalar_engine(model) is (ON_A_CPU[name] == "scalar")
     assert newton.supports(model) is (ON_A_CPU[name] == "newton")

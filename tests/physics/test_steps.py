@@ -458,7 +458,7 @@ def test_goals_and_steps_of_the_hand_are_one_kernel(monkeypatch):
 
 
 def test_steps_are_taken_one_by_one_where_their_kernel_does_not_compile(monkeypatch):
-    monkeypatch.setattr(mjx_model, "use_gpu_kernels", lambda probe: probe is not scalar.probe)
+    monkeypatch.setattr(mjx_model, "use_gpu_kernels", lambda probe: probe is not steps_kernel.probe)
     env = environments.make("FingerTurn")
     data = jax.eval_shape(lambda: jax.vmap(lambda _: mjx.make_data(env.mj_model))(jnp.zeros(8)))
     program = lowered_for_cuda(env._model, data)
@@ -471,7 +471,7 @@ def test_the_probe_is_a_kernel_for_nvidia():
 
 
 def test_which_models_the_scalar_engine_supports():
-    for name in ("FingerTurn", "HandReach", "Reacher", "FetchReach", "SawyerReach", "StalkReach"):
+    for name in ("FingerTurn", "HandReach", "Reacher", "FetchReach", "FetchPush", "SawyerReach", "StalkReach"):
         assert scalar.supports(environments.make(name)._model), name
     hand = environments.make("HandReach")
     assert scalar.supports(hand._goal_model)

@@ -7,13 +7,13 @@
     kinematics          forward kinematics, all bodies at once
     rotations           quaternions and frames, from a private module of MJX
     inverse_kinematics  joint angles that bring the last link of a chain to a pose
-    scalar/             the scalar engine: a subset of MuJoCo in scalars, one GPU thread per episode
+    scalar/             the scalar engine: a subset of MuJoCo in scalars, one GPU thread or warp per episode
 
 MJX runs every model on every platform and is the reference. The scalar engine computes the same steps for the models that it
 supports (`scalar.supports`), as long as nothing disturbs them (`mjx_model.take_steps`), where it is faster:
 
     engine    NVIDIA GPUs                                  CPUs
-    scalar    all tasks but FetchPush, in one kernel       FingerTurn (up to three joints, if `newton` does not support them)
+    scalar    all tasks, in one kernel                     FingerTurn (up to three joints, if `newton` does not support them)
     MJX       models that `scalar` does not support,       FetchPush, FetchReach, Reacher, SawyerReach and StalkReach with
               randomized dynamics                          `newton`, HandReach with MJX's own solver
 

@@ -92,12 +92,13 @@ def take_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None 
         count: Number of steps.
         exact: Make contacts and forces as exact as float32 allows (see `step`). False and None both disable this. With False,
             the GPU kernel is shared with exact steps in the same program of a model that differs in its time step only, and
-            compiled once; with None, the kernel cannot take exact steps and is smaller.
+            compiled once; with None, the kernel cannot take exact steps and is smaller. Exact steps of models with boxes are
+            always MJX's.
         disturbed: True if bodies are pushed (``xfrc_applied`` is not 0) or welds are switched off (``eq_active``), which the
             scalar engine does not support; MJX then takes the steps on all platforms. If a state is disturbed although this is
             False, the scalar engine sets its ``qpos`` to NaN.
     """
-    if disturbed or not scalar.supports(model):
+    if disturbed or not scalar.supports(model, exact):
         return _take_mjx_steps(model, data, count, bool(exact))
 
     def take(data: mjx.Data) -> mjx.Data:
@@ -112,7 +113,7 @@ def prefers_scalar_engine(model: mjx.Model) -> bool:
     """Return True if the scalar engine is faster than MJX for a model that it supports, on the platform traced for."""
     if targets_cpu():
         return model.nv <= _MAX_SCALAR_JOINTS_ON_CPU and not newton.supports(model)
-    return use_gpu_kernels(scalar.probe)
+    return use_gpu_kernels(scalar.probe_of(model))
 
 
 def _take_mjx_steps(model: mjx.Model, data: mjx.Data, count: int, exact: bool) -> mjx.Data:

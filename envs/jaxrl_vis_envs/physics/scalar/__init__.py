@@ -1,9 +1,9 @@
-"""The scalar engine: a subset of MuJoCo's physics written out in scalars, for GPUs with one thread per episode.
+"""The scalar engine: a subset of MuJoCo's physics written out in scalars, for GPUs with a thread or warp per episode.
 
     supports    checks if a model lies in the subset
     simulate    takes physics steps: on NVIDIA GPUs all of them in one kernel, elsewhere in plain JAX
 
-These two functions, and the probe that every kernel has, are all that the rest of the package uses. The modules, from the
+These two functions, and the probes that kernels have, are all that the rest of the package uses. The modules, from the
 bottom:
 
     partial_arithmetic, quaternions, sparse_algebra    scalars, vectors and matrices whose known entries generate no operations
@@ -12,8 +12,10 @@ bottom:
     solver/                                            friction cones, line search, Newton's method
     scalar_model                                       constants of a model, and the subset of MuJoCo
     steps, triton_scalars, steps_kernel                physics steps, in plain JAX and as a GPU kernel
+    boxes/                                             the same with boxes, one of them free: a warp per episode
 """
 
+import functools
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -22,11 +24,26 @@ from mujoco import mjx
 
 from jaxrl_vis_envs.compiling.compilation import use_gpu_kernels
 from jaxrl_vis_envs.physics.scalar import scalar_model, steps, steps_kernel
-from jaxrl_vis_envs.physics.scalar.scalar_model import supports
+from jaxrl_vis_envs.physics.scalar.boxes import box_kernel, box_model
+from jaxrl_vis_envs.physics.scalar.scalar_model import ScalarModel
 from jaxrl_vis_envs.physics.scalar.steps import JointState
-from jaxrl_vis_envs.physics.scalar.steps_kernel import probe
 
-__all__ = ["probe", "simulate", "supports"]
+__all__ = ["probe_of", "simulate", "supports"]
+
+
+def supports(model: mjx.Model, exact: bool | None = None) -> bool:
+    """Return True if the engine can simulate a model; see `scalar_model.supports`, or with boxes `box_model.supports`.
+
+    Args:
+        model: The model.
+        exact: True if steps have to be exact (see `mjx_model.take_steps`), which those with boxes are not.
+    """
+    return scalar_model.supports(model) or (not exact and box_model.supports(model))
+
+
+def probe_of(model: mjx.Model) -> Callable[[], None]:
+    """Return the function that compiles a small instance of the kernel for a model, for `use_gpu_kernels`."""
+    return box_kernel.probe if box_model.supports(model) else steps_kernel.probe
 
 
 def simulate(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = None) -> mjx.Data:
@@ -42,19 +59,34 @@ def simulate(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = 
         ``data`` with new ``qpos``, ``qvel``, ``qacc``, ``qacc_warmstart``, ``qfrc_constraint`` and ``time``. All other fields,
         body poses included, are unchanged and thus stale. ``qpos`` is NaN if ``xfrc_applied`` is not 0 or a weld is inactive.
     """
-    take = steps_kernel.simulate if use_gpu_kernels(probe) else steps.simulate_arrays
-    return _simulate_with(take, model, data, count, exact)
+    has_kernel = use_gpu_kernels(probe_of(model))
+    if box_model.supports(model):
+        return _simulate_boxes_with(box_kernel.simulate if has_kernel else box_kernel.simulate_arrays, model, data, count)
+    return _simulate_with(steps_kernel.simulate if has_kernel else steps.simulate_arrays, model, data, count, exact)
+
+
+def _simulate_boxes_with(take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
+    """Implement `simulate` of a model with boxes with ``take``, a function with the arguments of `box_kernel.simulate`."""
+    constants = box_model.build_box_model(model)
+    return _replaced(model, data, count, constants.tree, functools.partial(take, constants))
 
 
 def _simulate_with(
     take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int, exact: bool | None
 ) -> mjx.Data:
     """Implement `simulate` with ``take``, a function with the arguments of `steps.simulate_arrays`."""
-    constants, timestep = scalar_model.build_scalar_model(model), float(model.opt.timestep)
+    constants = scalar_model.build_scalar_model(model)
+    return _replaced(model, data, count, constants, functools.partial(take, constants, exact=exact))
+
+
+def _replaced(
+    model: mjx.Model, data: mjx.Data, count: int, constants: ScalarModel, take: Callable[..., JointState]
+) -> mjx.Data:
+    """Return ``data`` with the state after ``count`` steps of ``take``; ``constants`` are those of the tree."""
     state = JointState(data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_constraint)
     indices = np.array(constants.mocaps, int)
     mocap = jnp.concatenate([data.mocap_pos[indices], data.mocap_quat[indices]], axis=1) if len(indices) else None
-    state = take(constants, state, data.ctrl, data.qfrc_applied, timestep, count, exact, mocap=mocap)
+    state = take(state, data.ctrl, data.qfrc_applied, timestep=float(model.opt.timestep), count=count, mocap=mocap)
     is_disturbed = jnp.any(data.xfrc_applied != 0)
     if constants.welds:
         is_disturbed = is_disturbed | ~jnp.all(data.eq_active)

@@ -55,6 +55,10 @@ class LinkFrames:
         self._quaternions: dict[int, Quaternion] = {WORLD: quaternions.IDENTITY}
         self._quaternions |= {link: body.quaternion for link, body in mocap.items()}
 
+    def origin_and_axes(self, link: int) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
+        """Return origin and axes of a link's frame in the base frame."""
+        return self._poses[link].origin, self._poses[link].axes
+
     def point(self, link: int, position: np.ndarray) -> Vector:
         """Transform a point, ``position`` [3] (m), from the link's frame to the base frame."""
         pose = self._poses[link]

@@ -58,7 +58,10 @@ class FixedFrame(NamedTuple):
 
 
 def build_links(model: mjx.Model) -> tuple[list[Link], list[FixedFrame]]:
-    """Return the links of a model, one per joint in the order of the joints, and the frames of its bodies."""
+    """Return the links of a model, one per hinge or slide in the order of the joints, and the frames of its bodies.
+
+    A free body is a link of its own like the mocap bodies, after the last of them.
+    """
     tree: list[Link] = []
     frames = [FixedFrame(WORLD, np.eye(3), np.zeros(3))]
     position, rotation = _array(model.body_pos), _rotations(model.body_quat)
@@ -69,6 +72,9 @@ def build_links(model: mjx.Model) -> tuple[list[Link], list[FixedFrame]]:
         frame = FixedFrame(mocap_link(mocap), np.eye(3), np.zeros(3)) if mocap >= 0 else frame
         first, count = model.body_jntadr[body], model.body_jntnum[body]
         for joint in range(first, first + count):
+            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+                frame = FixedFrame(mocap_link(model.nmocap), np.eye(3), np.zeros(3))
+                continue
             axis, alignment = _align_axis(axes[joint])
             joint_frame = _compose(frame, alignment, anchor[joint])
             slides = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE

@@ -172,16 +172,26 @@ def supports(model: mjx.Model) -> bool:
     bodies that are active from the start. Not supported: other equalities, sensors, fluids and gravity compensation. The solver
     is Newton's; the integrator is Euler's, implicit in the damping, or RK4.
     """
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(model)):
+    if not is_concrete(model):
         return False
-    checks = (_has_simple_joints, _has_simple_tendons, _has_simple_actuators, _has_simple_equalities, _has_simple_contacts)
+    is_small = model.nq == model.nv <= _MAX_JOINTS and model.nv > 0
+    if not is_small or not np.isin(model.jnt_type, _ONE_DEGREE_OF_FREEDOM).all():
+        return False
+    return has_simple_tree(model) and _has_simple_contacts(model)
+
+
+def is_concrete(model: mjx.Model) -> bool:
+    """Return True if all numbers of a model are known."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(model))
+
+
+def has_simple_tree(model: mjx.Model) -> bool:
+    """Return True if the engine supports a model apart from the types of its joints and its contacts."""
+    checks = (_has_simple_joints, _has_simple_tendons, _has_simple_actuators, _has_simple_equalities)
     return all(is_simple(model) for is_simple in checks)
 
 
 def _has_simple_joints(model: mjx.Model) -> bool:
-    is_small = model.nq == model.nv <= _MAX_JOINTS and model.nv > 0
-    if not is_small or not np.isin(model.jnt_type, _ONE_DEGREE_OF_FREEDOM).all():
-        return False
     option = model.opt
     is_newton = option.solver == mujoco.mjtSolver.mjSOL_NEWTON and option.integrator in _INTEGRATORS
     is_plain = not (int(option.disableflags) & ~int(_SUPPORTED_FLAGS)) and option.enableflags == 0
@@ -246,23 +256,26 @@ def _has_joint_above(model: mjx.Model, bodies: tuple[int, int]) -> bool:
 
 
 def build_scalar_model(model: mjx.Model) -> ScalarModel:
-    """Return the constants of a model that the engine `supports`."""
+    """Return the constants of a model that the engine `supports`, or of the hinges and slides of one with a free body."""
     tree, frames = links.build_links(model)
-    flags = int(model.opt.disableflags)
+    joints, flags = len(tree), int(model.opt.disableflags)
     tendons = [_tendon_coefficients(model, tendon) for tendon in range(model.ntendon)]
     armature = np.asarray(model.tendon_armature)
     has_gravity = not flags & _FLAG.mjDSBL_GRAVITY
-    contact_list = _contacts(model, tree, frames) if not flags & _disabling(_FLAG.mjDSBL_CONTACT) else []
+    has_contacts = len(tree) == model.nv and not flags & _disabling(_FLAG.mjDSBL_CONTACT)
+    contact_list = _contacts(model, tree, frames) if has_contacts else []
     weld_list = _welds(model, tree, frames) if not flags & _disabling(_FLAG.mjDSBL_EQUALITY) else []
     constrained = [frame for contact in contact_list for frame in contact.pair.frames]
     constrained += [frame for weld in weld_list for frame in weld.weld.frames]
     parents = {link.parent for link in tree} | {frame.link for frame in constrained}
     return ScalarModel(
         links=tree,
-        rest=floats(np.asarray(model.qpos0)),
-        armature=floats(np.asarray(model.dof_armature)),
-        damping=floats(np.asarray(model.dof_damping)),
-        springs=tuple(zip(floats(np.asarray(model.jnt_stiffness)), floats(np.asarray(model.qpos_spring)), strict=True)),
+        rest=floats(np.asarray(model.qpos0)[:joints]),
+        armature=floats(np.asarray(model.dof_armature)[:joints]),
+        damping=floats(np.asarray(model.dof_damping)[:joints]),
+        springs=tuple(
+            zip(floats(np.asarray(model.jnt_stiffness)[:joints]), floats(np.asarray(model.qpos_spring)[:joints]), strict=True)
+        ),
         tendon_masses=tuple((joints, float(mass)) for joints, mass in zip(tendons, armature, strict=True)),
         gravity=np.asarray(model.opt.gravity, np.float64) * has_gravity,
         actuators=tuple(_actuator(model, index) for index in range(model.nu)),
@@ -305,7 +318,8 @@ def _actuator(model: mjx.Model, index: int) -> Actuator:
     return Actuator(int(model.actuator_trnid[index, 0]), gear, gain, bias, (control[0], control[1]), (force[0], force[1]))
 
 
-def _softness(model: mjx.Model, solref: object, solimp: object) -> Softness:
+def build_softness(model: mjx.Model, solref: object, solimp: object) -> Softness:
+    """Return the constants of a constraint of a model with these numbers of MuJoCo."""
     is_safe = not int(model.opt.disableflags) & _FLAG.mjDSBL_REFSAFE
     return constraint_softness.make_softness(np.asarray(solref), np.asarray(solimp), float(model.opt.timestep), is_safe)
 
@@ -315,7 +329,7 @@ def _frictions(model: mjx.Model) -> list[FrictionConstraint]:
     solref, solimp = np.asarray(model.dof_solref), np.asarray(model.dof_solimp)
     return [
         FrictionConstraint(
-            int(joint), float(max_force[joint]), float(weight[joint]), _softness(model, solref[joint], solimp[joint])
+            int(joint), float(max_force[joint]), float(weight[joint]), build_softness(model, solref[joint], solimp[joint])
         )
         for joint in np.flatnonzero(model._impl.dof_hasfrictionloss)
     ]
@@ -326,7 +340,7 @@ def _limits(model: mjx.Model, tendons: list[dict[int, float]]) -> list[LimitCons
         joints: dict[int, float], index: int, bounds: object, margin: object, weight: object, *parameters: object
     ) -> LimitConstraint:
         low, high = floats(np.asarray(bounds)[index])
-        softness = _softness(model, *(np.asarray(parameter)[index] for parameter in parameters))
+        softness = build_softness(model, *(np.asarray(parameter)[index] for parameter in parameters))
         return LimitConstraint(
             joints, (low, high), float(np.asarray(margin)[index]), float(np.asarray(weight)[index]), softness
         )
@@ -351,13 +365,13 @@ def _contacts(model: mjx.Model, tree: list[Link], frames: list[FixedFrame]) -> l
         solref, across = np.asarray(model.pair_solref)[index], np.asarray(model.pair_solreffriction)[index]
         across = across if across.any() else solref
         solimp = np.asarray(model.pair_solimp)[index]
-        softness = _softness(model, solref, solimp)
+        softness = build_softness(model, solref, solimp)
         contact = ContactConstraint(pair, float(np.asarray(model.pair_margin)[index]), (inverse,), (softness,), (), ())
         if dim > 1 and is_elliptic:
             ratios = [friction[0] ** 2 / friction[row - 1] ** 2 / impratio for row in range(1, dim)]
             contact = contact._replace(
                 inverse_weights=(inverse, *(float(inverse * ratio) for ratio in ratios)),
-                softness=(softness, *[_softness(model, across, solimp)] * (dim - 1)),
+                softness=(softness, *[build_softness(model, across, solimp)] * (dim - 1)),
                 cone=(float(friction[0] / np.sqrt(impratio)), *floats(friction[: dim - 1])),
             )
         elif dim > 1:
@@ -373,7 +387,7 @@ def _welds(model: mjx.Model, tree: list[Link], frames: list[FixedFrame]) -> list
     constraints = []
     for index in range(model.neq):
         weight = weights[model.eq_obj1id[index]] + weights[model.eq_obj2id[index]]
-        softness = _softness(model, np.asarray(model.eq_solref)[index], np.asarray(model.eq_solimp)[index])
+        softness = build_softness(model, np.asarray(model.eq_solref)[index], np.asarray(model.eq_solimp)[index])
         weld = welds.build_weld(model, tree, frames, index)
         constraints.append(WeldConstraint(weld, (float(weight[0]), float(weight[1])), softness))
     return constraints

@@ -58,7 +58,7 @@ class StepInputs(NamedTuple):
     mocap: dict[int, MocapPose]
 
 
-class _ConstraintRow(NamedTuple):
+class ConstraintRow(NamedTuple):
     """Row of a `scalar_newton.Problem`, with its fields; ``max_friction`` is None except for dry friction."""
 
     entries: Row
@@ -97,8 +97,7 @@ def simulate(
     Returns:
         The state after the steps.
     """
-    bounds = [actuator.control_bounds for actuator in constants.actuators]
-    control = [_clip(number, pair) for number, pair in zip(control, bounds, strict=True)]
+    control = clipped_controls(constants, control)
     poses = link_frames.mocap_poses(tuple(links.mocap_link(index) for index in constants.mocaps), list(mocap))
     inputs = StepInputs(timestep, control, applied, poses)
 
@@ -108,6 +107,12 @@ def simulate(
         return take_step(constants, state, inputs, exact, in_kernel)
 
     return jax.lax.fori_loop(0, count, advance, state)
+
+
+def clipped_controls(constants: ScalarModel, control: Column) -> Column:
+    """Clip the controls, one per actuator, to their bounds."""
+    bounds = [actuator.control_bounds for actuator in constants.actuators]
+    return [_clip(number, pair) for number, pair in zip(control, bounds, strict=True)]
 
 
 def simulate_arrays(
@@ -178,11 +183,26 @@ def _accelerations(
     return damped, acceleration, force
 
 
-def constraint_problem(constants: ScalarModel, state: JointState, inputs: StepInputs) -> tuple[Problem, list[int]]:
-    """Return the constraint problem of one step, and the joint at each index of the problem.
+class TreeState(NamedTuple):
+    """Dynamics of the joints before contacts.
 
-    The joints are reordered for little fill-in when the problem's matrices are factorized from the last row up.
+    Attributes:
+        mass: Mass matrix, nonzero entries on and below the diagonal.
+        force: Forces on the joints without constraints.
+        rows: Constraint rows: welds, dry friction, limits.
+        equalities: Number of rows of welds.
+        frames: Frames of links and joints.
     """
+
+    mass: Matrix
+    force: Column
+    rows: list[ConstraintRow]
+    equalities: int
+    frames: LinkFrames
+
+
+def tree_state(constants: ScalarModel, state: JointState, inputs: StepInputs) -> TreeState:
+    """Return the dynamics of the joints before contacts."""
     displacement = [minus(position, rest) for position, rest in zip(state.position, constants.rest, strict=True)]
     welded = {
         joint
@@ -201,13 +221,21 @@ def constraint_problem(constants: ScalarModel, state: JointState, inputs: StepIn
     equalities = len(rows)
     rows += [_friction_row(friction, state) for friction in constants.frictions]
     rows += [_limit_row(limit, state) for limit in constants.limits]
+    return TreeState(mass, _smooth_forces(constants, state, joints, inputs), rows, equalities, frames)
+
+
+def constraint_problem(constants: ScalarModel, state: JointState, inputs: StepInputs) -> tuple[Problem, list[int]]:
+    """Return the constraint problem of one step, and the joint at each index of the problem.
+
+    The joints are reordered for little fill-in when the problem's matrices are factorized from the last row up.
+    """
+    mass, force, rows, equalities, frames = tree_state(constants, state, inputs)
     cones = {}
     for contact in constants.contacts:
         if contact.cone:
             cones[len(rows)] = contact.cone
         rows += _contact_rows(contact, frames, state)
-    force = _smooth_forces(constants, state, joints, inputs)
-    order = elimination_order(len(joints), list(mass), [tuple(row.entries) for row in rows])
+    order = elimination_order(len(force), list(mass), [tuple(row.entries) for row in rows])
     place = {joint: index for index, joint in enumerate(order)}
     problem = Problem(
         mass={_below_diagonal(place[one], place[other]): number for (one, other), number in mass.items()},
@@ -287,14 +315,14 @@ def _smooth_forces(constants: ScalarModel, state: JointState, joints: list[Joint
     return forces
 
 
-def _friction_row(friction: FrictionConstraint, state: JointState) -> _ConstraintRow:
+def _friction_row(friction: FrictionConstraint, state: JointState) -> ConstraintRow:
     softness = friction.softness
     stiffness = softness.row_stiffness(friction.inverse_weight, softness.impedance(0.0))
     target = times(-softness.damping, state.velocity[friction.joint])
-    return _ConstraintRow({friction.joint: 1.0}, stiffness, target, friction.max_force)
+    return ConstraintRow({friction.joint: 1.0}, stiffness, target, friction.max_force)
 
 
-def _limit_row(limit: LimitConstraint, state: JointState) -> _ConstraintRow:
+def _limit_row(limit: LimitConstraint, state: JointState) -> ConstraintRow:
     """Return the row of the nearer bound."""
     low, high = limit.bounds
     length = plus(*(times(coefficient, state.position[joint]) for joint, coefficient in limit.joints.items()))
@@ -307,10 +335,10 @@ def _limit_row(limit: LimitConstraint, state: JointState) -> _ConstraintRow:
     impedance = softness.impedance(distance)
     stiffness = jnp.where(distance < 0, softness.row_stiffness(limit.inverse_weight, impedance), 0.0)
     pull = plus(times(softness.damping, speed), times(softness.stiffness, impedance, distance))
-    return _ConstraintRow(entries, stiffness, minus(0.0, pull))
+    return ConstraintRow(entries, stiffness, minus(0.0, pull))
 
 
-def _weld_rows(constraint: WeldConstraint, frames: LinkFrames, state: JointState) -> list[_ConstraintRow]:
+def _weld_rows(constraint: WeldConstraint, frames: LinkFrames, state: JointState) -> list[ConstraintRow]:
     """Return three position rows and three rotation rows, with one impedance at the norm of all six errors."""
     residual, softness = welds.weld_residual(constraint.weld, frames), constraint.softness
     impedance = softness.impedance(residual.norm)
@@ -318,7 +346,7 @@ def _weld_rows(constraint: WeldConstraint, frames: LinkFrames, state: JointState
     rows = []
     for index, (error, entries) in enumerate(zip(residual.errors, residual.entries, strict=True)):
         pull = plus(times(softness.damping, _speed(entries, state)), times(softness.stiffness, impedance, error))
-        rows.append(_ConstraintRow(entries, stiffness[index // 3], minus(0.0, pull)))
+        rows.append(ConstraintRow(entries, stiffness[index // 3], minus(0.0, pull)))
     return rows
 
 
@@ -326,7 +354,7 @@ def _speed(entries: Row, state: JointState) -> Any:
     return plus(*(times(entry, state.velocity[joint]) for joint, entry in entries.items()))
 
 
-def _contact_rows(contact: ContactConstraint, frames: LinkFrames, state: JointState) -> list[_ConstraintRow]:
+def _contact_rows(contact: ContactConstraint, frames: LinkFrames, state: JointState) -> list[ConstraintRow]:
     """Return a row along the normal and, with an elliptic cone, rows along the tangents; with a pyramid, a row per edge."""
     point = contacts.contact_point(contact.pair, frames)
     distance = minus(point.distance, contact.margin)
@@ -341,13 +369,13 @@ def _contact_rows(contact: ContactConstraint, frames: LinkFrames, state: JointSt
         pull = times(softness.damping, _speed(entries, state))
         if not rows:
             pull = plus(pull, times(softness.stiffness, impedance, distance))
-        rows.append(_ConstraintRow(entries, stiffness, minus(0.0, pull)))
+        rows.append(ConstraintRow(entries, stiffness, minus(0.0, pull)))
     return rows
 
 
 def _edge_rows(
     contact: ContactConstraint, point: contacts.ContactPoint, distance: Any, frames: LinkFrames, state: JointState
-) -> list[_ConstraintRow]:
+) -> list[ConstraintRow]:
     """Return two rows per direction of friction: the normal plus and minus friction times the tangent or torsional
     direction.
     """
@@ -365,7 +393,7 @@ def _edge_rows(
         drag = times(softness.damping, _speed(tangential, state))
         for combine in (plus, minus):
             edge = {joint: combine(entry, tangential[joint]) for joint, entry in ahead.items()}
-            rows.append(_ConstraintRow(edge, stiffness, minus(0.0, combine(pull, drag))))
+            rows.append(ConstraintRow(edge, stiffness, minus(0.0, combine(pull, drag))))
     return rows
 
 

@@ -1,5 +1,7 @@
 """One scalar per thread in Pallas kernels (Triton) of thousands of operations: loads, stores and the launch.
 
+Episodes have a thread each (`episode_kernel`) or a warp (`warp_kernel`).
+
 Triton analyses the whole program once for each load and store to distribute it over the threads of a block, so a kernel with
 500 loads takes minutes to compile. Here each thread loads and stores its own scalars by inline PTX, which Triton does not
 analyse. This needs a primitive that Pallas lacks and that is added here: the address of an array.
@@ -11,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
@@ -88,6 +91,95 @@ def _trace_kernel(
     return jaxpr_as_fun(jax.make_jaxpr(launch)(jax.ShapeDtypeStruct(shape, jnp.float32)))
 
 
+def warp_kernel(
+    name: str, compute: Callable[..., Iterable[Any]], constants: Hashable, table: np.ndarray, outputs: int, interpret: bool
+) -> Callable[[jax.Array], jax.Array]:
+    """Wrap a function of one episode as a GPU kernel with a warp of 32 threads (lanes) per episode.
+
+    Calls within one program with the same ``compute``, ``constants`` and batch size share one kernel, compiled once.
+
+    Args:
+        name: Name of the kernel.
+        compute: Function from ``constants``, an episode's inputs and the rows of ``table`` to its outputs; scalars are [32]
+            float32, one per lane. Inputs are the same in all lanes, and outputs have to be.
+        constants: Constants of the kernel.
+        table: [R, 32], a number per lane in each row.
+        outputs: Number of outputs.
+        interpret: Run the kernel without a GPU, slowly.
+
+    Returns:
+        The function from inputs [B, I] float32 to outputs [B, ``outputs``]; axes of `jax.vmap` are merged into B.
+    """
+
+    @custom_vmap
+    def run(inputs: jax.Array) -> jax.Array:
+        mesh = jax.sharding.get_abstract_mesh()
+        launch = _trace_warp_kernel(name, compute, constants, table.shape[0], outputs, interpret, inputs.shape, mesh)
+        results, _ = launch(inputs, jnp.asarray(table, jnp.float32))
+        return results
+
+    @run.def_vmap
+    def _(size: int, in_batched: list[bool], inputs: jax.Array) -> tuple[jax.Array, bool]:
+        del in_batched  # there is one input, so it is batched
+        flat = run(inputs.reshape(-1, inputs.shape[-1]))
+        return flat.reshape(size, -1, flat.shape[-1]), True
+
+    return run
+
+
+@functools.lru_cache(maxsize=16)
+def _trace_warp_kernel(
+    name: str,
+    compute: Compute,
+    constants: Hashable,
+    rows: int,
+    outputs: int,
+    interpret: bool,
+    shape: tuple[int, int],
+    mesh: Any,
+) -> Callable[..., list[jax.Array]]:
+    """Trace the kernel for inputs of a ``shape`` [B, I]; see `_trace_kernel`."""
+    del mesh
+    launch = kernel_call(
+        functools.partial(_warp_kernel, compute=compute, constants=constants, interpret=interpret),
+        grid=(shape[0],),
+        out_shape=[jax.ShapeDtypeStruct((shape[0], outputs), jnp.float32), jax.ShapeDtypeStruct((shape[0],), jnp.int32)],
+        compiler_params=_COMPILER,
+        interpret=interpret,
+        name=name,
+    )
+    arguments = [jax.ShapeDtypeStruct(size, jnp.float32) for size in (shape, (rows, WARP_SIZE))]
+    return jaxpr_as_fun(jax.make_jaxpr(launch)(*arguments))
+
+
+def _warp_kernel(
+    inputs: Any,
+    table: Any,
+    results: Any,
+    done: Any,
+    *,
+    compute: Callable[..., Iterable[Any]],
+    constants: Hashable,
+    interpret: bool,
+) -> None:
+    program = pl.program_id(0)
+    if interpret:
+        numbers = [jnp.broadcast_to(inputs[program, column], (WARP_SIZE,)) for column in range(inputs.shape[1])]
+        rows = [table[row, :] for row in range(table.shape[0])]
+    else:
+        own, lanes = _program_address(inputs), _lane_address(table)
+        numbers = [_load(own, 4 * column) for column in range(inputs.shape[1])]
+        rows = [_load(lanes, 4 * WARP_SIZE * row) for row in range(table.shape[0])]
+    computed = jax.jit(compute, static_argnums=0)(constants, numbers, rows)
+    if interpret:
+        for column, number in enumerate(computed):
+            results[program, column] = number[0]
+        done[program] = jnp.int32(0)
+    else:
+        own = _program_address(results)
+        done[program] = _store(own, ((4 * column, number) for column, number in enumerate(computed)))
+
+
 def _kernel(inputs: Any, results: Any, done: Any, *, compute: Compute, constants: Hashable, interpret: bool) -> None:
     program = pl.program_id(0)
     own = pl.ds(program * WARP_SIZE, WARP_SIZE)
@@ -151,11 +243,23 @@ def _own_address(ref: Any) -> jax.Array:
     )
 
 
+def _program_address(ref: Any) -> jax.Array:
+    """Return the address of a program's own row of an array [programs, columns] float32, in each thread."""
+    lines = f"{{ .reg .u32 program; mov.u32 program, %ctaid.x; mad.wide.u32 $0, program, {4 * ref.shape[1]}, $1; }}"
+    return _assemble(lines, "int64", _address_primitive().bind(ref))
+
+
+def _lane_address(ref: Any) -> jax.Array:
+    """Return each thread's address of its own element in the first row of an array [rows, 32] float32."""
+    lines = "{ .reg .u32 lane; mov.u32 lane, %tid.x; mad.wide.u32 $0, lane, 4, $1; }"
+    return _assemble(lines, "int64", _address_primitive().bind(ref))
+
+
 def load_rows(ref: Any) -> list[jax.Array]:
     """Load each thread's column of an array [rows, 32 * programs]: [32] float32 per row."""
     rows, threads = ref.shape
     address = _own_address(ref)
-    return [_assemble(f"ld.global.nc.f32 $0, [$1+{4 * threads * row}];", "float32", address) for row in range(rows)]
+    return [_load(address, 4 * threads * row) for row in range(rows)]
 
 
 def store_rows(ref: Any, values: Iterable[jax.Array]) -> jax.Array:
@@ -165,7 +269,17 @@ def store_rows(ref: Any, values: Iterable[jax.Array]) -> jax.Array:
         [] int32, always 0; the compiler cannot know that, and keeps the stores if it is used.
     """
     threads = ref.shape[1]
-    address, done = _own_address(ref), jnp.zeros(WARP_SIZE, jnp.int32)
-    for row, value in enumerate(values):
-        done = _assemble(f"st.global.f32 [$1+{4 * threads * row}], $2; mov.u32 $0, $3;", "int32", address, value, done)
+    return _store(_own_address(ref), ((4 * threads * row, value) for row, value in enumerate(values)))
+
+
+def _load(address: jax.Array, offset: int) -> jax.Array:
+    """Load float32 [32] from each thread's ``address`` plus ``offset`` bytes, of an array that the kernel does not change."""
+    return _assemble(f"ld.global.nc.f32 $0, [$1+{offset}];", "float32", address)
+
+
+def _store(address: jax.Array, values: Iterable[tuple[int, jax.Array]]) -> jax.Array:
+    """Store values, [32] float32, at each thread's ``address`` plus their offsets in bytes; return 0 as `store_rows` does."""
+    done = jnp.zeros(WARP_SIZE, jnp.int32)
+    for offset, value in values:
+        done = _assemble(f"st.global.f32 [$1+{offset}], $2; mov.u32 $0, $3;", "int32", address, value, done)
     return jnp.sum(done)

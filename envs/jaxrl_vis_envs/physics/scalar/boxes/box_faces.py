@@ -1,0 +1,208 @@
+"""Contacts between boxes in scalars (`partial_arithmetic`), one contact per lane: the arithmetic of `physics.box_contacts`.
+
+Each lane computes all candidates of its pair, and keeps the one that reaches farthest towards its own corner.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxrl_vis_envs.physics.scalar.boxes.box_model import CONTACTS, CORNERS, LaneContacts, Side
+from jaxrl_vis_envs.physics.scalar.boxes.own_block import in_own_block
+from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
+from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
+from jaxrl_vis_envs.physics.scalar.links import FixedFrame
+from jaxrl_vis_envs.physics.scalar.partial_arithmetic import (
+    Vector,
+    add,
+    choose,
+    combine,
+    dot,
+    minus,
+    plus,
+    scale,
+    subtract,
+    times,
+)
+
+_FAR = 1.0  # distance that represents no contact, m
+_NONE = -1e30  # reach of a candidate outside of the overlap
+
+
+class _Box(NamedTuple):
+    """Position, axes (three vectors) and half-size of a box in the world."""
+
+    position: Vector
+    axes: tuple[Vector, Vector, Vector]
+    half_size: Vector
+
+
+class _Candidate(NamedTuple):
+    """Point of the other face, in its half edges, and True if it lies in the overlap of the faces."""
+
+    x: Any
+    y: Any
+    is_inside: Any
+
+
+class Place(NamedTuple):
+    """Position and axes (three vectors) of a box in the world."""
+
+    position: Vector
+    axes: tuple[Vector, Vector, Vector]
+
+
+def places(contacts: LaneContacts, frames: LinkFrames) -> list[list[Place]]:
+    """Return the places of the boxes that move, for each side."""
+    return [[_place(frame, frames) for _, frame in side.moving] for side in contacts.sides]
+
+
+def _place(frame: FixedFrame, frames: LinkFrames) -> Place:
+    x, y, z = (frames.direction(frame.link, frame.rotation[:, axis]) for axis in range(3))
+    return Place(frames.point(frame.link, frame.position), (x, y, z))
+
+
+def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> ContactPoint:
+    """Return the contacts of all lanes, from the result of `places`; normals point from the first box to the second."""
+    one, other = (_box(side, moving) for side, moving in zip(contacts.sides, places, strict=True))
+    reference, other, is_first = _reference_first(one, other)
+    offset = _into(reference.axes, subtract(other.position, reference.position))
+    other = _nearest_face_last(reference, other)
+    columns = [_into(reference.axes, axis) for axis in other.axes]
+    side = jnp.where(offset[2] >= 0, 1.0, -1.0)
+    towards = jnp.where(columns[2][2] >= 0, 1.0, -1.0)
+    centre = subtract(offset, scale(columns[2], side * towards * other.half_size[2]))
+    edges = scale(columns[0], other.half_size[0]), scale(columns[1], other.half_size[1])
+    zero = 0.0 * centre[0]
+    x, y, exists = in_own_block(
+        lambda face: _farthest(contacts, _candidates(*face)), (centre, edges, reference.half_size), (zero, zero, zero)
+    )
+    point = add(centre, scale(edges[0], x), scale(edges[1], y))
+    distance = minus(side * point[2], reference.half_size[2])
+    point = point[0], point[1], point[2] - 0.5 * side * distance
+    normal = scale(reference.axes[2], jnp.where(is_first, side, -side))
+    position = add(reference.position, combine(reference.axes, point))
+    return ContactPoint(jnp.where(exists > 0.5, distance, _FAR), position, normal)
+
+
+def _box(side: Side, moving: list[Place]) -> _Box:
+    """Return the box of a side in each lane."""
+    place = Place(side.position, side.axes)  # type: ignore[arg-type] - of three
+    for (is_here, _), other in zip(side.moving, moving, strict=True):
+        condition = is_here == 1.0 if isinstance(is_here, float) else is_here > 0.5
+        place = _choose_parts(condition, other, place)
+    return _Box(*place, side.half_size)  # type: ignore[arg-type] - of three
+
+
+def _into(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
+    """Express a vector in the frame with these axes."""
+    return dot(axes[0], vector), dot(axes[1], vector), dot(axes[2], vector)
+
+
+def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
+    """Order two boxes, and turn the axes of the first so that its face farthest from the other is across the last axis.
+
+    Returns:
+        The boxes in order, and True where the order is the given one.
+    """
+    offset = subtract(other.position, one.position)
+    turn = [[_abs(dot(axis, across)) for across in other.axes] for axis in one.axes]
+    gaps = []
+    for box, opposite, rows in ((one, other, turn), (other, one, list(zip(*turn, strict=True)))):
+        for axis, extent, row in zip(box.axes, box.half_size, rows, strict=True):
+            reach = plus(*(times(*pair) for pair in zip(row, opposite.half_size, strict=True)))
+            gaps.append(minus(minus(_abs(dot(axis, offset)), extent), reach))
+    face = _greatest(gaps)
+    is_first = face < 3.0
+    axis = jnp.where(is_first, face, face - 3.0)
+    return _turn_axes(_choose_parts(is_first, one, other), axis), _choose_parts(is_first, other, one), is_first
+
+
+def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
+    """Turn the axes of the other box so that its face nearest to the reference is across the last axis."""
+    return _turn_axes(other, _greatest([_abs(dot(reference.axes[2], axis)) for axis in other.axes]))
+
+
+def _greatest(numbers: list[Any]) -> Any:
+    """Return the index of the first of the greatest numbers, as float32."""
+    best, index = numbers[0], 0.0 * numbers[0]
+    for place, number in enumerate(numbers[1:], start=1):
+        is_greater = number > best
+        best, index = jnp.where(is_greater, number, best), jnp.where(is_greater, float(place), index)
+    return index
+
+
+def _choose_parts(condition: Any, one: Any, other: Any) -> Any:
+    """Select between two tuples of the same structure, part by part."""
+    if isinstance(one, tuple):
+        parts = [_choose_parts(condition, *pair) for pair in zip(one, other, strict=True)]
+        return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
+    is_same = isinstance(one, float) and isinstance(other, float) and one == other
+    return one if is_same else choose(condition, one, other)
+
+
+def _turn_axes(box: _Box, axis: Any) -> _Box:
+    """Permute the axes of a box cyclically, so that ``axis`` is the last."""
+    is_zero, is_one = axis < 0.5, (axis > 0.5) & (axis < 1.5)
+
+    def pick(parts: tuple[Any, ...], place: int) -> Any:
+        return jnp.where(is_zero, parts[(place + 1) % 3], jnp.where(is_one, parts[(place + 2) % 3], parts[place]))
+
+    axes = [tuple(pick(tuple(own[part] for own in box.axes), place) for part in range(3)) for place in range(3)]
+    return _Box(box.position, tuple(axes), tuple(pick(box.half_size, place) for place in range(3)))  # type: ignore[arg-type]
+
+
+def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector) -> list[_Candidate]:
+    """Return 24 points: the corners of the other face, those of the reference, and the crossings of their edges."""
+    (a, c, _), (b, d, _) = edges
+    inverse = 1.0 / (a * d - b * c)
+    places: list[tuple[Any, Any]] = list(CORNERS)
+    for x, y in CORNERS:
+        gap = minus(times(x, half_size[0]), centre[0]), minus(times(y, half_size[1]), centre[1])
+        places.append(((d * gap[0] - b * gap[1]) * inverse, (a * gap[1] - c * gap[0]) * inverse))
+    for edge in range(2):
+        for axis in range(2):
+            slope = edges[edge][axis]
+            is_along = slope == 0
+            inverse = 1.0 / jnp.where(is_along, 1.0, slope)
+            for end, sign in CORNERS:
+                rest = sign * half_size[axis] - centre[axis] - end * edges[1 - edge][axis]
+                place = jnp.where(is_along, 2.0, rest * inverse)
+                places.append((place, end) if edge == 0 else (end, place))
+    found = []
+    for x, y in places:
+        # Crossings and corners lie on the edges up to rounding.
+        inside = [_abs(part) <= 1.0 + 1e-5 for part in (x, y) if not isinstance(part, float)]
+        for axis in range(2):
+            point = plus(centre[axis], times(edges[0][axis], x), times(edges[1][axis], y))
+            inside.append(_abs(point) <= half_size[axis] + 1e-7)
+        is_inside = inside[0]
+        for more in inside[1:]:
+            is_inside = is_inside & more
+        found.append(_Candidate(x, y, is_inside))
+    return found
+
+
+def _farthest(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
+    """Return the candidate that reaches farthest towards each lane's corner, and 1 if no corner before has it, else 0."""
+    like = 0.0 * (candidates[4].x + contacts.number)
+    own, place_x, place_y, index = like + _NONE, like, like, like
+    reaches, chosen = [like + _NONE] * (CONTACTS - 1), [like] * (CONTACTS - 1)
+    for number, (x, y, is_inside) in enumerate(candidates):
+        reach = jnp.where(is_inside, plus(times(contacts.corner[0], x), times(contacts.corner[1], y)), _NONE)
+        is_farther = reach > own
+        own, index = jnp.where(is_farther, reach, own), jnp.where(is_farther, float(number), index)
+        place_x, place_y = jnp.where(is_farther, x, place_x), jnp.where(is_farther, y, place_y)
+        for corner, (along, across) in enumerate(CORNERS[: CONTACTS - 1]):
+            reach = jnp.where(is_inside, plus(times(along, x), times(across, y)), _NONE)
+            is_farther = reach > reaches[corner]
+            reaches[corner] = jnp.where(is_farther, reach, reaches[corner])
+            chosen[corner] = jnp.where(is_farther, float(number), chosen[corner])
+    exists = own > _NONE
+    for corner, other in enumerate(chosen):
+        exists = exists & ((other != index) | (contacts.number <= corner))
+    return place_x, place_y, jnp.where(exists, 1.0, 0.0)
+
+
+def _abs(number: Any) -> Any:
+    return abs(number) if isinstance(number, float) else jnp.abs(number)
