@@ -21,7 +21,7 @@ if __name__ == "__main__":
     family = dataclasses.replace(family, rig=dataclasses.replace(family.rig, frames=3))
     write_plot(SAMPLE, draw(family, SEED), "jpeg", "none", lambda plot, pair: None)
     for path in SAMPLE.glob("*.jpg"):
-        options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+        options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1, cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
         cv2.imwrite(str(path), cv2.imread(str(path)), options)
     (SAMPLE / "truth").rmdir()
     about = json.loads((SAMPLE / "plot.json").read_text())
