@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ledger.records import RESULTS
-from benchmarks.ledger.stalks_table import LENSES, lens_rows
+from benchmarks.ledger.tables.stalks import LENSES, lens_rows
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.provenance import device_name, revision

@@ -1,4 +1,4 @@
-"""Tables of docs/lab/results.md: rows from `result_rows`, figures from the records.
+"""Tables of docs/lab/results.md: rows from `lab_rows`, figures from the records.
 
 A figure without a record is written as `MISSING`, and `make stale` lists it.
 """
@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.ledger import evidence
 from benchmarks.ledger.evidence import Evidence
 from benchmarks.ledger.records import read_all
-from benchmarks.ledger.result_rows import DEVICES, LEARNING, SPEED, Figure, Learning
+from benchmarks.ledger.tables.lab_rows import DEVICES, LEARNING, SPEED, Figure, Learning
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to

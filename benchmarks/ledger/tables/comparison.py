@@ -8,8 +8,8 @@ from typing import Any
 from benchmarks.claims import ol_aux
 from benchmarks.ledger import evidence
 from benchmarks.ledger.records import RESULTS, read_all
-from benchmarks.ledger.result_rows import DEVICES, Figure
-from benchmarks.ledger.result_tables import MISSING, find, short
+from benchmarks.ledger.tables.lab_results import MISSING, find, short
+from benchmarks.ledger.tables.lab_rows import DEVICES, Figure
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.studies.figures.authors import released_curves
 
