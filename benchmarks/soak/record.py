@@ -72,14 +72,14 @@ class Record:
 
     def table(self) -> str:
         """Format the table of all faults as Markdown."""
-        lines = ["| fault | times | what must hold |", "|---|---|---|"]
+        lines = ["| fault | injected | guarantee |", "|---|---|---|"]
         lines += [f"| {name} | {self.faults.get(name, 0)} | {promise} |" for name, promise in PROMISES.items()]
         goodput = self.done / self.begun if self.begun else 1.0
-        held = "all of it held" if not self.broken else f"**{len(self.broken)} times it did not**"
+        held = "no violation" if not self.broken else f"**violations: {len(self.broken)}**"
         lines += [
-            f"| all | {self.total} | {held}; {self.runs} training runs, none with a row missing or twice, {self.exact} of them "
-            f"with the metrics.jsonl of an undisturbed run, bit for bit; goodput {goodput:.3f} at {self.resumes} resumptions, "
-            f"replay lost {self.replays_lost} times |"
+            f"| all | {self.total} | {held}; {self.runs} training runs without missing or duplicate rows; "
+            f"metrics.jsonl of {self.exact} bit-identical to an undisturbed run; goodput {goodput:.3f} over {self.resumes} "
+            f"resumptions; replay lost {self.replays_lost} times |"
         ]
         return "\n".join(lines) + "\n"
 
