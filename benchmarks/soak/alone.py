@@ -296,7 +296,7 @@ class Alone:
     """Fault with a folder of its own; see the module."""
 
     strike: Callable[[Path, random.Random, References], None]
-    promise: str
+    guarantee: str
 
 
 ALONE: dict[str, Alone] = {

@@ -32,14 +32,14 @@ class Fault:
 
     Attributes:
         strike: Function of the run folder and a random generator that injects the fault.
-        promise: Guaranteed outcome, for the table.
+        guarantee: Guaranteed outcome, for the table.
         statuses: Permitted exit statuses of the process.
         spoils: True if a row of metrics.jsonl, or the run itself, may be lost.
         goes_back: True if the run may resume from an older checkpoint than the newest; `strike` checks which one.
     """
 
     strike: Strike
-    promise: str
+    guarantee: str
     statuses: tuple[int, ...]
     spoils: bool = False
     goes_back: bool = False

@@ -13,7 +13,7 @@ from benchmarks.soak.alone import ALONE
 from benchmarks.soak.faults import FAULTS
 from jaxrl_vis.host import provenance
 
-PROMISES = {name: fault.promise for name, fault in (FAULTS | ALONE).items()}
+GUARANTEES = {name: fault.guarantee for name, fault in (FAULTS | ALONE).items()}
 
 
 def _machine() -> dict[str, Any]:
@@ -44,7 +44,7 @@ class Record:
     machine: dict[str, Any] = dataclasses.field(default_factory=_machine)
     seed: int = 0
     minutes: float = 0.0
-    faults: dict[str, int] = dataclasses.field(default_factory=lambda: dict.fromkeys(PROMISES, 0))
+    faults: dict[str, int] = dataclasses.field(default_factory=lambda: dict.fromkeys(GUARANTEES, 0))
     runs: int = 0
     exact: int = 0
     done: int = 0
@@ -73,7 +73,7 @@ class Record:
     def table(self) -> str:
         """Format the table of all faults as Markdown."""
         lines = ["| fault | injected | guarantee |", "|---|---|---|"]
-        lines += [f"| {name} | {self.faults.get(name, 0)} | {promise} |" for name, promise in PROMISES.items()]
+        lines += [f"| {name} | {self.faults.get(name, 0)} | {guarantee} |" for name, guarantee in GUARANTEES.items()]
         goodput = self.done / self.begun if self.begun else 1.0
         held = "no violation" if not self.broken else f"**violations: {len(self.broken)}**"
         lines += [
@@ -96,6 +96,6 @@ def added(records: Sequence[Record]) -> Record:
         raise ValueError("two records of the same seed: the same piece twice?")
     names = ("minutes", "runs", "exact", "done", "begun", "resumes", "replays_lost")
     sums = {name: sum(getattr(record, name) for record in records) for name in names}
-    faults = {name: sum(record.faults.get(name, 0) for record in records) for name in PROMISES}
+    faults = {name: sum(record.faults.get(name, 0) for record in records) for name in GUARANTEES}
     broken = [line for record in records for line in record.broken]
     return Record(records[0].machine, records[0].seed, faults=faults, broken=broken, **sums)

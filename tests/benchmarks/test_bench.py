@@ -217,7 +217,7 @@ def test_peaks_take_the_longest_name() -> None:
     shares = roofline.describe(roofline.Cost(989e9, 3.35e9), 0.01, "bfloat16", "NVIDIA H100 80GB HBM3")
     assert shares["share_of_peak_flops"] == pytest.approx(0.1)
     assert shares["share_of_peak_bandwidth"] == pytest.approx(0.1)
-    assert shares["updates_per_s_at_the_roof"] == 1000
+    assert shares["roofline_updates_per_s"] == 1000
 
 
 def test_noise_fills_the_whole_replay() -> None:
@@ -289,7 +289,7 @@ def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypat
         assert set(parts) == {"rollout", "insert", "updates", "evaluation", "host", "env"}
         assert all(part > 0.0 for name, part in parts.items() if name != "host") and parts["host"] >= 0.0
         iteration = 1e3 * 3 * Dot.horizon / found[0].value  # ms; 3 environments
-        assert found[0].details["share_of_promise"] == pytest.approx((parts["env"] + parts["updates"]) / iteration, rel=0.01)
+        assert found[0].details["share_of_predicted"] == pytest.approx((parts["env"] + parts["updates"]) / iteration, rel=0.01)
 
 
 def test_what_one_of_several_devices_does() -> None:

@@ -108,7 +108,7 @@ def _lines(results: Path) -> Iterator[str]:
     rows = {row.label: _rate_cells(row, records) for row in RATES}
     label = f"VisualFetchReach learnt from images to {100 * _LEARNT:.0f} % success"
     rows[label] = _learning_cells(results)
-    yield "| what | here | instead | ratio |"
+    yield "| measurement | jaxrl-vis | alternative | ratio |"
     yield "|---|---|---|---|"
     for label, cells in rows.items():
         yield f"| {label} | {' | '.join(cells or (MISSING, '', ''))} |"

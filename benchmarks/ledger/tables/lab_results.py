@@ -71,7 +71,7 @@ def speed_cell(figures: tuple[Figure, ...], device: str, records: list[dict[str,
 def speed_table(results: Path) -> str:
     """Write the speed table, as Markdown."""
     records = [record for _, record in read_all(results) if record["name"] != evidence.NAME]
-    lines = [f"| what | {' | '.join(DEVICES)} |", "|---" * (1 + len(DEVICES)) + "|"]
+    lines = [f"| benchmark | {' | '.join(DEVICES)} |", "|---" * (1 + len(DEVICES)) + "|"]
     for row in SPEED:
         cells = (speed_cell(row.figures.get(column, ()), device, records) for column, device in DEVICES.items())
         lines.append(f"| {row.label} | {' | '.join(cells)} |")
@@ -144,7 +144,7 @@ def _machine(device: dict[str, Any]) -> str:
 
 def results_table(results: Path) -> str:
     """Write the results table, as Markdown."""
-    lines = ["| what | machine | figure | command |", "|---|---|---|---|"]
+    lines = ["| experiment | machine | result | command |", "|---|---|---|---|"]
     for row in LEARNING:
         runs = load_runs(row, results)
         command = row.command or training_command(next(iter(row.runs.values())))
