@@ -39,7 +39,7 @@ def test_pieces_are_added(tmp_path):
     assert total.faults["SIGKILL"] == 20 and total.total == 2 * (len(GUARANTEES) - 1 + 10) and len(GUARANTEES) >= 15
     assert (total.minutes, total.runs, total.exact, total.resumes, total.replays_lost) == (18.0, 12, 10, 96, 2)
     table = total.table()
-    assert "| SIGKILL | 20 |" in table and "goodput 0.990 at 96 resumptions, replay lost 2 times" in table
+    assert "| SIGKILL | 20 |" in table and "goodput 0.990 over 96 resumptions; replay lost 2 times" in table
     begin, end = "<!-- soak: begin -->\n", "<!-- soak: end -->\n"
     assert fill(f"before\n{begin}old\n{end}after\n", "soak", table) == f"before\n{begin}{table}{end}after\n"
     assert pages.soak(tmp_path) == table and pages.soak(tmp_path / "soak") is None
