@@ -9,13 +9,17 @@ import pytest
 
 from benchmarks.ledger import pages
 from benchmarks.ledger.markers import fill
+from benchmarks.soak import parts
 from benchmarks.soak.record import GUARANTEES, Record, added
 from benchmarks.soak.soak import Soak
 
 FAULTS, WORKERS = 2, 2
 
 
-def test_a_minute_of_faults(tmp_path):
+def test_a_minute_of_faults(tmp_path, monkeypatch):
+    options = list(parts.OPTIONS)
+    options[options.index("--env-steps") + 1] = str(80 * parts.STEPS)  # a third of a soak's runs
+    monkeypatch.setattr(parts, "OPTIONS", options)
     soak = Soak(tmp_path, FAULTS, 0, math.inf, note=lambda record: None, alone=False)
     soak.undisturbed()
     with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
