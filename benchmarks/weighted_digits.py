@@ -71,7 +71,7 @@ def problems() -> dict[str, Problem]:
     }
     classes = {"digit": 10, "even": 2, "high": 2, "holes": 3, "ink": 4}
 
-    def asked(indices: np.ndarray, digit: str = "digit") -> Split:
+    def label(indices: np.ndarray, digit: str = "digit") -> Split:
         named = {digit if name == "digit" else name: values[indices] for name, values in answers.items()}
         return {"x": images[indices].reshape(-1, 64), **named}
 
@@ -89,10 +89,10 @@ def problems() -> dict[str, Problem]:
             {name: pair(np.tile(indices, 4), seed) for seed, (name, indices) in enumerate(rows.items())},
             ("upper", "lower"),
         ),
-        "questions": Problem(classes, {name: asked(indices) for name, indices in rows.items()}, tuple(classes)),
+        "questions": Problem(classes, {name: label(indices) for name, indices in rows.items()}, tuple(classes)),
         "helped": Problem(
             {jw.MAIN if name == "digit" else name: count for name, count in classes.items()},
-            {name: asked(indices, jw.MAIN) for name, indices in few.items()},
+            {name: label(indices, jw.MAIN) for name, indices in few.items()},
             (jw.MAIN,),
         ),
     }

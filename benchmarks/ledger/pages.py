@@ -39,8 +39,8 @@ def soak(results: Path) -> str | None:
     """Return the table of docs/reliability.md, summed over the records in ``soak``, as Markdown; None if there are none."""
     from benchmarks.soak.record import Record, added
 
-    pieces = sorted((results / "soak").glob("*.json"))
-    return added([Record.read(piece) for piece in pieces]).table() if pieces else None
+    files = sorted((results / "soak").glob("*.json"))
+    return added([Record.read(file) for file in files]).table() if files else None
 
 
 PAGES: dict[str, dict[str, Writer]] = {

@@ -127,7 +127,7 @@ def describe(iteration: float, parts: dict[str, float], predicted: float) -> str
     return "\n".join(lines)
 
 
-def share_of_one(config: Config) -> Config:
+def single_device_config(config: Config) -> Config:
     """Return the configuration of one device's part of a run, as a run on one device."""
     parts = data_devices(config)
     return config.replace(
@@ -141,8 +141,8 @@ def share_of_one(config: Config) -> Config:
 
 
 def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
-    """Time an iteration of `share_of_one`, in seconds."""
-    config_of_one = share_of_one(config)
+    """Time an iteration of `single_device_config`, in seconds."""
+    config_of_one = single_device_config(config)
     return time_iterations(Programs(config_of_one, make_train_step(env, config_of_one), cache=False), settings.repeats)[
         1
     ].median_s

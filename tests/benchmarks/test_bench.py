@@ -295,9 +295,9 @@ def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypat
 def test_what_one_of_several_devices_does() -> None:
     """The measure of efficiency: a run of one device with its share of the seeds, or of the learner."""
     config = preset("debug", seeds=6, num_envs=8, batch_size=16, replay_transitions=800)
-    seeds = train.share_of_one(config.replace(devices=2))
+    seeds = train.single_device_config(config.replace(devices=2))
     assert (seeds.run.devices, seeds.run.seeds, seeds.run.num_envs, seeds.run.batch_size) == (1, 3, 8, 16)
-    parts = train.share_of_one(config.replace(devices=4, data_devices=2))
+    parts = train.single_device_config(config.replace(devices=4, data_devices=2))
     assert (parts.run.seeds, parts.run.num_envs, parts.run.batch_size, parts.run.replay_transitions) == (3, 4, 8, 400)
 
 
