@@ -119,6 +119,7 @@ FIRST = (*TASKS, "test_trainer", "test_render_parity")
 # Not test_signals: it makes JAX forget what was traced.
 SHARED = dict.fromkeys(("test_docs", "test_notebooks", "test_resume"), "test_trainer") | {
     "test_encoder": "test_audit",
+    "test_export": "test_policy",
     "test_phenotype_train": "test_detector",
 }
 
