@@ -306,7 +306,7 @@ def test_a_table_says_where_an_iteration_goes() -> None:
     lines = {" ".join(line.split()[:-3]): line.split()[-3:] for line in train.describe(1.0, parts, 0.7).splitlines()}
     assert lines["rollout"] == ["250.00", "ms", "25.0%"]
     assert lines["sum without evaluation"] == ["800.00", "ms", "80.0%"]
-    assert lines["promised"] == ["700.00", "ms", "70.0%"]
+    assert lines["predicted"] == ["700.00", "ms", "70.0%"]
 
 
 @pytest.mark.usefixtures("dots")
