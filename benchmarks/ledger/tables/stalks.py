@@ -20,7 +20,7 @@ def lens_table(results: Path = RESULTS) -> str | None:
 
 def lens_rows(lenses: dict[str, Any]) -> str:
     """Format a table of lenses from results by focal length factor; see `benchmarks.stalks.lenses.evaluate_row`."""
-    usual = lenses.get("1", {"width_errors_mm": {}})["width_errors_mm"]
+    reference_errors = lenses.get("1", {"width_errors_mm": {}})["width_errors_mm"]
     lines = [
         "| focal length | pixels per m | view, m | stalk count | detected | false positives | ground detected | widths "
         "| error, mm | difference from x 1, mm | `phenotype run` |",
@@ -28,7 +28,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
     ]
     for factor, lens in lenses.items():
         errors = lens["width_errors_mm"]
-        differences = [errors[stalk] - usual[stalk] for stalk in errors.keys() & usual.keys()]
+        differences = [errors[stalk] - reference_errors[stalk] for stalk in errors.keys() & reference_errors.keys()]
         tried = lens["pixels_per_metre"] >= TRIED.pixels_per_metre and lens["view_m"] >= TRIED.view
         cells = (
             f"x {factor}",
