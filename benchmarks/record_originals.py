@@ -21,7 +21,7 @@ import numpy as np
 
 STEPS = 50
 LIFTED = 0.5  # height of the grip at which the fingers pass over the object, m
-BEHIND = 0.065  # distance of the grip from the middle of the object before it pushes, m
+PUSH_OFFSET = 0.065  # distance of the grip from the middle of the object before it pushes, m
 MIN_PUSH = 0.08  # m
 MAX_OBLIQUITY = 0.1  # standard deviation of the direction of a push from a face's normal, rad
 
@@ -141,7 +141,7 @@ class Pusher:
         way = self.place - object_position[:2]
         left = np.linalg.norm(way)
         way = way / max(left, 1e-6)
-        behind = object_position[:2] - BEHIND * way
+        behind = object_position[:2] - PUSH_OFFSET * way
         aside = np.linalg.norm(behind - grip[:2])
         self.is_down |= not self.control and grip[2] < self.height + 0.01 and aside < 0.03
         action = np.zeros(4)

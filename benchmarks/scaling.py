@@ -194,32 +194,35 @@ def check_resume(saved: Timed, others: list[Config], env: Any, single: Timed) ->
 
 
 @dataclasses.dataclass(frozen=True)
-class Figure:
-    """Configuration on several devices, and its reference.
+class Comparison:
+    """Training on several devices, and its reference on one.
 
     Attributes:
         kind: seeds, weak or strong.
-        timed: The configuration.
-        one: Its reference on one device.
+        timed: Training on several devices.
+        reference: Training on one device.
     """
 
     kind: str
     timed: Timed
-    one: Timed
+    reference: Timed
 
 
-def make_figures(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Figure]:
+def make_comparisons(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Comparison]:
     """Create all configurations to be measured."""
     one_of = {batch: Timed(base.replace(batch_size=batch), env, False) for batch in batches}
-    one_seeds, figures = Timed(base.replace(seeds=seeds), env, True), []
+    one_seeds, comparisons = Timed(base.replace(seeds=seeds), env, True), []
     for count in numbers:
-        figures.append(Figure("seeds", Timed(base.replace(seeds=seeds * count, devices=count), env, True), one_seeds))
+        comparisons.append(Comparison("seeds", Timed(base.replace(seeds=seeds * count, devices=count), env, True), one_seeds))
         for batch, one in one_of.items():
             sizes = {"batch_size": batch, "num_envs": base.run.num_envs, "replay_transitions": base.run.replay_transitions}
             weak = base.replace(devices=count, **{name: size * count for name, size in sizes.items()})
             strong = base.replace(devices=count, batch_size=batch)
-            figures += [Figure("weak", Timed(weak, env, False), one), Figure("strong", Timed(strong, env, False), one)]
-    return figures
+            comparisons += [
+                Comparison("weak", Timed(weak, env, False), one),
+                Comparison("strong", Timed(strong, env, False), one),
+            ]
+    return comparisons
 
 
 def compare(
@@ -250,12 +253,12 @@ def compare(
     return line, Measurement(f"scaling/{kind}", round(speedup, 4), "x one device", described, details)
 
 
-def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
+def measure_all_reduce(comparison: Comparison) -> tuple[str, Measurement]:
     """Measure the time of an update's all-reduce; return a line, and the record."""
-    train, count = figure.timed.programs.shapes.train, figure.timed.config.run.devices
+    train, count = comparison.timed.programs.shapes.train, comparison.timed.config.run.devices
     numbers = sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves((train.agent.actor, train.agent.critic)))
     seconds = all_reduce_seconds(numbers, count)
-    updates = figure.timed.config.run.updates_per_iteration
+    updates = comparison.timed.config.run.updates_per_iteration
     line = (
         f"all-reduce of {numbers:,} float32 over {count} devices: {1e6 * seconds:.1f} us, "
         f"{1e3 * seconds * updates:.1f} ms in the {updates} updates of an iteration"
@@ -265,19 +268,19 @@ def measure_all_reduce(figure: Figure) -> tuple[str, Measurement]:
 
 
 def measure_in_processes(
-    figures: list[Figure], positions: list[int], times: list[list[float]]
+    comparisons: list[Comparison], positions: list[int], times: list[list[float]]
 ) -> list[tuple[str, Measurement]]:
     """Time the same training by two processes with half of the devices each; return lines of the table, and the records.
 
     Args:
-        figures: Configurations to be repeated, all on the same number of devices.
+        comparisons: Configurations to be repeated, all on the same number of devices.
         positions: Index of each among all configurations.
         times: Times of an iteration of each by one process, s.
     """
     with socket.socket() as free:
         free.bind(("localhost", 0))
         place = ["--coordinator", f"localhost:{free.getsockname()[1]}", "--positions", *map(str, positions)]
-    half = figures[0].timed.config.run.devices // 2
+    half = comparisons[0].timed.config.run.devices // 2
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(map(str, range(2 * half)))).split(",")
     children = []
     for index in range(2):
@@ -290,9 +293,9 @@ def measure_in_processes(
     if any(child.returncode for child in children):
         raise SystemExit(f"two processes ended with {', '.join(str(child.returncode) for child in children)}")
     results = []
-    for figure, one, two in zip(figures, times, json.loads(printed[0].splitlines()[-1]), strict=True):
-        line, measurement = compare("processes", figure.timed.config, one, two, 1)
-        kind = f"scaling/processes_{figure.kind}"
+    for comparison, one, two in zip(comparisons, times, json.loads(printed[0].splitlines()[-1]), strict=True):
+        line, measurement = compare("processes", comparison.timed.config, one, two, 1)
+        kind = f"scaling/processes_{comparison.kind}"
         results.append((line, dataclasses.replace(measurement, name=kind, unit="x one process")))
     return results
 
@@ -349,9 +352,9 @@ def main() -> None:
     base = preset("fast", env=options.env, num_envs=envs, replay_transitions=100_000)
     base = base.replace(**QUICK, replay_transitions=50 * envs) if options.quick else base
     env = make_env(base)
-    figures = make_figures(base, env, numbers, SMALL_BATCHES if options.quick else BATCHES, options.seeds_per_device)
-    alone = list({id(figure.one): figure.one for figure in figures}.values())
-    everything = [*alone, *(figure.timed for figure in figures)]
+    comparisons = make_comparisons(base, env, numbers, SMALL_BATCHES if options.quick else BATCHES, options.seeds_per_device)
+    alone = list({id(pair.reference): pair.reference for pair in comparisons}.values())
+    everything = [*alone, *(pair.timed for pair in comparisons)]
     if options.compile_only is not None:
         everything[options.compile_only].compile()
         return
@@ -371,29 +374,29 @@ def main() -> None:
         times[id(one)] = one.run(options.cycles)
         one.loop = None  # makes room
     keep(HEAD)
-    for figure in figures:
-        times[id(figure)] = figure.timed.run(options.cycles)
-        ideal = figure.timed.config.run.devices
-        keep(*compare(figure.kind, figure.timed.config, times[id(figure.one)], times[id(figure)], ideal))
+    for pair in comparisons:
+        times[id(pair)] = pair.timed.run(options.cycles)
+        ideal = pair.timed.config.run.devices
+        keep(*compare(pair.kind, pair.timed.config, times[id(pair.reference)], times[id(pair)], ideal))
         is_last = (
-            figure is [other for other in figures if other.timed.config.run.devices == figure.timed.config.run.devices][-1]
+            pair is [other for other in comparisons if other.timed.config.run.devices == pair.timed.config.run.devices][-1]
         )
         if is_last:  # one learner, of the smallest batch
-            keep(*measure_all_reduce(figure))
-            counts = (1, *(count for count in numbers if count < figure.timed.config.run.devices))
+            keep(*measure_all_reduce(pair))
+            counts = (1, *(count for count in numbers if count < pair.timed.config.run.devices))
             for line in check_resume(
-                figure.timed, [figure.timed.config.replace(devices=count) for count in counts], env, figure.one
+                pair.timed, [pair.timed.config.replace(devices=count) for count in counts], env, pair.reference
             ):
                 keep(line)
-            figure.one.loop = None
-        figure.timed.loop = None
+            pair.reference.loop = None
+        pair.timed.loop = None
     write_records(options.json, watch, measurements)
     if numbers[-1] % 2 == 0:
         again = [
-            figure for figure in figures if figure.timed.config.run.devices == numbers[-1] and figure.kind in ("seeds", "weak")
+            pair for pair in comparisons if pair.timed.config.run.devices == numbers[-1] and pair.kind in ("seeds", "weak")
         ][:2]
-        positions = [len(alone) + figures.index(figure) for figure in again]
-        for line, measurement in measure_in_processes(again, positions, [times[id(figure)] for figure in again]):
+        positions = [len(alone) + comparisons.index(pair) for pair in again]
+        for line, measurement in measure_in_processes(again, positions, [times[id(pair)] for pair in again]):
             keep(line, measurement)
     took = time.perf_counter() - began
     print(

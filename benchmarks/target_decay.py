@@ -95,8 +95,8 @@ def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[s
     title, levels, budget = TASKS[task]
     theirs = released_curves()
     lines = [
-        f"| {title} | decay | seeds | {' | '.join(f'to {level:g}' for level in levels)} | mean success to "
-        f"{show_steps(budget)}, IQM (95 %) | from the authors' curve |",
+        f"| {title} | decay | seeds | {' | '.join(f'steps to {level:g}' for level in levels)} | mean success to "
+        f"{show_steps(budget)}, IQM (95 %) | distance to the authors' curve |",
         "|---|---|---|" + "---|" * len(levels) + "---|---|",
     ]
     for variant, label in VARIANTS.items():

@@ -3,11 +3,11 @@
     python -m benchmarks.weighted_digits [--only NAME ...] [--json FILE]
 
     pairs       two superimposed digits: classify the upper and the lower one
-    questions   five questions about one digit: which, even, above four, how many holes, how much ink
-    helped      the same with 100 images: the digit's class is the main task, the other four are auxiliary
+    attributes  five attributes of one digit: class, parity, above four, number of holes, amount of ink
+    auxiliary   the same with 100 images: the digit's class is the main task, the other four are auxiliary
 
 Each method is trained with Adam at `RATES` on seeds 0 to 14; the rate with the best validation accuracy is used for seeds 100
-to 114, whose test accuracy is reported. Methods with a main loss are tested only on ``helped``, where only the main task's
+to 114, whose test accuracy is reported. Methods with a main loss are tested only on ``auxiliary``, where only the main task's
 accuracy counts. The record is written after each method, and methods that it already holds are not trained again.
 """
 
@@ -71,7 +71,7 @@ def problems() -> dict[str, Problem]:
     }
     classes = {"digit": 10, "even": 2, "high": 2, "holes": 3, "ink": 4}
 
-    def asked(indices: np.ndarray, digit: str = "digit") -> Split:
+    def label(indices: np.ndarray, digit: str = "digit") -> Split:
         named = {digit if name == "digit" else name: values[indices] for name, values in answers.items()}
         return {"x": images[indices].reshape(-1, 64), **named}
 
@@ -89,10 +89,10 @@ def problems() -> dict[str, Problem]:
             {name: pair(np.tile(indices, 4), seed) for seed, (name, indices) in enumerate(rows.items())},
             ("upper", "lower"),
         ),
-        "questions": Problem(classes, {name: asked(indices) for name, indices in rows.items()}, tuple(classes)),
-        "helped": Problem(
+        "attributes": Problem(classes, {name: label(indices) for name, indices in rows.items()}, tuple(classes)),
+        "auxiliary": Problem(
             {jw.MAIN if name == "digit" else name: count for name, count in classes.items()},
-            {name: asked(indices, jw.MAIN) for name, indices in few.items()},
+            {name: label(indices, jw.MAIN) for name, indices in few.items()},
             (jw.MAIN,),
         ),
     }

@@ -118,7 +118,9 @@ FIRST = (*TASKS, "test_trainer", "test_render_parity")
 # Files that share the programs of another one: notebooks and pages train with the smallest preset, as tests of the trainer do.
 # Not test_signals: it makes JAX forget what was traced.
 SHARED = dict.fromkeys(("test_docs", "test_notebooks", "test_resume"), "test_trainer") | {
-    "test_phenotype_train": "test_detector"
+    "test_encoder": "test_audit",
+    "test_export": "test_policy",
+    "test_phenotype_train": "test_detector",
 }
 
 

@@ -363,7 +363,7 @@ def _seeds(claim: Claim) -> str:
 
 
 def _table() -> str:
-    lines = ["| claim of the thesis | here | what we find | interval | seeds | figure |", "|---|---|---|---|---|---|"]
+    lines = ["| claim of the thesis | outcome | finding | interval | seeds | figure |", "|---|---|---|---|---|---|"]
     lines += [
         f"| {row.claim} | {row.answer} | {row.finding} | {row.interval} | {_seeds(row)} | {row.source} |" for row in claims()
     ]
@@ -372,7 +372,7 @@ def _table() -> str:
 
 
 def _short() -> str:
-    lines = ["| claim of the thesis | here | what we find |", "|---|---|---|"]
+    lines = ["| claim of the thesis | outcome | finding |", "|---|---|---|"]
     lines += [f"| {row.claim} | {row.answer} | {row.finding} |" for row in claims() if row.main]
     return "\n".join([*lines, "", "Intervals, p-values, seeds and figures: [Claims of the thesis](docs/claims.md)."])
 

@@ -1,12 +1,12 @@
 """Ledger: the stored records in benchmarks/results, the tables written from them, and their staleness.
 
-    records          reading of records                      evidence     training runs behind learning figures
-    result_rows      rows of docs/lab/results.md             staleness    records that are older than the measured code
-    result_tables    tables of docs/lab/results.md           ablations    learning curves of the ablations, one table
-    comparison_table comparison with peers in the README     render_table tables of docs/lab/renderer_speed.md
-    scaling_table    tables of docs/scaling.md               markers      position of a table in its page
-    pixels_table     table of docs/pixels.md                 platforms_table  tables of docs/where_it_ran.md
-    pages            every page with tables from records
+    records      reading of records
+    evidence     training runs behind learning figures
+    ablations    learning curves of the ablations, one compressed table
+    staleness    records that are older than the measured code
+    tables/      one file per page or family of tables, as Markdown
+    markers      position of a table in its page
+    pages        every page with tables from records
 
     python -m benchmarks.ledger tables     write the tables of README and docs (`make tables`)
     python -m benchmarks.ledger stale      list stale records, rows without a record, and outdated tables (`make stale`)

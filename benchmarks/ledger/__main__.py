@@ -2,15 +2,16 @@
 
 python -m benchmarks.ledger tables         write the tables of README and docs
 python -m benchmarks.ledger stale          list stale records, rows without a record, and outdated tables; exit 1 if any
-python -m benchmarks.ledger keep RUN NAME  store the evaluations of a run under a name of `result_rows.LEARNING`
+python -m benchmarks.ledger keep RUN NAME  store the evaluations of a run under a name of `tables.lab_rows.LEARNING`
 """
 
 import argparse
 import sys
 from pathlib import Path
 
-from benchmarks.ledger import evidence, pages, result_tables, staleness
+from benchmarks.ledger import evidence, pages, staleness
 from benchmarks.ledger.records import CHECKOUT, RESULTS
+from benchmarks.ledger.tables import lab_results as tables
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 
@@ -28,8 +29,8 @@ def complaints(results: Path, checkout: Path) -> list[str]:
     lines = []
     if provenance.is_checkout(checkout):
         lines += [str(stale) for stale in staleness.stale_records(results, checkout)]
-    if (checkout / result_tables.PAGE).exists():
-        lines += [f"{result_tables.PAGE}: {complaint}" for complaint in result_tables.missing_rows(results)]
+    if (checkout / tables.PAGE).exists():
+        lines += [f"{tables.PAGE}: {complaint}" for complaint in tables.missing_rows(results)]
     return lines + list(pages.outdated(results, checkout))
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from benchmarks.ledger.records import RESULTS
-from benchmarks.ledger.result_tables import short
+from benchmarks.ledger.tables.lab_results import short
 
 FILE = "ablations.jsonl.gz"
 UNKNOWN = "unknown"

@@ -5,23 +5,23 @@ from pathlib import Path
 
 from benchmarks import target_decay
 from benchmarks.claims import pages as claims
-from benchmarks.ledger import (
-    ablations,
-    comparison_table,
-    contrastive_table,
-    exported_table,
-    host_table,
-    pixels_table,
-    platforms_table,
-    push_table,
-    render_table,
-    result_tables,
-    scaling_table,
-    stalks_table,
-    weighting_table,
-)
+from benchmarks.ledger import ablations
 from benchmarks.ledger.markers import fill
 from benchmarks.ledger.records import CHECKOUT, RESULTS
+from benchmarks.ledger.tables import (
+    comparison,
+    contrastive,
+    exported,
+    host,
+    lab_results,
+    pixels,
+    platforms,
+    push,
+    render,
+    scaling,
+    stalks,
+    weighting,
+)
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.files import write_atomically
 
@@ -40,29 +40,29 @@ def soak(results: Path) -> str | None:
     """Return the table of docs/reliability.md, summed over the records in ``soak``, as Markdown; None if there are none."""
     from benchmarks.soak.record import Record, added
 
-    pieces = sorted((results / "soak").glob("*.json"))
-    return added([Record.read(piece) for piece in pieces]).table() if pieces else None
+    files = sorted((results / "soak").glob("*.json"))
+    return added([Record.read(file) for file in files]).table() if files else None
 
 
 PAGES: dict[str, dict[str, Writer]] = {
-    "README.md": {"comparison": comparison_table.comparison_table},
-    "docs/index.md": {"comparison": comparison_table.comparison_table},
-    "docs/lab/results.md": {"results table": result_tables.results_table, "speed table": result_tables.speed_table},
-    "docs/scaling.md": {"devices": scaling_table.devices_table, "processes": scaling_table.processes_table},
-    "docs/lab/renderer_speed.md": {"warp": render_table.warp_table, "mujoco": render_table.mujoco_table},
+    "README.md": {"comparison": comparison.comparison_table},
+    "docs/index.md": {"comparison": comparison.comparison_table},
+    "docs/lab/results.md": {"results table": lab_results.results_table, "speed table": lab_results.speed_table},
+    "docs/scaling.md": {"devices": scaling.devices_table, "processes": scaling.processes_table},
+    "docs/lab/renderer_speed.md": {"warp": render.warp_table, "mujoco": render.mujoco_table},
     "docs/reliability.md": {"soak": soak},
     "docs/lab/renderer_parity.md": {"table": renderer_parity},
-    "docs/phenotyping.md": {"lenses": stalks_table.lens_table, "coverage": stalks_table.coverage_table},
-    "docs/export.md": {"policies": exported_table.exported_table},
-    "docs/algorithms.md": {"forms": contrastive_table.forms_table},
-    "docs/indicator_rewards.md": {"host": host_table.host_table},
-    "docs/pixels.md": {"tasks": pixels_table.tasks_table, "training": pixels_table.training_table},
-    "docs/tasks.md": {"push on a GPU": push_table.gpu_table, "push on a CPU": push_table.cpu_table},
-    "docs/where_it_ran.md": {"platforms": platforms_table.platforms_table, "not run": platforms_table.not_run_table},
+    "docs/phenotyping.md": {"lenses": stalks.lens_table, "coverage": stalks.coverage_table},
+    "docs/export.md": {"policies": exported.exported_table},
+    "docs/algorithms.md": {"forms": contrastive.forms_table},
+    "docs/indicator_rewards.md": {"host": host.host_table},
+    "docs/pixels.md": {"tasks": pixels.tasks_table, "training": pixels.training_table},
+    "docs/tasks.md": {"push on a GPU": push.gpu_table, "push on a CPU": push.cpu_table},
+    "docs/where_it_ran.md": {"platforms": platforms.platforms_table, "not run": platforms.not_run_table},
     "docs/weighting.md": {
-        "digits": weighting_table.digits_table,
-        "torchjd": weighting_table.torchjd_table,
-        "cost": weighting_table.cost_table,
+        "digits": weighting.digits_table,
+        "torchjd": weighting.torchjd_table,
+        "cost": weighting.cost_table,
     },
     "docs/lab/ablations.md": {"curves": ablations.index_table},
     "docs/lab/target_decay.md": {"tables": target_decay.tables},

@@ -91,7 +91,7 @@ def measurements(name: str, evaluations: list[dict[str, float]], settings: dict[
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Train, and store the record (not for a smoke run); return the exit status."""
+    """Train, and store the record unless it is a smoke run; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=TASKS, default="CartpoleBalance")
     parser.add_argument("--smoke", action="store_true", help="a few steps of a few environments, without a record")

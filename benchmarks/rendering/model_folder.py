@@ -32,7 +32,7 @@ from jaxrl_vis_envs.render.reference import ReferenceRenderer
 SUFFIXES = (".xml", ".mjcf", ".urdf")
 VOID = 0.002  # fraction of an image; if less of it shows an object, there is nothing to compare
 SEEN_PIXELS = 12  # minimum number of pixels, away from edges, of an object that must not be missing
-LOUD = 16  # grey levels
+LARGE_DIFFERENCE = 16  # grey levels
 SHIFT = 2e-6  # camera displacement relative to the model's extent that should not change the image
 SKY = 0.69  # fraction of zfar beyond which the sky occludes colours, see docs/renderer.md
 FINE = 1e-3  # cell size of a plane's grid, m; MuJoCo makes at most some 200 cells per row
@@ -48,7 +48,7 @@ class Measures:
         depth: Fraction of object pixels with the same depth, within 1 mm or a thousandth.
         rgb: Mean absolute difference, grey levels of 255.
         max_difference: Maximum absolute difference, grey levels of 255.
-        loud: Fraction of pixels with a channel that differs by more than 16 grey levels.
+        large_differences: Fraction of pixels with a channel that differs by more than 16 grey levels.
         matched: Minimum of `render_comparison.matched_shares`.
         missing: Labels that are visible in MuJoCo's image and absent from ours.
     """
@@ -57,7 +57,7 @@ class Measures:
     depth: float = 1.0
     rgb: float = 0.0
     max_difference: int = 0
-    loud: float = 0.0
+    large_differences: float = 0.0
     matched: float = 1.0
     missing: tuple[int, ...] = ()
 
@@ -67,7 +67,7 @@ class Measures:
             "seg": self.segmentation >= 0.99,
             "depth": self.depth >= 0.995,
             "rgb": self.rgb <= 4.0,
-            ">16": self.loud <= 0.02,
+            ">16": self.large_differences <= 0.02,
             "match": self.matched >= 0.9,
             f"missing {self.missing}": not self.missing,
         }
@@ -75,7 +75,7 @@ class Measures:
 
     def worse(self, other: "Measures") -> "Measures":
         """Return the elementwise worse of two measures."""
-        similarities, differences = ("segmentation", "depth", "matched"), ("rgb", "max_difference", "loud")
+        similarities, differences = ("segmentation", "depth", "matched"), ("rgb", "max_difference", "large_differences")
         values: dict[str, Any] = {name: min(getattr(self, name), getattr(other, name)) for name in similarities}
         values |= {name: max(getattr(self, name), getattr(other, name)) for name in differences}
         return Measures(**values, missing=tuple(sorted({*self.missing, *other.missing})))
@@ -102,7 +102,7 @@ def measure(ours: Frame, theirs: Frame, hidden: np.ndarray) -> Measures:
         depth=_fraction(solid & near, solid),
         rgb=float(mean),
         max_difference=int(difference[coloured].max(initial=0)),
-        loud=1.0 - _fraction(coloured & (difference <= LOUD), coloured),
+        large_differences=1.0 - _fraction(coloured & (difference <= LARGE_DIFFERENCE), coloured),
         matched=min(matched_shares(ours, theirs).values(), default=1.0),
         missing=tuple(missing),
     )
@@ -315,7 +315,7 @@ def report(folder: pathlib.Path, size: int, pictures: pathlib.Path | None) -> in
                     if measures is None
                     else (
                         f"{measures.segmentation:.4f} | {measures.depth:.4f} | {measures.rgb:.2f} | {measures.max_difference} |"
-                        f" {measures.loud:.2%} | {measures.matched:.3f}"
+                        f" {measures.large_differences:.2%} | {measures.matched:.3f}"
                     )
                 )
                 print(f"| {name} | {title} | {figures} | {seconds:.0f} | {verdict} |", flush=True)

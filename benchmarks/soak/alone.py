@@ -296,17 +296,21 @@ class Alone:
     """Fault with a folder of its own; see the module."""
 
     strike: Callable[[Path, random.Random, References], None]
-    promise: str
+    guarantee: str
 
 
 ALONE: dict[str, Alone] = {
     "NaN on one of two seeds": Alone(
-        nan_on_one_seed, "status 4, names the seed, keeps the state; goes on from the last good checkpoint"
+        nan_on_one_seed, "exit status 4; names the seed, dumps the state, and resumes from the last valid checkpoint"
     ),
-    "killed run of a sweep": Alone(worker_of_a_study, "one line, the others go on; starting again writes the undisturbed rows"),
-    "killed job of a sweep": Alone(job_of_a_study, "the same where runs are jobs of submitit"),
-    "killed worker of phenotype run": Alone(worker_of_phenotyping, "one line; starting again writes the undisturbed tables"),
-    "killed worker of grasp eval": Alone(worker_of_grasping, "one line; starting again gives the undisturbed figures"),
+    "killed run of a sweep": Alone(
+        worker_of_a_study, "one-line message; others continue; a restart yields the rows of an undisturbed sweep"
+    ),
+    "killed job of a sweep": Alone(job_of_a_study, "the same for runs that are submitit jobs"),
+    "killed worker of phenotype run": Alone(
+        worker_of_phenotyping, "one-line message; a restart yields the tables of an undisturbed run"
+    ),
+    "killed worker of grasp eval": Alone(worker_of_grasping, "one-line message; a restart yields undisturbed figures"),
 }
 
 

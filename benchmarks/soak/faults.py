@@ -32,14 +32,14 @@ class Fault:
 
     Attributes:
         strike: Function of the run folder and a random generator that injects the fault.
-        promise: Guaranteed outcome, for the table.
+        guarantee: Guaranteed outcome, for the table.
         statuses: Permitted exit statuses of the process.
         spoils: True if a row of metrics.jsonl, or the run itself, may be lost.
         goes_back: True if the run may resume from an older checkpoint than the newest; `strike` checks which one.
     """
 
     strike: Strike
-    promise: str
+    guarantee: str
     statuses: tuple[int, ...]
     spoils: bool = False
     goes_back: bool = False
@@ -81,7 +81,7 @@ def _wait_for_end(part: Part) -> int | None:
     return status or None
 
 
-def _killed_in_a_save(folder: Path, rng: random.Random) -> int | None:
+def _kill_during_a_save(folder: Path, rng: random.Random) -> int | None:
     with killed_afterwards(_start_run(folder, rng)) as part:
         part.wait_for(part.is_saving, 20.0)
         return part.send(signal.SIGKILL) or None
@@ -288,7 +288,7 @@ def _move_folder(is_kept: bool) -> Strike:
     return strike
 
 
-def _lock_of_the_dead(folder: Path, rng: random.Random) -> int | None:
+def _stale_lock(folder: Path, rng: random.Random) -> int | None:
     """Leave the lock of a dead process. Without file locks a lease must expire, which takes a minute: rarely tried."""
     no_locks = rng.random() < 0.15
     variables = _with_site(SOAK_NO_LOCKS="1") if no_locks else _with_site()
@@ -303,45 +303,45 @@ def _lock_of_the_dead(folder: Path, rng: random.Random) -> int | None:
     return _resume_run(folder, rng, variables)[0] or None
 
 
-EXACT = "goes on exactly"
+EXACT = "exact resume"
 FAULTS: dict[str, Fault] = {
-    "SIGTERM": Fault(_send_signal(signal.SIGTERM), f"status 143, saved with the replay, {EXACT}", (143,)),
-    "SIGINT": Fault(_send_signal(signal.SIGINT), f"status 130, saved with the replay, {EXACT}", (130,)),
-    "SIGHUP": Fault(_send_signal(signal.SIGHUP), f"status 129, saved with the replay, {EXACT}", (129,)),
+    "SIGTERM": Fault(_send_signal(signal.SIGTERM), f"exit status 143; saves the state with the replay; {EXACT}", (143,)),
+    "SIGINT": Fault(_send_signal(signal.SIGINT), f"exit status 130; saves the state with the replay; {EXACT}", (130,)),
+    "SIGHUP": Fault(_send_signal(signal.SIGHUP), f"exit status 129; saves the state with the replay; {EXACT}", (129,)),
     "SIGTERM to the group": Fault(
-        _send_signal(signal.SIGTERM, to_group=True), "as SIGTERM, though children get the signal, too", (143,)
+        _send_signal(signal.SIGTERM, to_group=True), "as SIGTERM, although child processes receive the signal, too", (143,)
     ),
     "two signals": Fault(
         _send_signal(signal.SIGTERM, signal.SIGTERM),
-        "status 143 at once; the networks are saved",
+        "exits at once with status 143; the networks are saved",
         (143, -signal.SIGTERM),  # the second one may arrive when the run is saved and its handler removed
     ),
-    "second process": Fault(_second_process, "status 2 and one line; the first process goes on undisturbed", (143,)),
-    "SIGKILL": Fault(_send_signal(signal.SIGKILL), f"loses an iteration or two, {EXACT}", (-signal.SIGKILL,)),
-    "SIGKILL in a save": Fault(
-        _killed_in_a_save, f"goes on from what was saved before the half-written checkpoint, and {EXACT}", (-signal.SIGKILL,)
+    "second process": Fault(_second_process, "exit status 2, one-line message; the first process is undisturbed", (143,)),
+    "SIGKILL": Fault(_send_signal(signal.SIGKILL), f"loses one or two iterations; {EXACT}", (-signal.SIGKILL,)),
+    "SIGKILL during a save": Fault(
+        _kill_during_a_save, f"ignores the incomplete checkpoint; {EXACT} from the one before", (-signal.SIGKILL,)
     ),
-    "full disk": Fault(_full_disk, "status 1 (2 before it has begun) and one line; goes on when there is room again", (1, 2)),
-    "stalled disk": Fault(_stalled_disk, f"waits for the disk, and {EXACT}", (143,)),
+    "full disk": Fault(_full_disk, "exit status 1 (2 before training), one-line message; resumes once there is space", (1, 2)),
+    "stalled disk": Fault(_stalled_disk, f"waits for the disk; {EXACT}", (143,)),
     "damaged checkpoint": Fault(
         _damage_checkpoint,
-        "one line; goes on from the one before, and keeps the damaged one for inspection",
+        "one-line message; resumes from the previous checkpoint, and quarantines the damaged one",
         (143,),
         goes_back=True,
     ),
     "bit flipped in a checkpoint": Fault(
-        _bit_in_a_checkpoint, "is found, or lies in nothing that is read", (143,), goes_back=True
+        _bit_in_a_checkpoint, "detected, or without effect on the restored state", (143,), goes_back=True
     ),
     "bit flipped in metrics.jsonl": Fault(
-        _bit_in_metrics, "all other rows stay; a row that is none any more is put aside, and said", (143,), spoils=True
+        _bit_in_metrics, "all other rows are kept; an unreadable row is quarantined with a message", (143,), spoils=True
     ),
     "folder moved": Fault(
         _move_folder(is_kept=True),
-        "status 1 and one line; nothing is left behind, and the folder goes on at its new place",
+        "exit status 1, one-line message; nothing is left in the old place, and the run resumes in the new one",
         (1,),
     ),
-    "folder gone": Fault(_move_folder(is_kept=False), "status 1 and one line; no half of a run takes its place", (1,)),
-    "lock of a dead process elsewhere": Fault(_lock_of_the_dead, "is taken over", (143,)),
-    "clock jumps by up to a month": Fault(_jumping_clock, f"no duration follows it; {EXACT}", (143,)),
+    "folder deleted": Fault(_move_folder(is_kept=False), "exit status 1, one-line message; leaves no partial run folder", (1,)),
+    "stale lock of another host": Fault(_stale_lock, "the lock is taken over", (143,)),
+    "clock jumps of up to a month": Fault(_jumping_clock, f"durations are unaffected; {EXACT}", (143,)),
 }
 """Faults of a training run by name."""

@@ -82,12 +82,21 @@ class Part:
         cls,
         folder: Path,
         variables: dict[str, str] | None = None,
-        options: Sequence[str] = OPTIONS,
+        options: Sequence[str] | None = None,
         file_bytes: int | None = None,
     ) -> "Part":
-        """Start or resume the run in ``folder``; ``file_bytes`` limits the size of each file."""
+        """Start or resume the run in ``folder`` (`OPTIONS` by default); ``file_bytes`` limits the size of each file."""
         resume_option = ["--resume"] if folder.exists() else []
-        command = [sys.executable, "-m", "jaxrl_vis", "train", *options, "--run-dir", str(folder), *resume_option]
+        command = [
+            sys.executable,
+            "-m",
+            "jaxrl_vis",
+            "train",
+            *(OPTIONS if options is None else options),
+            "--run-dir",
+            str(folder),
+            *resume_option,
+        ]
         return cls.command(command, folder, variables, file_bytes)
 
     @classmethod

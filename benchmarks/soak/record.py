@@ -13,7 +13,7 @@ from benchmarks.soak.alone import ALONE
 from benchmarks.soak.faults import FAULTS
 from jaxrl_vis.host import provenance
 
-PROMISES = {name: fault.promise for name, fault in (FAULTS | ALONE).items()}
+GUARANTEES = {name: fault.guarantee for name, fault in (FAULTS | ALONE).items()}
 
 
 def _machine() -> dict[str, Any]:
@@ -44,7 +44,7 @@ class Record:
     machine: dict[str, Any] = dataclasses.field(default_factory=_machine)
     seed: int = 0
     minutes: float = 0.0
-    faults: dict[str, int] = dataclasses.field(default_factory=lambda: dict.fromkeys(PROMISES, 0))
+    faults: dict[str, int] = dataclasses.field(default_factory=lambda: dict.fromkeys(GUARANTEES, 0))
     runs: int = 0
     exact: int = 0
     done: int = 0
@@ -72,14 +72,14 @@ class Record:
 
     def table(self) -> str:
         """Format the table of all faults as Markdown."""
-        lines = ["| fault | times | what must hold |", "|---|---|---|"]
-        lines += [f"| {name} | {self.faults.get(name, 0)} | {promise} |" for name, promise in PROMISES.items()]
+        lines = ["| fault | injected | guarantee |", "|---|---|---|"]
+        lines += [f"| {name} | {self.faults.get(name, 0)} | {guarantee} |" for name, guarantee in GUARANTEES.items()]
         goodput = self.done / self.begun if self.begun else 1.0
-        held = "all of it held" if not self.broken else f"**{len(self.broken)} times it did not**"
+        held = "no violation" if not self.broken else f"**violations: {len(self.broken)}**"
         lines += [
-            f"| all | {self.total} | {held}; {self.runs} training runs, none with a row missing or twice, {self.exact} of them "
-            f"with the metrics.jsonl of an undisturbed run, bit for bit; goodput {goodput:.3f} at {self.resumes} resumptions, "
-            f"replay lost {self.replays_lost} times |"
+            f"| all | {self.total} | {held}; {self.runs} training runs without missing or duplicate rows; "
+            f"metrics.jsonl of {self.exact} bit-identical to an undisturbed run; goodput {goodput:.3f} over {self.resumes} "
+            f"resumptions; replay lost {self.replays_lost} times |"
         ]
         return "\n".join(lines) + "\n"
 
@@ -96,6 +96,6 @@ def added(records: Sequence[Record]) -> Record:
         raise ValueError("two records of the same seed: the same piece twice?")
     names = ("minutes", "runs", "exact", "done", "begun", "resumes", "replays_lost")
     sums = {name: sum(getattr(record, name) for record in records) for name in names}
-    faults = {name: sum(record.faults.get(name, 0) for record in records) for name in PROMISES}
+    faults = {name: sum(record.faults.get(name, 0) for record in records) for name in GUARANTEES}
     broken = [line for record in records for line in record.broken]
     return Record(records[0].machine, records[0].seed, faults=faults, broken=broken, **sums)

@@ -43,8 +43,16 @@ Photograph = tuple[np.ndarray, int, Callable[[np.ndarray], int]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Seen:
-    """Family, pooled features, scores, F1 of the detections, and (mean brightness, sharpness) of an image."""
+class ImageStatistics:
+    """Statistics of the detector on one image.
+
+    Attributes:
+        family: Family of the plot.
+        pooled: Pooled features of the network.
+        scores: Scores of the detections.
+        f1: F1 of the detections.
+        plain: Mean brightness and sharpness of the image.
+    """
 
     family: str
     pooled: np.ndarray
@@ -94,7 +102,7 @@ def f1_of(hits: int, finds: int, stalks: int) -> float:
     return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
 
 
-def detections_in(path: Path, finder: Finder, name: str) -> list[Seen]:
+def detections_in(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
     """Evaluate the images of a file of `draw`, or read the cached results of the detector of this name."""
     cached = path.with_suffix(f".{name.split()[-1]}.npz")
     if not cached.exists():
@@ -107,12 +115,12 @@ def detections_in(path: Path, finder: Finder, name: str) -> list[Seen]:
     with np.load(cached) as data:
         columns = [[data[f"{key}_{index}"] for index in range(FRAMES)] for key in ("pooled", "scores", "f1", "plain")]
     return [
-        Seen(family, pooled, scores, float(f1), (float(plain[0]), float(plain[1])))
+        ImageStatistics(family, pooled, scores, float(f1), (float(plain[0]), float(plain[1])))
         for pooled, scores, f1, plain in zip(*columns)
     ]
 
 
-def _detect_images(path: Path, finder: Finder) -> Iterator[Seen]:
+def _detect_images(path: Path, finder: Finder) -> Iterator[ImageStatistics]:
     with np.load(path) as data:
         for index in range(FRAMES):
             image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
@@ -120,15 +128,15 @@ def _detect_images(path: Path, finder: Finder) -> Iterator[Seen]:
             right, ignored = match_finds(stalks, scores, truth, kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
-            yield Seen("", pooled, scores, f1, plain_measures(image))
+            yield ImageStatistics("", pooled, scores, f1, plain_measures(image))
 
 
-def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[Seen]:
+def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[ImageStatistics]:
     """Evaluate photographs, whose cameras are unknown."""
     for image, count, find_boxes in photographs:
         stalks, scores, pooled = detect_stalks(finder, image, None)
         boxes = stalks[scores >= MIN_SCORE][:, :4]
-        yield Seen("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
+        yield ImageStatistics("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
 
 
 def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
@@ -137,10 +145,10 @@ def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
     return float(np.mean((above > 0) + 0.5 * (above == 0))) if above.size else float("nan")
 
 
-def control(fitted: list[Seen], tried: list[Seen]) -> np.ndarray:
+def control(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.ndarray:
     """Return the doubts [N] by a logistic regression on brightness and sharpness, their squares and product."""
 
-    def inputs(images: list[Seen]) -> np.ndarray:
+    def inputs(images: list[ImageStatistics]) -> np.ndarray:
         plain = (np.array([image.plain for image in images]) - [100.0, 6.0]) / [50.0, 2.0]
         return np.concatenate([plain, plain**2, plain[:, :1] * plain[:, 1:]], axis=1)
 
@@ -148,7 +156,7 @@ def control(fitted: list[Seen], tried: list[Seen]) -> np.ndarray:
     return weights[0] + inputs(tried) @ weights[1:]
 
 
-def report(name: str, images: list[Seen], gate: Gate, doubts_of_control: np.ndarray) -> None:
+def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_control: np.ndarray) -> None:
     """Print a line of figures."""
     wrong = np.array([image.f1 < RIGHT for image in images])
     doubts = np.array([gate.doubt(image.pooled, image.scores) for image in images])
@@ -192,7 +200,7 @@ def main() -> None:
         evaluate_all(done, range(len(tasks)), options.workers, lambda place, made: print(made["path"], flush=True))
     enable_compilation_cache()
     finder = load_finder(options.weights, MIN_SCORE)
-    seen: dict[str, list[Seen]] = {part: [] for part in FIRST_SEEDS}
+    seen: dict[str, list[ImageStatistics]] = {part: [] for part in FIRST_SEEDS}
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
         if path.exists():

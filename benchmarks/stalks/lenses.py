@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ledger.records import RESULTS
-from benchmarks.ledger.stalks_table import LENSES, lens_rows
+from benchmarks.ledger.tables.stalks import LENSES, lens_rows
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.provenance import device_name, revision
@@ -38,7 +38,7 @@ FACTORS = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.4, 1.66, 2.0)
 SEED, WIDTH, PAIRS = 5, 1055, 12
 
 
-def draw(folder: Path, factor: float) -> Path:
+def render_row(folder: Path, factor: float) -> Path:
     """Render the row through a lens of ``factor`` times the usual focal length, unless it exists; return its folder."""
     out = folder / f"{factor:g}"
     spec = folder / f"{factor:g}.toml"
@@ -50,12 +50,12 @@ def draw(folder: Path, factor: float) -> Path:
     return out / plot_name(SEED)
 
 
-def look(plot: Path, finder: Finder) -> dict[str, Any]:
+def evaluate_row(plot: Path, finder: Finder) -> dict[str, Any]:
     """Detect, measure and count the stalks of a rendered row.
 
     Returns:
-        Pixels per metre, and height of the view in m; numbers of true and counted stalks, clear sightings, correct detections
-        and false ones; fraction of pairs in which the ground was found; errors of widths in mm, by index of the stalk.
+        Pixels per metre, and height of the view in m; numbers of true and counted stalks, visible sightings, true and false
+        positives; fraction of pairs in which the ground was detected; errors of widths in mm, by index of the stalk.
     """
     truth, calibration = read_json(plot / "plot.json"), read_calibration(plot / "calibration.yaml")
     with (plot / "odometry.csv").open(newline="", encoding="utf-8") as file:
@@ -63,16 +63,16 @@ def look(plot: Path, finder: Finder) -> dict[str, Any]:
     names = {field.name for field in dataclasses.fields(StalkInView)}
     frames: list[list[Sighting]] = []
     owners: list[list[int | None]] = []
-    clear = detected = false = grounds = 0
+    visible = detected = false_positives = grounds = 0
     for row in rows:
         left, right = (read_image(plot / row[side]) for side in ("left", "right"))
         seen = [stalk for stalk in truth["seen"] if stalk["pair"] == int(row["pair"])]
         stalks = [StalkInView(**{name: stalk[name] for name in names}) for stalk in seen]
         view = view_pair(finder, left, right, calibration)
         matched, scored = match(view.detections, stalks)
-        clear += sum(stalk.band_box is not None and stalk.band_visible >= 0.3 for stalk in stalks)
+        visible += sum(stalk.band_box is not None and stalk.band_visible >= 0.3 for stalk in stalks)
         detected += sum(hit > 0 for _, hit in scored)
-        false += sum(not hit for _, hit in scored)
+        false_positives += sum(not hit for _, hit in scored)
         grounds += view.ground is not None
         frames.append(view.sightings)
         owners.append(matched)
@@ -85,22 +85,22 @@ def look(plot: Path, finder: Finder) -> dict[str, Any]:
         if owner < len(truth["stalks"]) and widths.lower is not None and widths.height_known:
             errors[owner] = widths.lower.mm - truth["stalks"][owner]["12in"]["diameter_mm"]
     return {
-        "density": calibration.focal / USUAL_DISTANCE,
-        "view": calibration.height * USUAL_DISTANCE / calibration.focal,
+        "pixels_per_metre": calibration.focal / USUAL_DISTANCE,
+        "view_m": calibration.height * USUAL_DISTANCE / calibration.focal,
         "true": truth["count"],
         "counted": len(counted),
-        "clear": clear,
-        "found": detected,
-        "false": false,
-        "ground": grounds / len(rows),
-        "errors_mm": errors,
+        "visible": visible,
+        "true_positives": detected,
+        "false_positives": false_positives,
+        "ground_share": grounds / len(rows),
+        "width_errors_mm": errors,
     }
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Render, measure, print the table, and update the record if requested; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("folder", type=Path, help="where the pairs are drawn")
+    parser.add_argument("folder", type=Path, help="folder for the rendered pairs")
     parser.add_argument("--factors", type=float, nargs="+", default=FACTORS)
     parser.add_argument("--results", type=Path, help=f"folder of records, such as {RESULTS.name}")
     options = parser.parse_args(words)
@@ -113,7 +113,7 @@ def main(words: Sequence[str] | None = None) -> int:
         record = read_json(target)
         lenses = record["lenses"] if about.items() <= record.items() else {}
     for factor in options.factors:
-        figures = look(draw(options.folder, factor), finder)
+        figures = evaluate_row(render_row(options.folder, factor), finder)
         lenses[f"{factor:g}"] = {**figures, "device": device_name(), "revision": revision()}
         record = json.loads(json.dumps({**about, "lenses": dict(sorted(lenses.items(), key=lambda lens: float(lens[0])))}))
         if target is not None:

@@ -178,7 +178,7 @@ def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
     return {
         "rows": rows,
         "success": success,
-        "success_of_behaviour": float(np.mean(episodes["reached"])),
+        "behaviour_success": float(np.mean(episodes["reached"])),
         "shares": latest(metrics),
         "seconds": time.monotonic() - began,
     }

@@ -110,5 +110,5 @@ def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[s
         flops = peak.bfloat16 if dtype == "bfloat16" else peak.float32
         achieved["share_of_peak_flops"] = round(cost.flops / seconds / flops, 4)
         achieved["share_of_peak_bandwidth"] = round(cost.bytes / seconds / peak.memory, 4)
-        achieved["updates_per_s_at_the_roof"] = round(1.0 / max(cost.flops / flops, cost.bytes / peak.memory))
+        achieved["roofline_updates_per_s"] = round(1.0 / max(cost.flops / flops, cost.bytes / peak.memory))
     return achieved

@@ -2,12 +2,12 @@
 
     iteration    rollout, insert and updates, the host reading the metrics of one iteration during the next
     parts        each of the three alone, and the time of evaluations and of the host per iteration
-    promise      sum of the times of the same environments and gradient steps, measured as in `bench env` and `bench update`
+    predicted    sum of the times of the same environments and gradient steps, measured as in `bench env` and `bench update`
 
     efficiency   on several devices: time of one device with its part of the seeds, or of the batch and the environments,
                  divided by the time of all devices together
 
-If an iteration takes longer than the promise, time is lost between its parts, in the policy during the rollout, or in the
+If an iteration takes longer than predicted, time is lost between its parts, in the policy during the rollout, or in the
 replay.
 """
 
@@ -119,15 +119,15 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     }
 
 
-def describe(iteration: float, parts: dict[str, float], promised: float) -> str:
+def describe(iteration: float, parts: dict[str, float], predicted: float) -> str:
     """Format a table of the parts: milliseconds, and percent of an iteration."""
     total = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
-    rows = {**parts, "sum without evaluation": total, "iteration": iteration, "promised": promised}
+    rows = {**parts, "sum without evaluation": total, "iteration": iteration, "predicted": predicted}
     lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]
     return "\n".join(lines)
 
 
-def share_of_one(config: Config) -> Config:
+def single_device_config(config: Config) -> Config:
     """Return the configuration of one device's part of a run, as a run on one device."""
     parts = data_devices(config)
     return config.replace(
@@ -141,8 +141,8 @@ def share_of_one(config: Config) -> Config:
 
 
 def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
-    """Time an iteration of `share_of_one`, in seconds."""
-    config_of_one = share_of_one(config)
+    """Time an iteration of `single_device_config`, in seconds."""
+    config_of_one = single_device_config(config)
     return time_iterations(Programs(config_of_one, make_train_step(env, config_of_one), cache=False), settings.repeats)[
         1
     ].median_s
@@ -162,8 +162,8 @@ def measure(settings: Settings) -> Iterator[Measurement]:
             {} if config.run.devices == 1 else {"efficiency": round(_time_share(env, config, settings) / timing.median_s, 3)}
         )
         episodes, _ = time_episodes(env, config.run.num_envs * config.run.seeds // config.run.devices, settings.repeats)
-        promised = episodes.median_s + parts["updates"]
-        print(describe(timing.median_s, parts, promised), flush=True)
+        predicted = episodes.median_s + parts["updates"]
+        print(describe(timing.median_s, parts, predicted), flush=True)
         shared = {
             "config": dict(
                 **settings.image_config(),
@@ -180,7 +180,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
                 seconds["compile"],
                 measured_s=round(time.perf_counter() - started, 1),
                 milliseconds={name: round(1e3 * part, 3) for name, part in {**parts, "env": episodes.median_s}.items()},
-                share_of_promise=round(promised / timing.median_s, 3),
+                share_of_predicted=round(predicted / timing.median_s, 3),
                 **efficiency,
             ),
         }

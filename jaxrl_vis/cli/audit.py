@@ -1,4 +1,4 @@
-"""``jaxrl-vis audit``."""
+"""Command ``jaxrl-vis audit``: compare image-based rewards with a task's true rewards."""
 
 import dataclasses
 import json

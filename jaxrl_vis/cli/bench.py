@@ -1,4 +1,4 @@
-"""``jaxrl-vis bench``."""
+"""Command ``jaxrl-vis bench``: measure the speed of rendering, physics, environments, updates and training."""
 
 import dataclasses
 from pathlib import Path

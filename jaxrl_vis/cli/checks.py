@@ -37,11 +37,14 @@ def check_env(name: str, folder: str | None = None) -> None:
 
 
 def may_run_code(run_dir: Path, trust: bool) -> bool:
-    """Return True if a run's custom code may be executed: permitted now or earlier, trained here, or confirmed interactively.
+    """Check that a run's custom code may be executed: permitted now or earlier, trained here, or confirmed interactively.
 
     Args:
         run_dir: The run folder.
         trust: True for ``--trust``.
+
+    Returns:
+        ``trust``, or True if it was confirmed on the terminal.
 
     Raises:
         RequestError: There is no permission.

@@ -1,4 +1,4 @@
-"""``jaxrl-vis doctor``."""
+"""Command ``jaxrl-vis doctor``: check the installation and the machine."""
 
 import dataclasses
 from pathlib import Path

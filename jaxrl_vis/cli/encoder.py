@@ -1,4 +1,4 @@
-"""``jaxrl-vis encoder``."""
+"""Command ``jaxrl-vis encoder``: train a small image encoder by itself."""
 
 import dataclasses
 from pathlib import Path

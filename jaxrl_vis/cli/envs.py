@@ -1,4 +1,4 @@
-"""``jaxrl-vis envs``."""
+"""Command ``jaxrl-vis envs``: list the tasks, or draw a gallery of them."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``jaxrl-vis figure``."""
+"""Command ``jaxrl-vis figure``: train the runs of a figure of the thesis, and draw it."""
 
 import dataclasses
 from pathlib import Path

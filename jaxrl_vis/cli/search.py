@@ -1,4 +1,4 @@
-"""``jaxrl-vis search``."""
+"""Command ``jaxrl-vis search``: search for hyper-parameters with Optuna."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""``jaxrl-vis sweep``."""
+"""Command ``jaxrl-vis sweep``: train several tasks with several methods and seeds."""
 
 import dataclasses
 from collections.abc import Mapping

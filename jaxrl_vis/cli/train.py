@@ -1,4 +1,4 @@
-"""``jaxrl-vis train``."""
+"""Command ``jaxrl-vis train``: train a policy, or resume its run."""
 
 import dataclasses
 import importlib

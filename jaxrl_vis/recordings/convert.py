@@ -18,10 +18,10 @@ def holds_recordings(path: Path) -> bool:
 
 
 def read(path: Path | str) -> Recordings:
-    """Read recorded episodes.
+    """Read recorded episodes from an .npz file, from a folder that contains one, or from a LeRobot dataset.
 
     Args:
-        path: See `holds_recordings`.
+        path: The file or folder.
 
     Raises:
         RequestError: There are no recordings, or they are damaged.

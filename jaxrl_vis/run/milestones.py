@@ -18,7 +18,9 @@ SCORE, SCORED = "score", "scored"
 
 
 class Milestones:
-    """Milestones of one run. The best score is stored only with the best checkpoint, where every resumption finds it.
+    """Tracker of a run's best evaluation: saves the best checkpoint, and decides when the run may end early.
+
+    The best score is stored only in the manifest of the best checkpoint, from which a resumed run reads it.
 
     Args:
         config: The run.

@@ -106,9 +106,9 @@ def _is_free(number: int, caught_in_c: int) -> bool:
 
 
 def _caught_in_c() -> int:
-    """Return a bit mask of signals that are caught or ignored: Python does not know handlers installed by C code.
+    """Return the bit mask of caught and ignored signals, including handlers of C code such as `faulthandler.register`'s.
 
-    Such as those of `faulthandler.register`. Zero if there is no /proc.
+    Python itself does not know those handlers. The mask is 0 on systems without /proc.
     """
     masks = 0
     with contextlib.suppress(OSError, ValueError):

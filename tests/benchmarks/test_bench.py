@@ -217,7 +217,7 @@ def test_peaks_take_the_longest_name() -> None:
     shares = roofline.describe(roofline.Cost(989e9, 3.35e9), 0.01, "bfloat16", "NVIDIA H100 80GB HBM3")
     assert shares["share_of_peak_flops"] == pytest.approx(0.1)
     assert shares["share_of_peak_bandwidth"] == pytest.approx(0.1)
-    assert shares["updates_per_s_at_the_roof"] == 1000
+    assert shares["roofline_updates_per_s"] == 1000
 
 
 def test_noise_fills_the_whole_replay() -> None:
@@ -289,15 +289,15 @@ def test_every_benchmark_keeps_records(benchmark: str, tmp_path: Path, monkeypat
         assert set(parts) == {"rollout", "insert", "updates", "evaluation", "host", "env"}
         assert all(part > 0.0 for name, part in parts.items() if name != "host") and parts["host"] >= 0.0
         iteration = 1e3 * 3 * Dot.horizon / found[0].value  # ms; 3 environments
-        assert found[0].details["share_of_promise"] == pytest.approx((parts["env"] + parts["updates"]) / iteration, rel=0.01)
+        assert found[0].details["share_of_predicted"] == pytest.approx((parts["env"] + parts["updates"]) / iteration, rel=0.01)
 
 
 def test_what_one_of_several_devices_does() -> None:
     """The measure of efficiency: a run of one device with its share of the seeds, or of the learner."""
     config = preset("debug", seeds=6, num_envs=8, batch_size=16, replay_transitions=800)
-    seeds = train.share_of_one(config.replace(devices=2))
+    seeds = train.single_device_config(config.replace(devices=2))
     assert (seeds.run.devices, seeds.run.seeds, seeds.run.num_envs, seeds.run.batch_size) == (1, 3, 8, 16)
-    parts = train.share_of_one(config.replace(devices=4, data_devices=2))
+    parts = train.single_device_config(config.replace(devices=4, data_devices=2))
     assert (parts.run.seeds, parts.run.num_envs, parts.run.batch_size, parts.run.replay_transitions) == (3, 4, 8, 400)
 
 
@@ -306,7 +306,7 @@ def test_a_table_says_where_an_iteration_goes() -> None:
     lines = {" ".join(line.split()[:-3]): line.split()[-3:] for line in train.describe(1.0, parts, 0.7).splitlines()}
     assert lines["rollout"] == ["250.00", "ms", "25.0%"]
     assert lines["sum without evaluation"] == ["800.00", "ms", "80.0%"]
-    assert lines["promised"] == ["700.00", "ms", "70.0%"]
+    assert lines["predicted"] == ["700.00", "ms", "70.0%"]
 
 
 @pytest.mark.usefixtures("dots")

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.ledger import host_table
+from benchmarks.ledger.tables import host
 from benchmarks.tasks import host_fetch, host_learning
 from jaxrl_vis.errors import RequestError
 
@@ -100,8 +100,8 @@ def test_cells_leave_records_that_a_table_is_written_from(tmp_path, capsys, monk
     assert [row["env_steps"] for row in live["rows"]] == [100, 200] and live["size"]["steps"] == 200
     assert 0.0 <= live["shares"]["false_positive_share"] <= 1.0 and live["versions"]["mujoco"]
     assert 0.0 <= recorded["shares"]["false_negative_share"] <= 1.0
-    assert recorded["success_of_behaviour"] in (0.0, 0.25, 0.5, 0.75, 1.0) and len(recorded["rows"]) == 5
-    table = host_table.rows(tmp_path)
+    assert recorded["behaviour_success"] in (0.0, 0.25, 0.5, 0.75, 1.0) and len(recorded["rows"]) == 5
+    table = host.rows(tmp_path)
     assert "| live | `indicator_balance_filter` | 0 | 100 | never |" in table
     assert "| recorded | `indicator_tolerance` | 2 | 100 |" in table
     capsys.readouterr()

@@ -12,9 +12,9 @@ from test_provenance import commit
 
 from benchmarks.ledger import __main__ as ledger
 from benchmarks.ledger import ablations, evidence, pages, records, staleness
-from benchmarks.ledger import result_tables as tables
-from benchmarks.ledger.comparison_table import comparison_table
-from benchmarks.ledger.result_rows import DEVICES, LEARNING, Figure, Learning
+from benchmarks.ledger.tables import lab_results as tables
+from benchmarks.ledger.tables.comparison import comparison_table
+from benchmarks.ledger.tables.lab_rows import DEVICES, LEARNING, Figure, Learning
 from jaxrl_vis.cli.parsing import parse
 from jaxrl_vis.cli.train import Train, training_config
 from jaxrl_vis.config import preset

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.ledger import pixels_table
+from benchmarks.ledger.tables import pixels
 from benchmarks.pixels import __main__ as command
 from benchmarks.pixels import gallery, playground, train
 from jaxrl_vis.bench.record import Measurement, keep, to_record
@@ -80,8 +80,8 @@ def test_the_table_has_camera_parity_and_speeds(tmp_path: Path) -> None:
     for name, value in (("pixels/steps", 1234.5), ("pixels/steps_with_images", 56.7)):
         measurement = Measurement(name, value, "env-steps/s", {"task": "FishSwim"})
         keep(tmp_path / "pixels-amd-epyc-2-cores.json", to_record(measurement))
-    table = pixels_table.tasks_table(tmp_path)
-    assert table is not None and pixels_table.tasks_table(tmp_path / "empty") is None
+    table = pixels.tasks_table(tmp_path)
+    assert table is not None and pixels.tasks_table(tmp_path / "empty") is None
     head, _, cartpole, fish = table.splitlines()
     assert head.endswith("| steps/s, two cores |")
     assert cartpole == "| CartpoleBalance | `fixed` | 99.91 | **0.700** |  | 1.23 |  |"

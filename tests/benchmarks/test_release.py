@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks import verify_release
-from benchmarks.ledger import platforms_table
+from benchmarks.ledger.tables import platforms
 from jaxrl_vis import cli
 from jaxrl_vis.host import doctor, platform_report
 
@@ -111,15 +111,15 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("quick")
 def test_a_report_is_a_row_of_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / platforms_table.FOLDER).mkdir()
-    assert platforms_table.platforms_table(tmp_path) is None
-    assert cli.main(["doctor", "--report", str(tmp_path / platforms_table.FOLDER)]) == 1
+    (tmp_path / platforms.FOLDER).mkdir()
+    assert platforms.platforms_table(tmp_path) is None
+    assert cli.main(["doctor", "--report", str(tmp_path / platforms.FOLDER)]) == 1
     assert "FAIL  renderer" in capsys.readouterr().out
-    (file,) = (tmp_path / platforms_table.FOLDER).iterdir()
+    (file,) = (tmp_path / platforms.FOLDER).iterdir()
     record = json.loads(file.read_text())
     assert record["checks"] == {"versions": True, "renderer": False, "training": True}
     assert record["backend"] == "cpu" and record["accelerator"] is None and file.suffix == ".json"
-    table = platforms_table.platforms_table(tmp_path)
+    table = platforms.platforms_table(tmp_path)
     assert table is not None
     row = table.splitlines()[-1]
     assert "doctor: 2 of 3 checks (failed: renderer); Thing, debug: 1,234 steps/s" in row

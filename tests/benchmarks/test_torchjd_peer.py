@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.ledger import weighting_table
+from benchmarks.ledger.tables import weighting
 from benchmarks.peers.torchjd import equality
 from benchmarks.peers.torchjd.jacobians import COUNTS, draw
 
@@ -36,12 +36,12 @@ def test_a_difference_beyond_what_is_allowed_is_a_failure() -> None:
 
 
 def test_tables_are_written_from_records(tmp_path: Path) -> None:
-    assert weighting_table.torchjd_table(tmp_path) is None and weighting_table.cost_table(tmp_path) is None
+    assert weighting.torchjd_table(tmp_path) is None and weighting.cost_table(tmp_path) is None
     row = {"method": "mgda", "cases": 7, "difference_max": 0.25, "difference_median": 1e-9}
     row |= {"residual_max_ours": 1e-15, "residual_max_theirs": 2e-3}
     versions = {"torchjd": "0.18.0", "torch": "2", "jax": "0.10"}
     (tmp_path / "weighting_parity.json").write_text(json.dumps({"rows": [row], "versions": versions}))
-    assert "| `mgda` | 7 | 2e-01 | 1e-09 | 1e-15 | 2e-03 |" in (weighting_table.torchjd_table(tmp_path) or "")
+    assert "| `mgda` | 7 | 2e-01 | 1e-09 | 1e-15 | 2e-03 |" in (weighting.torchjd_table(tmp_path) or "")
     ours = [
         {"method": "mgda", "losses": 2, "what": what, "seconds": time}
         for what, time in (("alone", 1e-5), ("step, latents", 4e-4))
@@ -51,4 +51,4 @@ def test_tables_are_written_from_records(tmp_path: Path) -> None:
     ]
     record = {"device": "a GPU", "size": {"losses": [2]}, "ours": ours, "torchjd": theirs}
     (tmp_path / "weighting_cost-nvidia-h100.json").write_text(json.dumps(record))
-    assert "| `mgda` | 400 / 5,000 | 10 / 2,000 |" in (weighting_table.cost_table(tmp_path) or "")
+    assert "| `mgda` | 400 / 5,000 | 10 / 2,000 |" in (weighting.cost_table(tmp_path) or "")

@@ -133,23 +133,24 @@ def test_two_processes_learn_and_save_what_one_does(pair: tuple[Path, list, list
 
 
 def two_trainings(*words: str) -> list[tuple[int, str, str]]:
-    """Runs `jaxrl-vis train Reacher` in two processes with one device each; returns exit statuses and outputs."""
-    train = [sys.executable, "-m", "jaxrl_vis", "train", "Reacher", "--preset", "debug", "--env-steps", "800", *words]
+    """Runs `jaxrl-vis train` in two processes with one device each; returns exit statuses and outputs."""
+    train = [sys.executable, "-m", "jaxrl_vis", "train", *words, "--preset", "debug", "--env-steps", "40"]
     place = ["--coordinator", f"127.0.0.1:{free_port()}", "--num-processes", "2", "--process-id"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return ended([subprocess.Popen([*train, *place, index], **pipes) for index in ("0", "1")], 200)
 
 
-def test_processes_train_a_task_of_ours(tmp_path: Path) -> None:
-    """Its physics model must lie on devices of each process itself."""
-    ends = two_trainings("--seeds", "2", "--run-dir", str(tmp_path / "run"))
+def test_processes_train_a_task_with_physics(tmp_path: Path) -> None:
+    """Its model must lie on devices of each process itself."""
+    task = ["point_mass:StatePointMass", "--env-folder", str(Path(__file__).parents[1])]
+    ends = two_trainings(*task, "--seeds", "2", "--run-dir", str(tmp_path / "run"))
     assert [status for status, _, _ in ends] == [0, 0], ends
     assert {row["seed"] for row in rows_without_time(tmp_path / "run")} == {0, 1}
 
 
 def test_each_process_says_why_it_refuses(tmp_path: Path) -> None:
     """None is ended by JAX because another one was faster."""
-    ends = two_trainings("--seeds", "3", "--run-dir", str(tmp_path / "run"))
+    ends = two_trainings("Reacher", "--seeds", "3", "--run-dir", str(tmp_path / "run"))
     assert [status for status, _, _ in ends] == [2, 2], ends
     assert all("seeds 3 cannot be divided among 2 devices" in words.splitlines()[-1] for _, _, words in ends), ends
 

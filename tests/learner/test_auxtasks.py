@@ -203,6 +203,7 @@ def test_tasks_that_show_states_have_no_auxiliary_tasks():
         auxtasks.make(["egomotion"], spec)
 
 
+@functools.cache
 def decoder_gradients(channels, dtype, implementation):
     """Losses of both decoders and their gradients, by ``implementation``: products, kernel (interpreted) or plain; flat."""
     spec = make_spec(channels, 32, latent_size=16, dtype=dtype, levels=3)

@@ -214,7 +214,7 @@ def test_it_learns_the_point_mass_with_several_seeds():
     env = point_mass.StatePointMass(point_mass.PointMassConfig(horizon=10))
     program = make_train_step(env, preset("debug", **LEARNING, seeds=2))
     loop = begin(program, jax.random.split(jax.random.key(7), 2))
-    for _ in range(12):
+    for _ in range(8):
         loop, metrics = train_iteration(program, loop)
     assert (metrics["train/logit_following"] > metrics["train/logit_other"] + 5.0).all()
     outcome, _ = program.evaluate(loop.train, jax.random.key(11))
@@ -225,7 +225,7 @@ def test_it_learns_from_images():
     changes = {"encoder_filters": (8, 8), "normalizer_floor": 1.0, "encoders": "shared"}
     program = make_train_step(probes.SeenGoWhereTold(), preset("debug", **{**LEARNING, **changes}))
     loop = begin(program, jax.random.split(jax.random.key(7), 1))
-    for _ in range(25):
+    for _ in range(12):
         loop, _ = train_iteration(program, loop)
     outcome, _ = program.evaluate(loop.train, jax.random.key(11))
     assert (outcome["eval/success"] >= 0.9).all()

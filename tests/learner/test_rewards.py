@@ -48,7 +48,7 @@ def test_a_tolerance_forgives_noise_and_small_things():
 
 @functools.cache
 def with_classifier():
-    return trained(StaysPut(), method="classifier", iterations=14)
+    return trained(StaysPut(), method="classifier", iterations=8)
 
 
 def test_a_classifier_tells_goals_from_what_is_not_there():

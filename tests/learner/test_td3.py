@@ -140,7 +140,7 @@ SETTINGS = {
 def test_policy_goes_where_the_goal_is(env, changes):
     program = make_train_step(env, preset("debug", **{**SETTINGS, **changes}))
     loop = begin(program, jax.random.split(jax.random.key(7), changes.get("seeds", 1)))
-    for _ in range(25):
+    for _ in range(12):
         loop, metrics = train_iteration(program, loop)
     assert metrics["guard/nonfinite"].sum() == 0
     outcome, _ = program.evaluate(loop.train, jax.random.key(11))

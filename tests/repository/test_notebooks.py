@@ -1,7 +1,9 @@
 """Notebooks run from top to bottom on the smallest settings, and are committed without outputs."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,6 +31,7 @@ SAID = {
 
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
+jupyter_client = pytest.importorskip("jupyter_client")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -39,21 +42,31 @@ def test_outputs_are_stripped(path: Path) -> None:
             assert cell.execution_count is None
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path: Path, tmp_path: Path, clean_environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", clean_environment["PYTHONPATH"])
-    monkeypatch.setenv("JAXRL_VIS_NOTEBOOK_FAST", "1")
-    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    startup = tmp_path / "ipython/profile_default/startup"
+@pytest.fixture(scope="module")
+def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A kernel for all notebooks, so that modules are imported once; each begins without the names of the one before."""
+    checkout, ipython = Path(__file__).resolve().parents[2], tmp_path_factory.mktemp("ipython")
+    startup = ipython / "profile_default/startup"
     startup.mkdir(parents=True)
     (startup / "garbage.py").write_text("import gc\ngc.set_threshold(100_000, 20, 20)\n")  # as in conftest.py
-    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel shows figures in the notebook
-    assert os.environ["JAX_PLATFORMS"] == "cpu"
+    changes = {
+        "PYTHONPATH": os.pathsep.join((str(checkout), str(checkout / "envs"))),
+        "JAXRL_VIS_NOTEBOOK_FAST": "1",
+        "IPYTHONDIR": str(ipython),
+    }
+    environment = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}  # figures go into the notebook
+    assert environment["JAX_PLATFORMS"] == "cpu"
+    manager = jupyter_client.AsyncKernelManager(kernel_name="python3")
+    nbclient.util.run_sync(manager.start_kernel)(env=environment | changes)
+    yield manager
+    nbclient.util.run_sync(manager.shutdown_kernel)(now=True)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(path: Path, tmp_path: Path, kernel: Any) -> None:
     notebook = nbformat.read(path, as_version=4)
-    client = nbclient.NotebookClient(
-        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
-    )
-    client.execute()
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(f"%reset -f\n%cd -q {tmp_path}"))
+    nbclient.NotebookClient(notebook, timeout=600, km=kernel).execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     shown = [(kind, data) for output in outputs for kind, data in output.get("data", {}).items()]
     figures = sum(kind == "image/png" for kind, _ in shown)

@@ -1,25 +1,26 @@
 """Every built-in algorithm by the command line: trained, resumed, evaluated, played, and its policy loaded."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import point_mass
+import probe_environments as probes
 import pytest
 from fake_program import rows_without_time
 
 import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.learner.train_step import ALGORITHMS
+from jaxrl_vis_envs import registry
+from jaxrl_vis_envs.pixels import PixelsConfig
 
-TRAIN = ["train", "VisualPoint", "--preset", "debug", "--image-size", "8", "--num-envs", "2", "--env-steps", "40"]
+TRAIN = ["train", "VisualTold", "--preset", "debug", "--num-envs", "2", "--env-steps", "32"]
 TRAIN += ["--full-checkpoint-interval", "2", "--checkpoint-interval", "2", "--seeds", "2"]
 
 
 @pytest.fixture(autouse=True)
-def registered() -> Iterator[None]:
-    with point_mass.registered():
-        yield
+def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = registry._Entry(lambda _: probes.SeenGoWhereTold(), PixelsConfig)
+    monkeypatch.setitem(registry._ENTRIES, "VisualTold", task)
 
 
 @pytest.mark.parametrize("algorithm", [name for name in ALGORITHMS if name != "ddpg"])
@@ -27,8 +28,8 @@ def test_an_algorithm_resumes_exactly_and_is_played(algorithm: str, tmp_path: Pa
     monkeypatch.chdir(tmp_path)
     train = [*TRAIN, "--algorithm", algorithm]
     assert cli.main([*train, "--run-dir", "straight"]) == 0
-    assert cli.main([*train, "--env-steps", "20", "--run-dir", "cut"]) == 0
-    assert cli.main(["train", "--resume", "--env-steps", "40", "--run-dir", "cut"]) == 0
+    assert cli.main([*train, "--env-steps", "16", "--run-dir", "cut"]) == 0
+    assert cli.main(["train", "--resume", "--env-steps", "32", "--run-dir", "cut"]) == 0
     rows = rows_without_time(tmp_path / "straight")
     assert rows == rows_without_time(tmp_path / "cut") and len(rows) == 4
     assert cli.main(["eval", "cut", "--episodes", "4"]) == 0

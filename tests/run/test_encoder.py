@@ -28,7 +28,8 @@ def test_an_encoder_is_trained_and_makes_rewards(capsys: pytest.CaptureFixture[s
     encode = frozen_encoder.load("e.npz")
     vectors = encode(jax.random.bits(jax.random.key(0), (3, 4, 16, 16), np.uint8))
     assert vectors.shape == (3, 8) and np.isfinite(vectors).all()
-    audit = ["audit", "VisualPoint", "--image-size", "16", "--episodes", "4", "--goals", "2", "--sequences", "4"]
+    # Shapes of test_audit, whose programs are found again.
+    audit = ["audit", "VisualPoint", "--image-size", "16", "--episodes", "8", "--goals", "4", "--sequences", "8"]
     assert cli.main([*audit, "--rewards", "features", "--reward-encoder", "e.npz"]) == 0
     name, *numbers = [cell.strip() for cell in capsys.readouterr().out.splitlines()[2].strip("|").split("|")]
     assert name == "features" and float(numbers[3]) > 0.2  # images near the last one are more like it

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_policy import SETTINGS, Seen, register
+from test_policy import Seen, register
 
 import jaxrl_vis
 from jaxrl_vis import cli
@@ -30,19 +30,6 @@ from jaxrl_vis.run.exported.layers import collect, forward, layers_of
 from jaxrl_vis.types import NormalizerState, Statistics
 
 FORMATS_HERE = [kind for kind in FORMATS if kind != "onnx" or importlib.util.find_spec("onnxruntime")]
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Trained runs: two seeds on images, one seed on states."""
-    folder = tmp_path_factory.mktemp("exported")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        register(monkeypatch)
-        for name, seeds in (("VisualTold", {"seed": 3, "seeds": 2}), ("Told", {})):
-            # As in test_policy, so that it is compiled once for both.
-            config = preset("debug", env=name, encoders="shared", **SETTINGS, **seeds)
-            list(jaxrl_vis.make_trainer(config, folder / name).run())
-    return {path.name: path for path in folder.iterdir()}
 
 
 @pytest.fixture(autouse=True)

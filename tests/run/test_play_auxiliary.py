@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import probe_environments as probes
@@ -14,6 +15,8 @@ import jaxrl_vis
 from jaxrl_vis import cli
 from jaxrl_vis.learner.auxtasks import NAMES
 from jaxrl_vis.report import auxiliary_video, videos
+from jaxrl_vis.run.storage.checkpoint import Checkpoints
+from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.pixels import PixelsConfig
 
@@ -38,16 +41,21 @@ def dots():
         yield
 
 
-def train(folder: Path, **changes: Any) -> Path:
+def save_fresh_learner(folder: Path, **changes: Any) -> Path:
+    """A run folder with a checkpoint of what a run begins with: gradient steps would take longest to compile."""
     config = jaxrl_vis.preset("debug", env="VisualDots", **{**SETTINGS, **changes})
-    list(jaxrl_vis.make_trainer(config, folder).run())
+    trainer = jaxrl_vis.make_trainer(config, folder)
+    trainer.folder.open(config)
+    checkpoints = Checkpoints(trainer.folder.checkpoints, run_id=read_run_id(folder))
+    checkpoints.save_light(1, trainer.init(jax.random.key(0)).train, {})
+    checkpoints.close()
     return folder
 
 
 def test_a_run_shows_what_it_predicts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = train(tmp_path / "run", aux_tasks=NAMES, weighting="balance", seeds=2)
+    run = save_fresh_learner(tmp_path / "run", aux_tasks=NAMES, weighting="balance", seeds=2)
     capsys.readouterr()
     drawn: list[auxiliary_video.Predictions] = []
     draw = auxiliary_video.draw_frames

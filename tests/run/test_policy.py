@@ -53,19 +53,6 @@ def told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Trained runs: two seeds on images, one seed on states."""
-    folder = tmp_path_factory.mktemp("policies")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        register(monkeypatch)
-        for name, seeds in (("VisualTold", {"seed": 3, "seeds": 2}), ("Told", {})):
-            # With a shared encoder, the actor alone is not all of a policy.
-            config = jaxrl_vis.preset("debug", env=name, encoders="shared", **SETTINGS, **seeds)
-            assert len(list(jaxrl_vis.make_trainer(config, folder / name).run())) == 3
-    return {path.name: path for path in folder.iterdir()}
-
-
-@pytest.fixture(scope="module")
 def policies(runs: dict[str, Path]) -> dict[str, jaxrl_vis.Policy]:
     """The first seed of each run."""
     with pytest.MonkeyPatch.context() as monkeypatch:

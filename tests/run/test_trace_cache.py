@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import point_mass
+import probe_environments as probes
 import pytest
 import small_program
 from jax.experimental.compilation_cache import compilation_cache
@@ -25,26 +26,36 @@ from jaxrl_vis.run.compiled import trace_cache
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.compiled.trace_cache import VARIABLE, fingerprint
 from jaxrl_vis.run.storage.folder import RunFolder
+from jaxrl_vis_envs import registry
 from jaxrl_vis_envs.compiling import compilation
 from jaxrl_vis_envs.compiling.compilation import kernels
+from jaxrl_vis_envs.pixels import PixelsConfig
 
-# Whatever is traced here is traced often, so it is the environment that takes least.
-CONFIG = preset("debug", env="VisualPoint", image_size=8, num_envs=2)
+# Whatever is traced here is traced often, so it is the environment that takes least, without physics and renderer; and once
+# the one of those that have them.
+CONFIG = preset("debug", env="VisualTold", num_envs=2)
+RENDERED = preset("debug", env="VisualPoint", image_size=8, num_envs=2)
 NAMES = ["init", "learn", "play"]
+
+
+class Told(probes.SeenGoWhereTold):
+    """A built-in task, by its module."""
+
+    __module__ = "jaxrl_vis_envs.tasks.told"
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch) -> Iterator[Path]:
     """Where programs are kept, which nothing turns off."""
     monkeypatch.setattr(compilation, "_assumed", set())  # of kernels that other tests have let in
+    monkeypatch.setitem(registry._ENTRIES, "VisualTold", registry._Entry(lambda _: Told(), PixelsConfig))
     with point_mass.registered(tmp_path):
         yield tmp_path / "programs"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def program():
-    with point_mass.registered():
-        return small_program.make_train_step(make_env(CONFIG), CONFIG)
+    return small_program.make_train_step(make_env(CONFIG), CONFIG)
 
 
 def untraceable(program, *names: str):
@@ -73,23 +84,22 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name.partition("-")[0] for path in folder.iterdir())
 
 
-@pytest.mark.parametrize("names", [NAMES, ["evaluate", *NAMES]], ids=["cpu", "gpu"])
-def test_what_was_traced_once_is_not_traced_again_and_computes_the_same(folder, program, monkeypatch, names):
-    if "evaluate" in names:
-        monkeypatch.setattr(train_step, "targets_cpu", lambda: False)
-        program = train_step.make_train_step(program.env, CONFIG)
-    straight = results(Programs(CONFIG, program))
+@pytest.mark.parametrize(("names", "config"), [(NAMES, RENDERED), (["evaluate", *NAMES], CONFIG)], ids=["cpu", "gpu"])
+def test_what_was_traced_once_is_not_traced_again_and_computes_the_same(folder, monkeypatch, names, config):
+    monkeypatch.setattr(train_step, "targets_cpu", lambda: "evaluate" not in names)
+    program = train_step.make_train_step(make_env(config), config)
+    straight = results(Programs(config, program))
     assert not folder.exists()
-    first = Programs(CONFIG, program, keep=True)
+    first = Programs(config, program, keep=True)
     first.compile()
     assert names_in(folder) == names
     assert_equal(results(first), straight)
-    again = Programs(CONFIG, untraceable(program, *(name for name in names if name != "init")), keep=True)
+    again = Programs(config, untraceable(program, *(name for name in names if name != "init")), keep=True)
     again.compile()
     assert_equal(results(again), straight)
     assert again.compile()[names[-1]].memory_analysis().argument_size_in_bytes > 0
     with pytest.raises(AssertionError, match="traced"):
-        Programs(CONFIG.replace(batch_size=8), untraceable(program, *names), keep=True).compile()
+        Programs(config.replace(batch_size=8), untraceable(program, *names), keep=True).compile()
 
 
 def test_damaged_and_unsuitable_programs_are_traced_anew(folder, program):

@@ -171,8 +171,9 @@ def test_what_messages_advise_may_follow_in_the_same_folder(plots, tmp_path, cap
     assert run(plot, other, "--calibration", str(tmp_path / "calibration.yaml"), "--method", "ellipse") == 0
 
 
-def test_synth_adds_the_truth_that_is_missing(tmp_path, capsys):
-    words = ["phenotype", "synth", str(tmp_path), "--width", "211", "--frames", "1", "--truth"]
+def test_synth_adds_the_truth_that_is_missing(plots, tmp_path, capsys):
+    small = ["--spec", str(plots.parent / "few.json"), "--width", "211", "--frames", "1"]
+    words = ["phenotype", "synth", str(tmp_path), *small, "--truth"]
     assert cli.main([*words, "boxes", "--format", "jpeg"]) == 0
     assert cli.main([*words, "all"]) == 0
     assert "there already" not in capsys.readouterr().out

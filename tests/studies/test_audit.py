@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import point_mass
+import probe_environments as probes
 import pytest
 from scipy import stats
 
@@ -13,6 +14,8 @@ from jaxrl_vis import cli
 from jaxrl_vis.config import preset
 from jaxrl_vis.run.storage.folder import RunFolder
 from jaxrl_vis.studies.audit import measures, report
+from jaxrl_vis_envs import registry
+from jaxrl_vis_envs.pixels import PixelsConfig
 
 OWN = """
 import jax.numpy as jnp
@@ -56,13 +59,15 @@ def test_a_probability_is_calibrated_and_its_square_is_not() -> None:
 
 
 @pytest.fixture
-def point(here: Path) -> Iterator[Path]:
+def point(here: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (here / "own.py").write_text(OWN)
+    monkeypatch.setitem(registry._ENTRIES, "VisualTold", registry._Entry(lambda _: probes.SeenGoWhereTold(), PixelsConfig))
     with point_mass.registered():
         yield here
 
 
-SMALL = ["audit", "VisualPoint", "--image-size", "16", "--episodes", "8", "--goals", "4", "--sequences", "8"]
+FEW = ["--episodes", "8", "--goals", "4", "--sequences", "8"]
+SMALL = ["audit", "VisualPoint", "--image-size", "16", *FEW]
 
 
 def test_an_audit_tells_what_rewards_are_worth(point: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -83,23 +88,28 @@ def test_an_audit_tells_what_rewards_are_worth(point: Path, capsys: pytest.Captu
 
 
 def test_noise_breaks_equality(point: Path) -> None:
-    assert cli.main([*SMALL, "--noise", "2", "--json", "a.json", "--tolerance", "12", "--tolerance-share", "0.9"]) == 0
+    assert (
+        cli.main(
+            ["audit", "VisualTold", *FEW, "--noise", "2", "--json", "a.json", "--tolerance", "12", "--tolerance-share", "0.9"]
+        )
+        == 0
+    )
     exact, tolerant = json.loads(Path("a.json").read_text())["rewards"].values()
     assert exact["false_negative"] == 1.0 and tolerant["false_negative"] < 0.5
 
 
 def test_a_model_that_a_run_has_trained_along_is_audited(point: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    train = ["train", "VisualPoint", "--preset", "debug", "--pixels", "rgbd", "--image-size", "16", "--num-envs", "2"]
-    assert cli.main([*train, "--env-steps", "20", "--method", "classifier", "--run-dir", "model"]) == 0
+    train = ["train", "VisualTold", "--preset", "debug", "--num-envs", "2", "--env-steps", "16", "--method", "classifier"]
+    assert cli.main([*train, "--run-dir", "model"]) == 0
     Path("other").mkdir()  # of which the configuration suffices
     RunFolder(Path("other")).open(preset("debug", env="VisualPoint", image_size=16, method="indicator"), False, False, ())
-    assert cli.main([*SMALL, "--rewards", "model", "--json", "a.json"]) == 0
+    assert cli.main(["audit", "VisualTold", *FEW, "--rewards", "model", "--json", "a.json"]) == 0
     (record,) = json.loads(Path("a.json").read_text())["rewards"].values()
     assert all(0.0 <= record[name] <= 1.0 for name in ("false_positive", "false_negative", "calibration_error"))
     capsys.readouterr()
     for words, message in (
         (["--rewards", "other"], "the run in other has no model of rewards: train with --method autoencoder or classifier"),
-        (["--rewards", "model", "--pixels", "rgb"], "sees images of (4, 16, 16), and these are of (3, 16, 16)"),
+        (["--rewards", "model", "--pixels", "rgb"], "sees images of (1, 8, 8), and these are of (3, 16, 16)"),
     ):
         assert cli.main([*SMALL, *words]) == 2
         assert message in capsys.readouterr().err

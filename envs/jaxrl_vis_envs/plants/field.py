@@ -54,7 +54,7 @@ class Stalk:
 
         Args:
             height: Height above the ground, m.
-            bare: Without sheaths and nodes.
+            bare: True to exclude sheaths and nodes.
         """
         _, arc = self.at_height(height)
         mean = 2.0 * float(np.interp(arc, self.arc, self.bare_radius if bare else self.radius))

@@ -68,7 +68,7 @@ class PulledArm(MjxGoalEnv):
 
     @abc.abstractmethod
     def _settled(self, mj_model: mujoco.MjModel, config: PulledArmConfig) -> mujoco.MjData:
-        """Return the start of every episode."""
+        """Return the physics state in which every episode starts, after the arm has been pulled there and has come to rest."""
 
     def sample_start(self, key: jax.Array) -> mjx.Data:
         return self._start

@@ -1,4 +1,4 @@
-"""``jaxrl-vis dataset``."""
+"""Command ``jaxrl-vis dataset``: record or convert episodes, as a LeRobot dataset or .npz file."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``jaxrl-vis eval``."""
+"""Command ``jaxrl-vis eval``: evaluate the policy of a run."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""``jaxrl-vis export``."""
+"""Command ``jaxrl-vis export``: export the policy of a run for use without this project."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``jaxrl-vis play``."""
+"""Command ``jaxrl-vis play``: show episodes of a policy as a video, or live."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``jaxrl-vis push``."""
+"""Command ``jaxrl-vis push``: share the policy of a run in a folder or on a hub."""
 
 import dataclasses
 from pathlib import Path

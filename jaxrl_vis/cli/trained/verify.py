@@ -1,4 +1,4 @@
-"""``jaxrl-vis verify``."""
+"""Command ``jaxrl-vis verify``: repeat the beginning of a run, and compare its files bit for bit."""
 
 import dataclasses
 import math

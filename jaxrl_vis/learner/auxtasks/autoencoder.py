@@ -1,4 +1,4 @@
-"""Autoencoder: the observation from its latent, by a decoder (thesis, 5.2.3.1)."""
+"""Autoencoder: reconstruction of the observation from its latent, by a decoder (thesis, 5.2.3.1)."""
 
 import jax
 

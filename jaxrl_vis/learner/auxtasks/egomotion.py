@@ -1,4 +1,4 @@
-"""Egomotion: the rotation of an image, from its latents before and after, by a linear layer (thesis, 5.2.3.1)."""
+"""Egomotion: prediction of an image's rotation from its latents before and after, by a linear layer (thesis, 5.2.3.1)."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Forward dynamics: the next latent from this one and the action, by a linear layer (thesis, 5.2.3.1)."""
+"""Forward dynamics: prediction of the next latent from the current one and the action, by a linear layer (thesis, 5.2.3.1)."""
 
 import jax
 

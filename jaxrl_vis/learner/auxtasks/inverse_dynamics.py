@@ -1,4 +1,4 @@
-"""Inverse dynamics: the action from two successive latents, by a linear layer (thesis, 5.2.3.1)."""
+"""Inverse dynamics: prediction of the action from two successive latents, by a linear layer (thesis, 5.2.3.1)."""
 
 import jax
 

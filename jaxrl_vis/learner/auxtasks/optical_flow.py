@@ -1,4 +1,4 @@
-"""Optical flow: its magnitude at each pixel, from the latents of two images, by a decoder (thesis, 5.2.3.1)."""
+"""Optical flow: prediction of its magnitude at each pixel from the latents of two images, by a decoder (thesis, 5.2.3.1)."""
 
 import jax
 import jax.numpy as jnp

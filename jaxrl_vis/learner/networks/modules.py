@@ -22,7 +22,7 @@ _glorot = nn.initializers.glorot_uniform()
 
 
 def _zero_init(key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.Array:
-    """Initialise kernels with outputs close to 0: uniform in [-1e-12, 1e-12]."""
+    """Sample a kernel uniformly from [-1e-12, 1e-12], so that outputs are close to 0."""
     return jax.random.uniform(key, shape, dtype, -1e-12, 1e-12)
 
 

@@ -19,7 +19,7 @@ from jaxrl_vis_envs.cores import num_cores
 
 
 class ThreadedRollout:
-    """Rollout of any number of environments, in parts of equal size.
+    """Thread pool for rollouts and evaluations of any number of episodes, in parts of equal size by the same program.
 
     Args:
         size: P, number of environments per part.

@@ -60,7 +60,12 @@ def card(
         remark: Additional sentence about the scores.
     """
     task, name = config.environment.env, f"{config.environment.env}, {config.reward.method}, {config.run.algorithm}"
-    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in _front(task, name, scores.get(seed)).items()), "---", ""]
+    lines = [
+        "---",
+        *(f"{key}: {json.dumps(value)}" for key, value in _front_matter(task, name, scores.get(seed)).items()),
+        "---",
+        "",
+    ]
     lines += [f"# {name}", "", f"A policy that reaches goals of the task {task}, trained by jaxrl-vis.", ""]
     lines += [f"![{caption}]({file})\n" for caption, file in (pictures or {}).items()]
     lines += ["| seed | environment steps | success | 95 % interval | episodes | mean distance |", "|---|---|---|---|---|---|"]
@@ -102,7 +107,7 @@ def card(
     return "\n".join(lines) + "\n"
 
 
-def _front(task: str, name: str, of_seed: Score | None) -> dict[str, Any]:
+def _front_matter(task: str, name: str, of_seed: Score | None) -> dict[str, Any]:
     """Return the front matter; its values are written as JSON, a subset of YAML."""
     front: dict[str, Any] = {
         "library_name": "jaxrl-vis",

@@ -14,7 +14,7 @@ _LOWER_IS_BETTER = ("goal_distance", "goal_distance_median")
 
 
 def metric(config: Config) -> str:
-    """Return the name of the metric, without ``eval/``."""
+    """Return the name of the metric that the score averages, without ``eval/``."""
     return config.run.best_by or "success"
 
 

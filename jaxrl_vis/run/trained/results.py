@@ -56,7 +56,7 @@ class Results:
         self._echo(f"see {', '.join([*written, self._folder.metrics.name])} in {self._folder.path}")
 
     def draw_curve(self, done: int) -> None:
-        """Draw the evaluations up to ``done`` iterations."""
+        """Plot the learning curve up to iteration ``done`` into the run folder."""
         from jaxrl_vis.report import plots
 
         config, env = self._programs.config, self._programs.env

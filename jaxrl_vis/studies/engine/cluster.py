@@ -118,7 +118,7 @@ class Job:
 
 
 class Cluster:
-    """Starter of runs as cluster jobs.
+    """Submitter of runs as cluster jobs.
 
     Args:
         executor: Executor of the jobs.

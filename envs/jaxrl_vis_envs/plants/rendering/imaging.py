@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis_envs.plants.rendering.texture import hash_words, normal
+from jaxrl_vis_envs.plants.rendering.texture import approximate_normal, hash_words
 
 _PSF_RADIUS = 4  # pixels, of the point spread function
 
@@ -64,7 +64,7 @@ def _expose(radiance: jax.Array, exposure: Exposure) -> jax.Array:
     falloff = 1.0 - exposure.vignetting * (x[None, :] ** 2 + y[:, None] ** 2)
     electrons = radiance * (falloff * exposure.gain * exposure.full_well)[..., None]
     index = jnp.arange(height * width * 3, dtype=jnp.uint32).reshape(height, width, 3)
-    drawn = normal(hash_words(index, jnp.broadcast_to(exposure.seed, index.shape)))
+    drawn = approximate_normal(hash_words(index, jnp.broadcast_to(exposure.seed, index.shape)))
     deviation = exposure.noise * jnp.sqrt(jnp.maximum(electrons, 0.0) + exposure.read_noise**2)
     signal = jnp.clip((electrons + deviation * drawn) / exposure.full_well, 0.0, 1.0)
     curved = jnp.where(signal <= 0.0031308, 12.92 * signal, 1.055 * signal ** (1 / 2.4) - 0.055)

@@ -147,8 +147,8 @@ def shade(tables: Tables, shot: Shot, x: jax.Array, y: jax.Array, hit: Hit) -> l
     ground = _SurfacePoint(world[0], world[1], flat, x * 0.0, x * 0.0, x * 0.0)
     surface = _SurfacePoint(*jax.tree.map(lambda s, t, g: jnp.where(is_cone, s, jnp.where(is_leaf, t, g)), stalk, leaf, ground))
     material = jnp.where(is_cone, tables.cone_material[cone_row], jnp.where(is_leaf, tables.triangle_material[leaf_row], 0))
-    m = tables.materials[material]
-    albedo, gloss = _albedo(m, surface, is_cone, is_leaf, is_ground)
+    properties = tables.materials[material]
+    albedo, gloss = _albedo(properties, surface, is_cone, is_leaf, is_ground)
 
     to_flash = tuple(shot.flash[i] - point[i] for i in range(3))
     square = _dot(to_flash, to_flash)
@@ -218,12 +218,12 @@ def _backdrop(shot: Shot, day: Day, x: jax.Array, y: jax.Array) -> list[jax.Arra
 
 
 def _albedo(
-    m: jax.Array, surface: _SurfacePoint, is_cone: jax.Array, is_leaf: jax.Array, is_ground: jax.Array
+    material: jax.Array, surface: _SurfacePoint, is_cone: jax.Array, is_leaf: jax.Array, is_ground: jax.Array
 ) -> tuple[list[jax.Array], jax.Array]:
     """Compute the reflectance of surfaces (three channels), and the intensity of their highlights."""
-    base, over = [m[..., k] for k in range(3)], [m[..., 3 + k] for k in range(3)]
+    base, over = [material[..., k] for k in range(3)], [material[..., 3 + k] for k in range(3)]
     fibre_f, fibre_c, blotch_f, blotch_c, speckles, speckle_f, bands, band_f, bloom, gloss, texture_shift, edge = (
-        m[..., 6 + k] for k in range(12)
+        material[..., 6 + k] for k in range(12)
     )
     u, v = surface.u + texture_shift, surface.v + texture_shift
     # Fibres run along a stalk or leaf; the ground's grains have no direction.

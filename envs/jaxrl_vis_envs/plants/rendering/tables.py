@@ -150,18 +150,18 @@ def _in_sight(boxes: np.ndarray, columns: int, lines: int) -> np.ndarray:
     return (boxes[:, 0] < columns) & (boxes[:, 1] < lines) & (boxes[:, 2] >= 0) & (boxes[:, 3] >= 0)
 
 
-def _list_by_tile(boxes: np.ndarray, columns: int, lines: int) -> tuple[np.ndarray, np.ndarray]:
+def _list_by_tile(boxes: np.ndarray, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the table rows visible in each tile, tile by tile, and the range [N, 2] of each tile's part."""
     first = np.maximum(boxes[:, :2], 0)
-    last = np.minimum(boxes[:, 2:], [columns - 1, lines - 1])
+    last = np.minimum(boxes[:, 2:], [columns - 1, rows - 1])
     wide, high = (last - first + 1).T if len(boxes) else np.zeros((2, 0), np.int64)
     counts = wide * high
     row = np.repeat(np.arange(len(boxes)), counts)
     number_in_box = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    line, column = np.divmod(number_in_box, np.maximum(wide[row], 1))
-    tile = (first[row, 1] + line) * columns + first[row, 0] + column
+    tile_row, column = np.divmod(number_in_box, np.maximum(wide[row], 1))
+    tile = (first[row, 1] + tile_row) * columns + first[row, 0] + column
     order = np.argsort(tile, kind="stable")
-    ends = np.cumsum(np.bincount(tile, minlength=columns * lines))
+    ends = np.cumsum(np.bincount(tile, minlength=columns * rows))
     starts = np.concatenate([[0], ends[:-1]])
     return row[order].astype(np.int32), np.stack([starts, ends], axis=1).astype(np.int32)
 

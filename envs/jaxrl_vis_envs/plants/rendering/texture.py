@@ -19,7 +19,7 @@ def uniform(bits: jax.Array) -> jax.Array:
     return (bits >> 8).astype(jnp.int32).astype(jnp.float32) * jnp.float32(2.0**-24)
 
 
-def normal(bits: jax.Array) -> jax.Array:
+def approximate_normal(bits: jax.Array) -> jax.Array:
     """Convert uint32 to approximately standard normal float32, within 3.4 of 0, from the sum of the four bytes."""
     total = (bits & 255) + ((bits >> 8) & 255) + ((bits >> 16) & 255) + (bits >> 24)
     return (total.astype(jnp.int32).astype(jnp.float32) - 510.0) * jnp.float32(1.0 / 147.8)

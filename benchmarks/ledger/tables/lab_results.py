@@ -1,4 +1,4 @@
-"""Tables of docs/lab/results.md: rows from `result_rows`, figures from the records.
+"""Tables of docs/lab/results.md: rows from `lab_rows`, figures from the records.
 
 A figure without a record is written as `MISSING`, and `make stale` lists it.
 """
@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.ledger import evidence
 from benchmarks.ledger.evidence import Evidence
 from benchmarks.ledger.records import read_all
-from benchmarks.ledger.result_rows import DEVICES, LEARNING, SPEED, Figure, Learning
+from benchmarks.ledger.tables.lab_rows import DEVICES, LEARNING, SPEED, Figure, Learning
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
@@ -71,7 +71,7 @@ def speed_cell(figures: tuple[Figure, ...], device: str, records: list[dict[str,
 def speed_table(results: Path) -> str:
     """Write the speed table, as Markdown."""
     records = [record for _, record in read_all(results) if record["name"] != evidence.NAME]
-    lines = [f"| what | {' | '.join(DEVICES)} |", "|---" * (1 + len(DEVICES)) + "|"]
+    lines = [f"| benchmark | {' | '.join(DEVICES)} |", "|---" * (1 + len(DEVICES)) + "|"]
     for row in SPEED:
         cells = (speed_cell(row.figures.get(column, ()), device, records) for column, device in DEVICES.items())
         lines.append(f"| {row.label} | {' | '.join(cells)} |")
@@ -144,7 +144,7 @@ def _machine(device: dict[str, Any]) -> str:
 
 def results_table(results: Path) -> str:
     """Write the results table, as Markdown."""
-    lines = ["| what | machine | figure | command |", "|---|---|---|---|"]
+    lines = ["| experiment | machine | result | command |", "|---|---|---|---|"]
     for row in LEARNING:
         runs = load_runs(row, results)
         command = row.command or training_command(next(iter(row.runs.values())))

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ledger.result_tables import short
+from benchmarks.ledger.tables.lab_results import short
 from jaxrl_vis.bench.record import load
 
 _PARITY = "pixels_parity.json"

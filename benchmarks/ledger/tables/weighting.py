@@ -18,7 +18,10 @@ def torchjd_table(results: Path) -> str | None:
     if not (results / _RECORD).exists():
         return None
     record = json.loads((results / _RECORD).read_text())
-    lines = ["| method | cases | difference, greatest | median | residual, ours | TorchJD's |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| method | cases | maximum difference | median difference | residual | residual of TorchJD |",
+        "|---|---|---|---|---|---|",
+    ]
     for row in record["rows"]:
         residuals = [f"{row[name]:.0e}" if name in row else "" for name in ("residual_max_ours", "residual_max_theirs")]
         cells = [f"`{row['method']}`", str(row["cases"]), f"{row['difference_max']:.0e}", f"{row['difference_median']:.0e}"]
@@ -41,7 +44,7 @@ def _of_device(record: dict[str, Any]) -> str:
     ours, theirs = (
         {(row["method"], row["losses"], row["what"]): row["seconds"] for row in record[side]} for side in ("ours", "torchjd")
     )
-    head = ["method", *(f"step, K = {count}" for count in counts), f"alone, K = {counts[-1]}"]
+    head = ["method", *(f"step, K = {count}" for count in counts), f"weighting only, K = {counts[-1]}"]
     lines = [
         f"{record['device']}, microseconds, ours / TorchJD's:",
         "",

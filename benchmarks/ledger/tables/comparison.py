@@ -8,8 +8,8 @@ from typing import Any
 from benchmarks.claims import ol_aux
 from benchmarks.ledger import evidence
 from benchmarks.ledger.records import RESULTS, read_all
-from benchmarks.ledger.result_rows import DEVICES, Figure
-from benchmarks.ledger.result_tables import MISSING, find, short
+from benchmarks.ledger.tables.lab_results import MISSING, find, short
+from benchmarks.ledger.tables.lab_rows import DEVICES, Figure
 from jaxrl_vis.report.learning import curve, steps_to
 from jaxrl_vis.studies.figures.authors import released_curves
 
@@ -108,7 +108,7 @@ def _lines(results: Path) -> Iterator[str]:
     rows = {row.label: _rate_cells(row, records) for row in RATES}
     label = f"VisualFetchReach learnt from images to {100 * _LEARNT:.0f} % success"
     rows[label] = _learning_cells(results)
-    yield "| what | here | instead | ratio |"
+    yield "| measurement | jaxrl-vis | alternative | ratio |"
     yield "|---|---|---|---|"
     for label, cells in rows.items():
         yield f"| {label} | {' | '.join(cells or (MISSING, '', ''))} |"

@@ -1,4 +1,4 @@
-"""Rows of the tables of docs/lab/results.md: records and wording. `result_tables` writes them."""
+"""Rows of the tables of docs/lab/results.md: records and wording. `lab_results` writes them."""
 
 import dataclasses
 from typing import Any

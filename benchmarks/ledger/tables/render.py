@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ledger.result_tables import short
+from benchmarks.ledger.tables.lab_results import short
 from jaxrl_vis.bench.record import load
 
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"

@@ -10,13 +10,16 @@ from jaxrl_vis.host.platform_report import SCHEMA
 FOLDER = "platforms"
 _BENCHMARKS = ("render", "physics", "env", "update", "train")
 EXPECTED = (
-    ("ARM (aarch64, Linux)", "All of it: MuJoCo and jaxlib have wheels, and nothing here is compiled for one processor."),
+    (
+        "ARM (aarch64, Linux)",
+        "Everything: MuJoCo and jaxlib provide wheels, and this project contains no processor-specific binaries.",
+    ),
     (
         "Apple (arm64, macOS)",
-        "All of it on the CPU, by the wheels of MuJoCo and jaxlib. Its GPU: nothing is promised, jax-metal lags behind JAX.",
+        "Everything on the CPU, with the wheels of MuJoCo and jaxlib. Its GPU is unsupported, as jax-metal lags behind JAX.",
     ),
-    ("TPU", "Training, MJX, and images by the plain renderer; the kernels for NVIDIA GPUs are left aside by themselves."),
-    ("AMD GPU (ROCm)", "As on a TPU, with AMD's jaxlib; the kernels are for NVIDIA GPUs alone."),
+    ("TPU", "Training, MJX and the pure JAX renderer; the kernels for NVIDIA GPUs are disabled automatically."),
+    ("AMD GPU (ROCm)", "As on a TPU, with AMD's jaxlib."),
 )
 """Untested platforms, and what is expected to work."""
 
@@ -27,13 +30,15 @@ def platforms_table(results: Path) -> str | None:
     if not rows:
         return None
     rows.sort(key=lambda row: row[0], reverse=True)
-    lines = ["| date | machine | driver | Python | JAX | what ran |", "|---|---|---|---|---|---|"]
+    lines = ["| date | machine | driver | Python | JAX | checks and benchmarks |", "|---|---|---|---|---|---|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def not_run_table(_: Path) -> str:
     """Write the untested platforms, as Markdown."""
-    return "\n".join(["| not run | expected |", "|---|---|", *(f"| {name} | {text} |" for name, text in EXPECTED)])
+    return "\n".join(
+        ["| untested platform | expected to work |", "|---|---|", *(f"| {name} | {text} |" for name, text in EXPECTED)]
+    )
 
 
 def _records(results: Path) -> list[dict[str, Any]]:

@@ -19,25 +19,25 @@ def lens_table(results: Path = RESULTS) -> str | None:
 
 
 def lens_rows(lenses: dict[str, Any]) -> str:
-    """Format a table of lenses from results by focal length factor; see `benchmarks.stalks.lenses.look`."""
-    usual = lenses.get("1", {"errors_mm": {}})["errors_mm"]
+    """Format a table of lenses from results by focal length factor; see `benchmarks.stalks.lenses.evaluate_row`."""
+    reference_errors = lenses.get("1", {"width_errors_mm": {}})["width_errors_mm"]
     lines = [
-        "| focal length | pixels per m | view, m | counted | found | false finds | ground seen | widths | error, mm "
-        "| beside x 1, mm | `phenotype run` |",
+        "| focal length | pixels per m | view, m | stalk count | detected | false positives | ground detected | widths "
+        "| error, mm | difference from x 1, mm | `phenotype run` |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for factor, lens in lenses.items():
-        errors = lens["errors_mm"]
-        differences = [errors[stalk] - usual[stalk] for stalk in errors.keys() & usual.keys()]
-        tried = lens["density"] >= TRIED.pixels_per_metre and lens["view"] >= TRIED.view
+        errors = lens["width_errors_mm"]
+        differences = [errors[stalk] - reference_errors[stalk] for stalk in errors.keys() & reference_errors.keys()]
+        tried = lens["pixels_per_metre"] >= TRIED.pixels_per_metre and lens["view_m"] >= TRIED.view
         cells = (
             f"x {factor}",
-            f"{lens['density']:.0f}",
-            f"{lens['view']:.2f}",
+            f"{lens['pixels_per_metre']:.0f}",
+            f"{lens['view_m']:.2f}",
             f"{lens['counted']} of {lens['true']}",
-            f"{lens['found']} of {lens['clear']}",
-            f"{lens['false']}",
-            f"{100 * lens['ground']:.0f} %",
+            f"{lens['true_positives']} of {lens['visible']}",
+            f"{lens['false_positives']}",
+            f"{100 * lens['ground_share']:.0f} %",
             f"{len(errors)}",
             f"{np.median(list(errors.values())):+.2f}" if errors else "",
             f"{np.median(differences):+.2f}" if differences and factor != "1" else "",
@@ -50,7 +50,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
 def coverage_table(results: Path = RESULTS) -> str | None:
     """Write the table of 95 % intervals from the records of `phenotype eval` for each family; None without both."""
     lines = [
-        "| family | seeds | widths | within the interval | mean absolute error, mm | mean standard error, mm |",
+        "| family | seeds | widths | coverage | mean absolute error, mm | mean standard error, mm |",
         "|---|---|---|---|---|---|",
     ]
     for family in ("training", "shifted"):

@@ -29,7 +29,7 @@ def rows(folder: Path) -> str:
     cells = [cell for cell in host_learning.cells() if (folder / f"{cell.name}.json").exists()]
     records = sorted((read_json(folder / f"{cell.name}.json") for cell in cells), key=_place)
     lines = [
-        "| learned | reward | camera noise | seeds | steps to 0.9 | success at the end | false + | false - |",
+        "| data | reward | camera noise | seeds | steps to 0.9 | final success | false positive rate | false negative rate |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for _, group in itertools.groupby(records, key=_place):
@@ -38,7 +38,7 @@ def rows(folder: Path) -> str:
     versions = records[0]["versions"]
     lines += [
         "",
-        f"The noisy behaviour's own success: {_behaviour(records)}. Made by {revisions} on {records[0]['device']}, "
+        f"Success of the noisy behaviour policy: {_behaviour(records)}. Made by {revisions} on {records[0]['device']}, "
         f"MuJoCo {versions['mujoco']}, JAX {versions['jax']}.",
     ]
     return "\n".join(lines)
@@ -49,7 +49,7 @@ def _place(record: dict[str, Any]) -> tuple[str, int, int]:
 
 
 def _behaviour(records: list[dict[str, Any]]) -> str:
-    shares = {record["success_of_behaviour"] for record in records if record["mode"] == "recorded"}
+    shares = {record["behaviour_success"] for record in records if record["mode"] == "recorded"}
     return ", ".join(f"{share:.3f}" for share in sorted(shares)) or "not recorded"
 
 
