@@ -3,7 +3,8 @@
 There are three stages: all linear work, once per environment (`pixel.shapes`, `pixel.lights`); the nearest object of each pixel
 (`pixel.raycast`, `pixel.triangles`), an integer that is never differentiated; and, once per pixel, depth, normal and colour of
 that object from a row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two stages are one kernel on a GPU
-(`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`).
+(`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`). In scenes with meshes or height fields, a
+kernel on a GPU searches for their triangles (`gpu.walk`).
 """
 
 import dataclasses
@@ -19,7 +20,7 @@ from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, target_pl
 from jaxrl_vis_envs.render import camera, cords
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.cpu import passes
-from jaxrl_vis_envs.render.gpu import kernel
+from jaxrl_vis_envs.render.gpu import kernel, walk
 from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
 from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent
 from jaxrl_vis_envs.render.pixel.prepare import check_poses, prepare
@@ -96,6 +97,7 @@ def render_planes(
 def _in_32_bits(scene: Scene) -> Scene:
     """Convert the leaves, which may be Python numbers or 64-bit arrays, to the dtypes that `Scene` documents."""
     leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
+    leaves.remove("hierarchies")  # built once, never replaced
     dtypes = {name: _INTEGERS.get(name, jnp.float32) for name in leaves}
     return scene.replace(**{name: jnp.asarray(getattr(scene, name), dtype) for name, dtype in dtypes.items()})
 
@@ -105,7 +107,7 @@ def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
     for path in (kernel, passes):
         if path.can_render(scene, outputs):
             return path.draw
-    return None
+    return _draw_walking if walk.can_search(scene) else None
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -130,7 +132,21 @@ def _differentiate(path: _Path, outputs: Outputs, primals: tuple, tangents: tupl
         return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
 
 
-def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
+def _draw_walking(
+    outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
+) -> Planes:
+    """Render as `_draw`, with triangles found by a GPU kernel."""
+    return _draw(outputs, scene, rotation, unit, light_table, search=walk.nearest_triangle)
+
+
+def _draw(
+    outputs: Outputs,
+    scene: Scene,
+    rotation: jax.Array,
+    unit: shapes.UnitShapes,
+    light_table: jax.Array,
+    search: Callable | None = None,
+) -> Planes:
     """Render the requested planes of a scene with objects, in plain JAX.
 
     Args:
@@ -139,8 +155,9 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
         rotation: [3, 3] float32, see `camera.camera_pose`.
         unit: Rendered objects.
         light_table: Lights, from `lights.pack`.
+        search: Search for triangles, see `blocks.nearest`, over all pixels at once; None for that in plain JAX.
     """
-    layout = blocks.layout(scene)
+    layout = blocks.layout(scene) if search is None else blocks.whole(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # Barrier: XLA would otherwise repeat the per-object work in every pixel.
     unit = camera.barrier(unit)
@@ -155,7 +172,7 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
             length = blocks.restore(scene, layout, along)
         return Planes(None, depth, None, None, length)
     # Barriers: XLA would otherwise search for the nearest object again for each output.
-    near = jax.lax.optimization_barrier(blocks.nearest(scene, unit, rays))
+    near = jax.lax.optimization_barrier(blocks.nearest(scene, unit, rays, search))
     rows = lookup.object_table(scene, unit)
     view = _View(rotation, unit, rows, light_table)
     pixels = blocks.merge_blocks((rays, near))

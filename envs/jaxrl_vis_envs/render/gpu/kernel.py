@@ -107,10 +107,16 @@ def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[j
     across = (sides[:, 0] <= u_at(lefts + wide)[:, None]) & (sides[:, 1] >= u_at(lefts - 1)[:, None])
     down = (sides[:, 2] <= v_at(tops - 1)[:, None]) & (sides[:, 3] >= v_at(tops + high)[:, None])
     meets = (down[:, None] & across[None, :]).reshape(len(tops) * len(lefts), -1)
-    words = -(-len(order) // 32)
-    meets = jnp.pad(meets, ((0, 0), (0, 32 * words - len(order)))).reshape(-1, words, 32)
+    return pack_bits(meets), order
+
+
+def pack_bits(mask: jax.Array) -> jax.Array:
+    """Pack a mask [tiles, N] into bits [tiles, words] int32: bit b of word w is element 32 w + b."""
+    count = mask.shape[1]
+    words = -(-count // 32)
+    mask = jnp.pad(mask, ((0, 0), (0, 32 * words - count))).reshape(-1, words, 32)
     bits = jnp.asarray(np.left_shift(np.uint32(1), np.arange(32, dtype=np.uint32)))
-    return jax.lax.bitcast_convert_type(jnp.sum(jnp.where(meets, bits, 0), axis=-1, dtype=jnp.uint32), jnp.int32), order
+    return jax.lax.bitcast_convert_type(jnp.sum(jnp.where(mask, bits, 0), axis=-1, dtype=jnp.uint32), jnp.int32)
 
 
 class _Refs(NamedTuple):

@@ -7,6 +7,7 @@ divided; intermediate values then also stay in the cache.
 On any platform, blocks are tiles if the scene has many objects, most of which are outside a given tile.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -45,6 +46,12 @@ def layout(scene: Scene) -> Layout:
         return Layout(pixels // scene.width, pixels % scene.width, None)
     preferred = _CPU_TILE if targets_cpu() else _TILE
     return tiles(scene, near_divisor(scene.height, preferred), near_divisor(scene.width, preferred))
+
+
+def whole(scene: Scene) -> Layout:
+    """Return the layout of one block: all pixels, row by row."""
+    pixels = np.arange(scene.height * scene.width)[None]
+    return Layout(pixels // scene.width, pixels % scene.width, None)
 
 
 def tiles(scene: Scene, high: int, wide: int) -> Layout:
@@ -147,8 +154,15 @@ class Nearest(NamedTuple):
     triangle: jax.Array | None
 
 
-def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
-    """Return the nearest opaque objects along rays [blocks, P]."""
+def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, search: Callable | None = None) -> Nearest:
+    """Return the nearest opaque objects along rays [blocks, P].
+
+    Args:
+        scene: The scene.
+        unit: Rendered objects.
+        rays: [blocks, P].
+        search: Function with the arguments and results of `triangles.nearest_triangle` but for the last two, in its place.
+    """
     row = None
     if raycast.has_separate_rows(scene):
         bits_and_row = scan_one(lambda rays: raycast.nearest_row(scene, unit, rays), rays)
@@ -160,12 +174,12 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
 
     # Not differentiated: the derivatives come from `surface.meet`.
     unit = jax.lax.stop_gradient(unit)
-    bounds = jax.lax.optimization_barrier(triangles.opaque_bounds(jax.lax.stop_gradient(scene), unit))
+    if search is None:
+        bounds = jax.lax.optimization_barrier(triangles.opaque_bounds(jax.lax.stop_gradient(scene), unit))
+        search = functools.partial(triangles.nearest_triangle, bounds=bounds)
 
     def add_triangles(rays: Rays, key: jax.Array, row: jax.Array | None) -> Nearest:
-        depth, triangle, owner = triangles.nearest_triangle(
-            scene, unit, rays, raycast.decode(scene, key, row)[0], bounds=bounds
-        )
+        depth, triangle, owner = search(scene, unit, rays, raycast.decode(scene, key, row)[0])
         mask = raycast.code_mask(scene)
         triangle_key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
         is_triangle = triangle >= 0

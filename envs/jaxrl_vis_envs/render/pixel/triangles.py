@@ -17,8 +17,9 @@ from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
 from jaxrl_vis_envs.render.scene import Scene
 
-# Relative tolerance by which triangles extend beyond their edges, so that no ray passes between adjacent ones.
-_SEAM = 1e-5
+SEAM = 1e-5
+"""Relative tolerance by which triangles extend beyond their edges, so that no ray passes between adjacent ones."""
+
 # Horizontal and vertical offset of a second ray in `next_triangle`, relative to half the image's height. Few edges have that
 # direction, and it is far larger than the rounding error of an edge.
 _OFFSET = (2e-5, -6e-6)
@@ -201,7 +202,7 @@ def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array
     """Return the depth [P] of a cluster's nearest triangle, with its index in the lowest bits; infinite if there is none."""
     best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
     for number, (t, margin, is_front) in enumerate(_intersect_triangles(scene, unit, cluster, rays)):
-        meets = is_front & (margin >= -_SEAM)
+        meets = is_front & (margin >= -SEAM)
         key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
         best = jnp.minimum(best, jnp.where(meets, key, best))
     infinite = np.float32(np.inf).view(np.int32)
