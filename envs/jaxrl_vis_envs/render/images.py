@@ -135,8 +135,8 @@ def _differentiate(path: _Path, outputs: Outputs, primals: tuple, tangents: tupl
 def _draw_walking(
     outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
-    """Render as `_draw`, with triangles found by a GPU kernel."""
-    return _draw(outputs, scene, rotation, unit, light_table, search=walk.nearest_triangle)
+    """Render as `_draw`, with the nearest objects found by GPU kernels."""
+    return _draw(outputs, scene, rotation, unit, light_table, walk.nearest)
 
 
 def _draw(
@@ -155,7 +155,7 @@ def _draw(
         rotation: [3, 3] float32, see `camera.camera_pose`.
         unit: Rendered objects.
         light_table: Lights, from `lights.pack`.
-        search: Search for triangles, see `blocks.nearest`, over all pixels at once; None for that in plain JAX.
+        search: Function in the place of `blocks.nearest`, for all pixels in one block; None for that.
     """
     layout = blocks.layout(scene) if search is None else blocks.whole(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
@@ -172,7 +172,7 @@ def _draw(
             length = blocks.restore(scene, layout, along)
         return Planes(None, depth, None, None, length)
     # Barriers: XLA would otherwise search for the nearest object again for each output.
-    near = jax.lax.optimization_barrier(blocks.nearest(scene, unit, rays, search))
+    near = jax.lax.optimization_barrier((search or blocks.nearest)(scene, unit, rays))
     rows = lookup.object_table(scene, unit)
     view = _View(rotation, unit, rows, light_table)
     pixels = blocks.merge_blocks((rays, near))

@@ -22,9 +22,9 @@ from jaxrl_vis_envs.compiling.compilation import use_gpu_kernels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
-from jaxrl_vis_envs.render.gpu.kernel import pack_bits
+from jaxrl_vis_envs.render.gpu import kernel
 from jaxrl_vis_envs.render.model import hierarchies, reading
-from jaxrl_vis_envs.render.pixel import shapes
+from jaxrl_vis_envs.render.pixel import blocks, raycast, shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.pixel.triangles import SEAM
@@ -122,6 +122,27 @@ def can_search(scene: Scene) -> bool:
     return scene.hierarchies is not None and use_gpu_kernels(probe)
 
 
+def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, interpret: bool = False) -> blocks.Nearest:
+    """Return the nearest opaque objects of all pixels, as `blocks.nearest`. Not differentiable.
+
+    Args:
+        scene: Scene with triangles.
+        unit: Rendered objects.
+        rays: [1, H * W], those of all pixels, row by row.
+        interpret: Run without a GPU, slowly.
+    """
+    scene, unit = jax.lax.stop_gradient((scene, unit))
+    rays, row = Rays(rays.u[0], rays.v[0]), None
+    if kernel.can_search(scene):
+        key, row = kernel.nearest_primitives(scene, unit, interpret)
+    elif raycast.has_separate_rows(scene):
+        key, row = raycast.nearest_row(scene, unit, rays)
+    else:
+        key = raycast.nearest_key(scene, unit, rays)
+    found = nearest_triangle(scene, unit, rays, raycast.decode(scene, key, row)[0], interpret)
+    return jax.tree.map(lambda plane: plane[None], blocks.add_triangles(scene, key, row, found))
+
+
 def nearest_triangle(
     scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -148,7 +169,7 @@ def nearest_triangle(
     start, direction, _ = camera.ray_parts(scene, rays)
     axis = -unit.axes[trees.objects, :, 2] if scene.projection == "orthographic" else _apply(unit.axes[trees.objects], middle)
     refs = _shared_refs(trees, unit, order, axis)._replace(
-        words=pack_bits(meets),
+        words=kernel.pack_bits(meets),
         near=near[order],
         ball=jnp.concatenate([middle, radius[:, None]], axis=1)[order],
         start=_stack(start, depth.shape),

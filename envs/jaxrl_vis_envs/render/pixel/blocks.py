@@ -7,7 +7,6 @@ divided; intermediate values then also stay in the cache.
 On any platform, blocks are tiles if the scene has many objects, most of which are outside a given tile.
 """
 
-import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -154,15 +153,8 @@ class Nearest(NamedTuple):
     triangle: jax.Array | None
 
 
-def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, search: Callable | None = None) -> Nearest:
-    """Return the nearest opaque objects along rays [blocks, P].
-
-    Args:
-        scene: The scene.
-        unit: Rendered objects.
-        rays: [blocks, P].
-        search: Function with the arguments and results of `triangles.nearest_triangle` but for the last two, in its place.
-    """
+def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
+    """Return the nearest opaque objects along rays [blocks, P]."""
     row = None
     if raycast.has_separate_rows(scene):
         bits_and_row = scan_one(lambda rays: raycast.nearest_row(scene, unit, rays), rays)
@@ -174,17 +166,28 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, search: Callable 
 
     # Not differentiated: the derivatives come from `surface.meet`.
     unit = jax.lax.stop_gradient(unit)
-    if search is None:
-        bounds = jax.lax.optimization_barrier(triangles.opaque_bounds(jax.lax.stop_gradient(scene), unit))
-        search = functools.partial(triangles.nearest_triangle, bounds=bounds)
+    bounds = jax.lax.optimization_barrier(triangles.opaque_bounds(jax.lax.stop_gradient(scene), unit))
 
-    def add_triangles(rays: Rays, key: jax.Array, row: jax.Array | None) -> Nearest:
-        depth, triangle, owner = search(scene, unit, rays, raycast.decode(scene, key, row)[0])
-        mask = raycast.code_mask(scene)
-        triangle_key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
-        is_triangle = triangle >= 0
-        return Nearest(
-            jnp.where(is_triangle, triangle_key, key), None if row is None else jnp.where(is_triangle, owner, row), triangle
-        )
+    def with_triangles(rays: Rays, key: jax.Array, row: jax.Array | None) -> Nearest:
+        depth = raycast.decode(scene, key, row)[0]
+        return add_triangles(scene, key, row, triangles.nearest_triangle(scene, unit, rays, depth, bounds=bounds))
 
-    return scan(add_triangles, rays, key, row)
+    return scan(with_triangles, rays, key, row)
+
+
+def add_triangles(scene: Scene, key: jax.Array, row: jax.Array | None, found: tuple) -> Nearest:
+    """Return what is nearest of primitives and triangles.
+
+    Args:
+        scene: The scene.
+        key: [P] int32, keys of the nearest primitives.
+        row: [P] int32, their rows if the scene has separate rows, else None.
+        found: Nearest triangles in front of them, from `triangles.nearest_triangle`.
+    """
+    depth, triangle, owner = found
+    mask = raycast.code_mask(scene)
+    triangle_key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
+    is_triangle = triangle >= 0
+    return Nearest(
+        jnp.where(is_triangle, triangle_key, key), None if row is None else jnp.where(is_triangle, owner, row), triangle
+    )
