@@ -22,7 +22,7 @@ from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.cpu import passes
 from jaxrl_vis_envs.render.gpu import kernel, walk
 from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
-from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent
+from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent, triangles
 from jaxrl_vis_envs.render.pixel.prepare import check_poses, prepare
 from jaxrl_vis_envs.render.scene import Scene
 
@@ -37,6 +37,14 @@ class _View(NamedTuple):
     unit: shapes.UnitShapes
     table: jax.Array
     lights: jax.Array
+    blocked: Callable[..., jax.Array]
+
+
+class _Search(NamedTuple):
+    """Search for objects: `blocks.nearest` and `triangles.blocked`, or functions of the same form for all pixels at once."""
+
+    nearest: Callable[..., blocks.Nearest] = blocks.nearest
+    blocked: Callable[..., jax.Array] = triangles.blocked
 
 
 class _Path(NamedTuple):
@@ -136,7 +144,7 @@ def _draw_walking(
     outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
     """Render as `_draw`, with the nearest objects found by GPU kernels."""
-    return _draw(outputs, scene, rotation, unit, light_table, walk.nearest)
+    return _draw(outputs, scene, rotation, unit, light_table, _Search(walk.nearest, walk.blocked))
 
 
 def _draw(
@@ -145,7 +153,7 @@ def _draw(
     rotation: jax.Array,
     unit: shapes.UnitShapes,
     light_table: jax.Array,
-    search: Callable | None = None,
+    search: _Search = _Search(),
 ) -> Planes:
     """Render the requested planes of a scene with objects, in plain JAX.
 
@@ -155,9 +163,9 @@ def _draw(
         rotation: [3, 3] float32, see `camera.camera_pose`.
         unit: Rendered objects.
         light_table: Lights, from `lights.pack`.
-        search: Function in the place of `blocks.nearest`, for all pixels in one block; None for that.
+        search: Search for objects.
     """
-    layout = blocks.layout(scene) if search is None else blocks.whole(scene)
+    layout = blocks.layout(scene) if search == _Search() else blocks.whole(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # Barrier: XLA would otherwise repeat the per-object work in every pixel.
     unit = camera.barrier(unit)
@@ -172,9 +180,9 @@ def _draw(
             length = blocks.restore(scene, layout, along)
         return Planes(None, depth, None, None, length)
     # Barriers: XLA would otherwise search for the nearest object again for each output.
-    near = jax.lax.optimization_barrier((search or blocks.nearest)(scene, unit, rays))
+    near = jax.lax.optimization_barrier(search.nearest(scene, unit, rays))
     rows = lookup.object_table(scene, unit)
-    view = _View(rotation, unit, rows, light_table)
+    view = _View(rotation, unit, rows, light_table, search.blocked)
     pixels = blocks.merge_blocks((rays, near))
     planes = blocks.scan(lambda *block: _finish(scene, view, outputs, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
@@ -199,7 +207,8 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
         normal = tuple(jnp.where(hit_mask, component, 0.0) for component in hit.normal)
         sheets = transparent.intersect_sheets(scene, view.unit, view.table, rays, far)
         if outputs.rgb:
-            front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays)
+            blocked = _blocked_where(scene, view, hit_mask) if nearest.triangle is not None else None
+            front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays, blocked)
             background = shade.sky(scene, view.rotation, rays)
             colour = tuple(jnp.where(hit_mask, one, other) for one, other in zip(front, background, strict=True))
             if scene.haze[0] >= 0:
@@ -212,6 +221,15 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
         # The extra last entry is the sky's label, selected by index -1.
         labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[shown]
     return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
+
+
+def _blocked_where(scene: Scene, view: _View, shown: jax.Array) -> Callable[[triangles.Segments], jax.Array]:
+    """Return the test for triangles on segments from pixels [P], False unless ``shown``."""
+
+    def blocked(segments: triangles.Segments) -> jax.Array:
+        return view.blocked(scene, view.unit, segments._replace(farthest=jnp.where(shown, segments.farthest, 0.0)))
+
+    return blocked
 
 
 def _declared_last(scene: Scene, view: _View, rays: Rays, nearest: blocks.Nearest, index: jax.Array) -> jax.Array:

@@ -226,7 +226,7 @@ class Scene:
         Raises:
             ValueError: ``mj_model`` is not a `mujoco.MjModel`, the camera, a texture or a geom in ``leave_out`` does not exist,
                 a size is not a positive integer, groups are not integers, ``lights`` is invalid, or something visible is not
-                supported (skins, flexes, shadows of meshes).
+                supported (skins, flexes).
         """
         reading.check_model(mj_model)
         reading.check_size(height=height, width=width)
@@ -239,7 +239,7 @@ class Scene:
         appearance = reading.object_appearance(mj_model)
         types = reading.object_types(mj_model)
         drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, tendon_groups, leave_out)
-        reading.check_supported(mj_model, types, drawn, groups, leave_out, shadows)
+        reading.check_supported(mj_model, groups, leave_out)
         clear_planes = reading.planes_clear_from_behind(mj_model, camera_id, camera, plane_backs)
         transparency = reading.transparency(appearance["rgba"][:, 3], clear_planes)
         ids, reordered = reading.drawing_order(mj_model, types, np.flatnonzero(drawn), transparency[drawn] == reading.SOLID)

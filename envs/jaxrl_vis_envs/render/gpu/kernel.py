@@ -183,14 +183,16 @@ class _Tile(NamedTuple):
     """Pixels of a tile, [_PIXELS] each, of which some may lie beyond the image, and what is nearest there.
 
     Attributes:
-        pixel: Number of the pixel.
+        row: Row of the pixel.
+        column: Its column.
         inside: True within the image.
         rays: The rays.
         zfar: [] float32, m.
         best: Keys, or depth bits and rows, as from `_nearest`.
     """
 
-    pixel: Any
+    row: Any
+    column: Any
     inside: Any
     rays: Rays
     zfar: Any
@@ -219,13 +221,13 @@ def _search_tile(refs: _Refs, scene: Scene, tile: tuple[int, int]) -> _Tile:
     if raycast.has_separate_rows(scene):
         best = (sky, jnp.full((_PIXELS,), len(scene.object_ids), jnp.int32))
     best = _nearest(scene, refs, tile_index, rays, znear, best)
-    return _Tile(row * scene.width + column, inside, rays, zfar, best)
+    return _Tile(row, column, inside, rays, zfar, best)
 
 
 def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     count = len(_Refs._fields)
     refs, out = _Refs(*refs[:count]), list(refs[count:])
-    pixel, inside, rays, zfar, best = _search_tile(refs, scene, tile)
+    row, column, inside, rays, zfar, best = _search_tile(refs, scene, tile)
     mask = raycast.code_mask(scene)
     if raycast.has_separate_rows(scene):
         index = best[1]
@@ -234,6 +236,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
         index = best[0] & mask
         hit_mask = index != mask
     near = jax.lax.bitcast_convert_type(best[0] & ~mask, jnp.float32)
+    pixel = row * scene.width + column
 
     def store(value, plane=None):
         ref = out[0].at[pixel] if plane is None else out[0].at[plane, pixel]
@@ -412,7 +415,7 @@ def _search_kernel(*refs, scene: Scene, tile: tuple[int, int]):
     count = len(_Refs._fields)
     found = _search_tile(_Refs(*refs[:count]), scene, tile)
     for out, plane in zip(refs[count:], found.best, strict=True):
-        plgpu.store(out.at[found.pixel], plane, mask=found.inside)
+        plgpu.store(out.at[found.row * scene.width + found.column], plane, mask=found.inside)
 
 
 def _inputs(scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> _Refs:

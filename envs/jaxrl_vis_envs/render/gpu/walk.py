@@ -27,7 +27,7 @@ from jaxrl_vis_envs.render.model import hierarchies, reading
 from jaxrl_vis_envs.render.pixel import blocks, raycast, shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot
 from jaxrl_vis_envs.render.pixel.prepare import prepare
-from jaxrl_vis_envs.render.pixel.triangles import SEAM
+from jaxrl_vis_envs.render.pixel.triangles import SEAM, Segments, may_meet
 from jaxrl_vis_envs.render.scene import Scene
 
 # Tuned on an H100: rows and columns of a tile, nodes that a lane may visit and objects that it may look at in one step.
@@ -182,6 +182,45 @@ def nearest_triangle(
     row = trees.rows.at[jnp.maximum(row, 0)].get(mode="promise_in_bounds")
     owner = trees.objects.at[jnp.maximum(hit, 0)].get(mode="promise_in_bounds")
     return best, jnp.where(is_hit, row, -1), jnp.where(is_hit, owner, -1)
+
+
+def blocked(scene: Scene, unit: shapes.UnitShapes, segments: Segments, interpret: bool = False) -> jax.Array:
+    """Return True where a segment enters a mesh or a height field, as `triangles.blocked`. Not differentiable.
+
+    Args:
+        scene: Scene with triangles.
+        unit: Rendered objects.
+        segments: [H * W], one for each pixel, row by row.
+        interpret: Run without a GPU, slowly.
+    """
+    scene, unit, segments = jax.lax.stop_gradient((scene, unit, segments))
+    trees = scene.hierarchies
+    assert trees is not None
+    middle, radius = _balls(trees, unit)
+    by_tile = jax.tree.map(lambda plane: _cut(scene, plane), segments)
+    meets = jax.vmap(may_meet, in_axes=(0, None, None))(by_tile, middle, radius)
+    start, direction = jnp.stack(segments.start), jnp.stack(segments.direction)
+    shown = segments.farthest > segments.nearest
+    common = jnp.sum(jnp.where(shown, direction, 0.0), axis=1)
+    order = jnp.arange(len(radius), dtype=jnp.int32)
+    refs = _shared_refs(trees, unit, order, _apply(unit.axes[trees.objects], common[None]))._replace(
+        words=kernel.pack_bits(meets),
+        near=jnp.zeros_like(radius),
+        ball=jnp.concatenate([middle, radius[:, None]], axis=1),
+        start=start,
+        direction=direction,
+        nearest=segments.nearest,
+        farthest=segments.farthest,
+    )
+    return _walk(scene, refs, any_hit=True, interpret=interpret)[0] >= 0
+
+
+def _cut(scene: Scene, plane: jax.Array) -> jax.Array:
+    """Cut a plane [H * W] into tiles [tiles, 32], with zeros beyond the image."""
+    (high, wide), (down, across) = _TILE, (-(-scene.height // _TILE[0]), -(-scene.width // _TILE[1]))
+    plane = plane.reshape(scene.height, scene.width)
+    plane = jnp.pad(plane, ((0, down * high - scene.height), (0, across * wide - scene.width)))
+    return plane.reshape(down, high, across, wide).swapaxes(1, 2).reshape(down * across, high * wide)
 
 
 def _balls(trees: hierarchies.Hierarchies, unit: shapes.UnitShapes) -> tuple[jax.Array, jax.Array]:
@@ -340,7 +379,8 @@ def _next_object(refs: _Refs, tile: jax.Array, start: Vector, direction: Vector,
         along = dot(middle, direction) * inverse_square
         apart = tuple(m - along * d for m, d in zip(middle, direction, strict=True))
         radius = _gather(refs.ball, looks, place, 3)
-        takes = looks & is_nearer & (dot(apart, apart) <= radius * radius)
+        is_ahead = (along > 0.0) | (dot(middle, middle) <= radius * radius)
+        takes = looks & is_nearer & is_ahead & (dot(apart, apart) <= radius * radius)
         walked = jnp.where(takes, _gather(refs.order, takes, place), walked)
         fresh |= takes
         # Objects are sorted: all that follow are farther away, too.
@@ -413,12 +453,12 @@ def _test_leaf(refs: _Refs, nearest: jax.Array, state: _State, leaf: jax.Array) 
 
 
 def probe() -> None:
-    """Compile a small instance of the kernel."""
+    """Compile small instances of both kernels."""
     probe_program().lower().compile()
 
 
 def probe_program() -> Any:
-    """Trace a small instance of the kernel (`jax.stages.Traced`)."""
+    """Trace small instances of both kernels (`jax.stages.Traced`)."""
     mj_model = mujoco.MjModel.from_xml_string(_PROBE)
     mj_data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, mj_data)
@@ -426,7 +466,7 @@ def probe_program() -> Any:
     unit = jax.eval_shape(lambda scene: prepare(scene, mj_data), scene).unit  # avoids compilation
     pixels = jax.ShapeDtypeStruct((64,), jnp.float32)
 
-    def search(scene: Scene, unit: shapes.UnitShapes, u: jax.Array, depth: jax.Array) -> Any:
-        return nearest_triangle(scene, unit, Rays(u, u), depth)
+    def search(scene: Scene, unit: shapes.UnitShapes, one: jax.Array) -> Any:
+        return nearest_triangle(scene, unit, Rays(one, one), one), blocked(scene, unit, Segments((one,) * 3, (one,) * 3, one, one))
 
-    return jax.jit(search).trace(scene, unit, pixels, pixels)
+    return jax.jit(search).trace(scene, unit, pixels)

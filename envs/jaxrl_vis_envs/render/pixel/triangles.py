@@ -15,6 +15,7 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector
 from jaxrl_vis_envs.render.scene import Scene
 
 SEAM = 1e-5
@@ -26,6 +27,22 @@ _OFFSET = (2e-5, -6e-6)
 # Part of a pixel by which the bounds of a cluster are rounded outwards, more than the rounding error of a large image.
 _ROUNDING = 1e-2
 _NUMBER = meshes.CLUSTER - 1  # mask of the lowest bits of a depth, which hold a triangle's index in its cluster
+
+
+class Segments(NamedTuple):
+    """Parts of rays in the camera's frame, [P] float32 each; empty where ``farthest`` is not above ``nearest``.
+
+    Attributes:
+        start: Three components, metres.
+        direction: Three components, unit vectors.
+        nearest: Distance from the start at which the part begins, m.
+        farthest: Distance at which it ends, m; may be infinite.
+    """
+
+    start: Vector
+    direction: Vector
+    nearest: jax.Array
+    farthest: jax.Array
 
 
 class Bounds(NamedTuple):
@@ -184,8 +201,8 @@ def next_triangle(
         first = scene.cluster_places[cluster][1]
         # Clusters are in the order of their triangles: one found in an earlier cluster precedes all in this one.
         crossings = zip(
-            _intersect_triangles(scene, unit, cluster, rays),
-            _intersect_triangles(scene, unit, cluster, offset_rays),
+            _intersect_view(scene, unit, cluster, rays),
+            _intersect_view(scene, unit, cluster, offset_rays),
             strict=True,
         )
         for number, ((t, _, is_front), (_, margin, offset_is_front)) in enumerate(crossings):
@@ -198,10 +215,58 @@ def next_triangle(
     return depths, jnp.where(rows == unset, -1, rows)
 
 
+def blocked(scene: Scene, unit: shapes.UnitShapes, segments: Segments) -> jax.Array:
+    """Return True where a segment enters a mesh or a height field, [P] bool, of any transparency. Not differentiable.
+
+    The segments should start close together, and have similar directions.
+    """
+    scene, unit, segments = jax.lax.stop_gradient((scene, unit, segments))
+    counts = jnp.cumsum(may_meet(segments, _in_camera(scene, unit)[0], scene.clusters[:, 3]), dtype=jnp.int32)
+    last = counts.shape[0] - 1
+
+    def add_cluster(state: tuple) -> tuple:
+        step, found = state
+        cluster = jnp.minimum(_kth(counts, step), last)
+        for t, margin, is_front in _intersect_triangles(scene, unit, cluster, segments.start, segments.direction):
+            found |= is_front & (margin >= -SEAM) & (t > segments.nearest) & (t < segments.farthest)
+        return step + 1, found
+
+    start = (jnp.zeros((), jnp.int32), jnp.zeros(segments.nearest.shape, bool))
+    return jax.lax.while_loop(lambda state: state[0] < counts[last], add_cluster, start)[1]
+
+
+def may_meet(segments: Segments, middle: jax.Array, radius: jax.Array) -> jax.Array:
+    """Test which spheres the segments may meet (conservative).
+
+    Args:
+        segments: [P].
+        middle: [K, 3] float32, m, centres in the camera's frame.
+        radius: [K] float32, m.
+
+    Returns:
+        [K] bool.
+    """
+    valid = segments.farthest > segments.nearest
+    starts, directions = jnp.stack(segments.start), jnp.stack(segments.direction)
+    low, high = jnp.min(jnp.where(valid, starts, np.inf), axis=1), jnp.max(jnp.where(valid, starts, -np.inf), axis=1)
+    reach = radius * (1.0 + 1e-4) + 0.5 * jnp.sqrt(jnp.sum(jnp.square(high - low))) + 1e-5
+    axis = jnp.sum(jnp.where(valid, directions, 0.0), axis=1)
+    axis *= jax.lax.rsqrt(jnp.sum(jnp.square(axis)) + 1e-20)
+    # At a distance of t, segments are within the radius of their starts plus spread * t around the axis.
+    spread = jnp.sqrt(jnp.max(jnp.where(valid, jnp.sum(jnp.square(directions - axis[:, None]), axis=0), 0.0)))
+    farthest = jnp.max(jnp.where(valid, segments.farthest, 0.0))
+    offset = middle - 0.5 * (low + high)  # not a number without any segment
+    along = jnp.sum(offset * axis, axis=1)
+    apart = jnp.sqrt(jnp.sum(jnp.square(offset - along[:, None] * axis), axis=1))
+    beyond = (along + reach) / jnp.maximum(1.0 - spread, 0.1)
+    is_near = (apart <= reach + spread * beyond) & (along >= -reach) & (along <= farthest * (1.0 + spread) + reach)
+    return is_near | ((spread > 0.9) & jnp.any(valid))
+
+
 def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
     """Return the depth [P] of a cluster's nearest triangle, with its index in the lowest bits; infinite if there is none."""
     best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
-    for number, (t, margin, is_front) in enumerate(_intersect_triangles(scene, unit, cluster, rays)):
+    for number, (t, margin, is_front) in enumerate(_intersect_view(scene, unit, cluster, rays)):
         meets = is_front & (margin >= -SEAM)
         key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
         best = jnp.minimum(best, jnp.where(meets, key, best))
@@ -209,13 +274,21 @@ def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array
     return jax.lax.bitcast_convert_type(jnp.minimum(best, infinite), jnp.float32)
 
 
-def _intersect_triangles(
+def _intersect_view(
     scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays
 ) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
-    """Yield the depth of each triangle's plane, the minimum barycentric coordinate there, and a mask; [P] each.
+    """Yield `_intersect_triangles` of the camera's rays, with masks that are True only beyond the near plane."""
+    start, direction, _ = camera.ray_parts(scene, rays)
+    for t, margin, is_front in _intersect_triangles(scene, unit, cluster, start, direction):
+        yield t, margin, is_front & (t > scene.znear)
 
-    The triangles are those of one cluster. A negative coordinate is outside. The mask is True for triangles that face the ray
-    beyond the near plane.
+
+def _intersect_triangles(
+    scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, start: Vector, direction: Vector
+) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
+    """Yield the ray parameter at each triangle's plane, the minimum barycentric coordinate there, and a mask; [P] each.
+
+    The triangles are those of one cluster. A negative coordinate is outside. The mask is True for triangles that face the ray.
     """
     location = scene.cluster_places[cluster]
     axes, origin = unit.axes[location[0]], unit.origin[location[0]]
@@ -225,11 +298,10 @@ def _intersect_triangles(
     # Composed maps from the camera's frame to each unit triangle: few numbers, so that a ray needs only one map.
     local_maps = jnp.sum(maps[:, :, :3, None] * axes[None, None], axis=2)
     begin = jnp.sum(maps[:, :, :3] * origin, axis=2) + maps[:, :, 3]
-    start, direction, _ = camera.ray_parts(scene, rays)
     for number in range(meshes.CLUSTER):
         ray = camera.multiply(local_maps[number], direction)
         offset = camera.multiply(local_maps[number], start)
         origin_local = tuple(begin[number, axis] + offset[axis] for axis in range(3))
         t = -origin_local[2] / jnp.where(ray[2] < 0.0, ray[2], -1.0)
         first, second = origin_local[0] + t * ray[0], origin_local[1] + t * ray[1]
-        yield t, jnp.minimum(jnp.minimum(first, second), 1.0 - first - second), (ray[2] < 0.0) & (t > scene.znear)
+        yield t, jnp.minimum(jnp.minimum(first, second), 1.0 - first - second), ray[2] < 0.0
