@@ -15,7 +15,7 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
-from jaxrl_vis_envs.render.pixel.arithmetic import Vector
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, normalized
 from jaxrl_vis_envs.render.scene import Scene
 
 SEAM = 1e-5
@@ -247,19 +247,23 @@ def may_meet(segments: Segments, middle: jax.Array, radius: jax.Array) -> jax.Ar
         [K] bool.
     """
     valid = segments.farthest > segments.nearest
-    starts, directions = jnp.stack(segments.start), jnp.stack(segments.direction)
-    low, high = jnp.min(jnp.where(valid, starts, np.inf), axis=1), jnp.max(jnp.where(valid, starts, -np.inf), axis=1)
-    reach = radius * (1.0 + 1e-4) + 0.5 * jnp.sqrt(jnp.sum(jnp.square(high - low))) + 1e-5
-    axis = jnp.sum(jnp.where(valid, directions, 0.0), axis=1)
-    axis *= jax.lax.rsqrt(jnp.sum(jnp.square(axis)) + 1e-20)
+    # By components, which XLA fuses with the comparisons: tiles times spheres would be large arrays.
+    low = [jnp.min(jnp.where(valid, component, np.inf)) for component in segments.start]
+    high = [jnp.max(jnp.where(valid, component, -np.inf)) for component in segments.start]
+    size = tuple(one - other for one, other in zip(high, low, strict=True))
+    reach = radius * (1.0 + 1e-4) + 0.5 * jnp.sqrt(dot(size, size)) + 1e-5
+    axis = normalized(tuple(jnp.sum(jnp.where(valid, component, 0.0)) for component in segments.direction))
+    turn = tuple(component - a for component, a in zip(segments.direction, axis, strict=True))
     # At a distance of t, segments are within the radius of their starts plus spread * t around the axis.
-    spread = jnp.sqrt(jnp.max(jnp.where(valid, jnp.sum(jnp.square(directions - axis[:, None]), axis=0), 0.0)))
+    spread = jnp.sqrt(jnp.max(jnp.where(valid, dot(turn, turn), 0.0)))
     farthest = jnp.max(jnp.where(valid, segments.farthest, 0.0))
-    offset = middle - 0.5 * (low + high)  # not a number without any segment
-    along = jnp.sum(offset * axis, axis=1)
-    apart = jnp.sqrt(jnp.sum(jnp.square(offset - along[:, None] * axis), axis=1))
+    # Not a number without any segment.
+    offset = tuple(middle[:, i] - 0.5 * (low[i] + high[i]) for i in range(3))
+    along = dot(offset, axis)
+    aside = tuple(o - along * a for o, a in zip(offset, axis, strict=True))
     beyond = (along + reach) / jnp.maximum(1.0 - spread, 0.1)
-    is_near = (apart <= reach + spread * beyond) & (along >= -reach) & (along <= farthest * (1.0 + spread) + reach)
+    is_near = (jnp.sqrt(dot(aside, aside)) <= reach + spread * beyond) & (along >= -reach)
+    is_near &= along <= farthest * (1.0 + spread) + reach
     return is_near | ((spread > 0.9) & jnp.any(valid))
 
 
