@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -81,8 +80,8 @@ class Comparison:
 
         Returns:
             Entries of the record: ``depth_agreement`` (see `depth_agreement`), ``label_agreement`` (a fraction of the pixels),
-            ``colour_difference`` and ``textured_difference``: the mean absolute difference over channels and over pixels without and with a texture, in
-            grey levels of 255. A difference over no pixels is omitted.
+            ``colour_difference`` and ``textured_difference``: the mean absolute difference over channels and over pixels
+            without and with a texture, in grey levels of 255. A difference over no pixels is omitted.
 
         Raises:
             AssertionError: The peer's images differ from ours.

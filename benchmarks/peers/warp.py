@@ -35,8 +35,8 @@ VERSION = "4.0.0"
 # Warp reads the nearest texel of the finest level, while OpenGL and we filter, and multiplies by the texture before clamping
 # the light to 1, while OpenGL and we do so afterwards. Observed: 8 grey levels in `finger`, 20 in `primitives`.
 MAX_TEXTURED_DIFFERENCE = 25.0
-# Warp lights every pixel of a mesh, while OpenGL and we light the corners of its triangles.
-MAX_LIT_DIFFERENCE = 1.5
+# Warp lights every pixel of a mesh, while OpenGL and we light the corners of its triangles. Observed: 3.9 in `aloha`.
+MAX_LIT_DIFFERENCE = 5.0
 
 
 def check() -> None:
@@ -175,7 +175,11 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
     import mujoco_warp as mjw  # pyright: ignore[reportMissingImports]
     import warp as wp  # pyright: ignore[reportMissingImports]
 
-    count, size, mj_model = comparison.config["images"] // comparison.cameras, comparison.config["image_size"], comparison.mj_model
+    count, size, mj_model = (
+        comparison.config["images"] // comparison.cameras,
+        comparison.config["image_size"],
+        comparison.mj_model,
+    )
     model = mjw.put_model(mj_model)
     context = mjw.create_render_context(
         mj_model,
@@ -185,6 +189,7 @@ def prepare(comparison: Comparison, options: dict[str, bool]) -> tuple[Any, list
         render_depth=True,
         render_seg=comparison.labelled,
         cam_active=list(range(comparison.cameras)),
+        shadow_light_fraction=0.0,  # as in OpenGL and ours: nothing of a light reaches what lies in its shadow
         **options,
     )
     # Buffers of one environment suffice, because only poses are read; those of thousands of free bodies would fill the memory.

@@ -212,9 +212,7 @@ def test_shadows_fall_where_the_light_is_hidden():
     octahedron = '<mesh name="m" vertex=".2 0 0 -.2 0 0 0 .2 0 0 -.2 0 0 0 .2 0 0 -.2"/>'
     for kind in ('sphere" size=".2', 'cylinder" size=".2 .2', 'capsule" size=".2 .2', 'mesh" mesh="m'):
         given = {"size": 33, "header": dark, "assets": octahedron}
-        lit, shadowed = (
-            drawn(light.format("true") + body.format(kind), shadows=shadows, **given) for shadows in (False, True)
-        )
+        lit, shadowed = (drawn(light.format("true") + body.format(kind), shadows=shadows, **given) for shadows in (False, True))
         floor = lit.segmentation == 0
         changed = floor & (shadowed.rgb[..., 0] < lit.rgb[..., 0] - 20)
         assert 0.005 < changed.sum() / floor.sum() < 0.2, kind

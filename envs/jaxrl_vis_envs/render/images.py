@@ -4,7 +4,7 @@ There are three stages: all linear work, once per environment (`pixel.shapes`, `
 (`pixel.raycast`, `pixel.triangles`), an integer that is never differentiated; and, once per pixel, depth, normal and colour of
 that object from a row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two stages are one kernel on a GPU
 (`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`). In scenes with meshes or height fields, a
-kernel on a GPU searches for their triangles (`gpu.walk`).
+kernel on a GPU searches for their triangles (`gpu.search`).
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, target_pl
 from jaxrl_vis_envs.render import camera, cords
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.cpu import passes
-from jaxrl_vis_envs.render.gpu import kernel, walk
+from jaxrl_vis_envs.render.gpu import kernel, search
 from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
 from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent, triangles
 from jaxrl_vis_envs.render.pixel.prepare import check_poses, prepare
@@ -45,6 +45,9 @@ class _Search(NamedTuple):
 
     nearest: Callable[..., blocks.Nearest] = blocks.nearest
     blocked: Callable[..., jax.Array] = triangles.blocked
+
+
+_PLAIN = _Search()
 
 
 class _Path(NamedTuple):
@@ -115,7 +118,7 @@ def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
     for path in (kernel, passes):
         if path.can_render(scene, outputs):
             return path.draw
-    return _draw_walking if walk.can_search(scene) else None
+    return _draw_walking if search.can_search(scene) else None
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -144,7 +147,7 @@ def _draw_walking(
     outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
     """Render as `_draw`, with the nearest objects found by GPU kernels."""
-    return _draw(outputs, scene, rotation, unit, light_table, _Search(walk.nearest, walk.blocked))
+    return _draw(outputs, scene, rotation, unit, light_table, _Search(search.nearest, search.blocked))
 
 
 def _draw(
@@ -153,7 +156,7 @@ def _draw(
     rotation: jax.Array,
     unit: shapes.UnitShapes,
     light_table: jax.Array,
-    search: _Search = _Search(),
+    searches: _Search = _PLAIN,
 ) -> Planes:
     """Render the requested planes of a scene with objects, in plain JAX.
 
@@ -163,9 +166,9 @@ def _draw(
         rotation: [3, 3] float32, see `camera.camera_pose`.
         unit: Rendered objects.
         light_table: Lights, from `lights.pack`.
-        search: Search for objects.
+        searches: Search for objects.
     """
-    layout = blocks.layout(scene) if search == _Search() else blocks.whole(scene)
+    layout = blocks.layout(scene) if searches == _PLAIN else blocks.whole(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # Barrier: XLA would otherwise repeat the per-object work in every pixel.
     unit = camera.barrier(unit)
@@ -180,10 +183,12 @@ def _draw(
             length = blocks.restore(scene, layout, along)
         return Planes(None, depth, None, None, length)
     # Barriers: XLA would otherwise search for the nearest object again for each output.
-    near = jax.lax.optimization_barrier(search.nearest(scene, unit, rays))
+    near = jax.lax.optimization_barrier(searches.nearest(scene, unit, rays))
     rows = lookup.object_table(scene, unit)
-    view = _View(rotation, unit, rows, light_table, search.blocked)
-    pixels = blocks.merge_blocks((rays, near))
+    view = _View(rotation, unit, rows, light_table, searches.blocked)
+    pixels = (rays, near)
+    if near.triangle is None or not any(scene.light_shadows):  # shadows of triangles need pixels that are close together
+        pixels = blocks.merge_blocks(pixels)
     planes = blocks.scan(lambda *block: _finish(scene, view, outputs, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
     planes = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)

@@ -83,7 +83,7 @@ class Case:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Outputs to measure, of which a peer has the first."""
-        return MESH_OUTPUTS if self.config["scene"] in models.MESH_SCENES else OUTPUTS
+        return MESH_OUTPUTS if self.config.get("scene") in models.MESH_SCENES else OUTPUTS
 
 
 def cases(scene: str, settings: Settings, sizes: tuple[int, ...], min_poses: int = 0) -> Iterator[Case]:

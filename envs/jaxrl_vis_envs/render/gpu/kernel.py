@@ -20,14 +20,14 @@ from jaxrl_vis_envs.compiling.compilation import use_gpu_kernels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.gpu.tiles import PIXELS, rectangles, tile_shape, tile_words
 from jaxrl_vis_envs.render.model import reading
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.scene import Scene
 
-# Tuned on an H200: pixels per tile (a power of two, some of which may be idle), and launch parameters.
-_PIXELS = 128
+# Tuned on an H200.
 _COMPILER = plgpu.CompilerParams(num_warps=4, num_stages=1)
 # Indices of the camera's parameters in the vector that the kernel reads.
 _LENS, _CLIP, _ROTATION, _SKY_TOP, _SKY_BOTTOM, _FOVY = range(4), range(4, 6), range(6, 15), range(15, 18), range(18, 21), 21
@@ -62,63 +62,6 @@ def supports(scene: Scene) -> bool:
     textured = scene.atlas.used or scene.atlas.sky is not None
     # The kernel computes the texture footprint of a pixel, and does not support lenses with a sensor.
     return is_simple and not (textured and scene.projection == "intrinsic") and set(scene.object_types) <= _TYPES
-
-
-def tile_shape(height: int, width: int) -> tuple[int, int]:
-    """Return the rows and columns of a tile: about twice as wide as high, with little overhang beyond the image's border."""
-
-    def cost(shape: tuple[int, int]) -> float:
-        high, wide = shape
-        return -(-height // high) * -(-width // wide) * (1.0 + 0.1 * abs(np.log2(wide / high) - 1.0))
-
-    return min(((_PIXELS // wide, wide) for wide in range(8, _PIXELS + 1)), key=cost)
-
-
-def rectangles(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
-    """Return bounds [G, 4] float32 (min u, max u, min v, max v) of each object's bounding sphere; infinite for planes."""
-    is_infinite = np.array(scene.object_types) == shapes.PLANE
-    endless = np.array([-camera.INFINITE, camera.INFINITE] * 2, np.float32)
-    return jnp.where(is_infinite[:, None], endless, camera.sphere_sides(scene, unit.ball[:, :3], unit.ball[:, 3]))
-
-
-def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int], rows: list[int]) -> tuple[jax.Array, np.ndarray]:
-    """Determine which objects may be visible in which tiles.
-
-    Args:
-        scene: The scene.
-        sides: [G, 4] from `rectangles`.
-        tile: Rows and columns of a tile.
-        rows: The objects.
-
-    Returns:
-        Bits [tiles, words] int32, in which bit b of word w stands for object ``order[32 w + b]``; and the order of ``rows``,
-        sorted by type.
-    """
-    order = np.array(rows, np.int32)[np.argsort(np.array(scene.object_types)[rows], kind="stable")]
-    high, wide = tile
-    tops, lefts = np.arange(0, scene.height, high), np.arange(0, scene.width, wide)
-    middle_u, middle_v, half_u, half_v = camera.lens(scene)
-
-    def u_at(column: np.ndarray) -> jax.Array:
-        return middle_u + jnp.asarray((2.0 * column + 1.0 - scene.width) / scene.width, jnp.float32) * half_u
-
-    def v_at(row: np.ndarray) -> jax.Array:
-        return middle_v + jnp.asarray((scene.height - 1.0 - 2.0 * row) / scene.height, jnp.float32) * half_v
-
-    sides = sides[order]
-    across = (sides[:, 0] <= u_at(lefts + wide)[:, None]) & (sides[:, 1] >= u_at(lefts - 1)[:, None])
-    down = (sides[:, 2] <= v_at(tops - 1)[:, None]) & (sides[:, 3] >= v_at(tops + high)[:, None])
-    meets = (down[:, None] & across[None, :]).reshape(len(tops) * len(lefts), -1)
-    return pack_bits(meets), order
-
-
-def pack_bits(mask: jax.Array) -> jax.Array:
-    """Pack a mask [tiles, N] into bits [tiles, words] int32: bit b of word w is element 32 w + b."""
-    count = mask.shape[1]
-    words = -(-count // 32)
-    mask = jnp.pad(mask, ((0, 0), (0, 32 * words - count))).reshape(-1, words, 32)
-    bits = jnp.asarray(np.left_shift(np.uint32(1), np.arange(32, dtype=np.uint32)))
-    return jax.lax.bitcast_convert_type(jnp.sum(jnp.where(mask, bits, 0), axis=-1, dtype=jnp.uint32), jnp.int32)
 
 
 class _Refs(NamedTuple):
@@ -180,7 +123,7 @@ def _nearest(scene: Scene, refs: _Refs, tile_index: Any, rays: Rays, znear: Any,
 
 
 class _Tile(NamedTuple):
-    """Pixels of a tile, [_PIXELS] each, of which some may lie beyond the image, and what is nearest there.
+    """Pixels of a tile, [PIXELS] each, of which some may lie beyond the image, and what is nearest there.
 
     Attributes:
         row: Row of the pixel.
@@ -205,7 +148,7 @@ def _search_tile(refs: _Refs, scene: Scene, tile: tuple[int, int]) -> _Tile:
     across = np.int32(-(-scene.width // wide))
     tile_index = pl.program_id(0)
     top, left = jax.lax.div(tile_index, across) * high, jax.lax.rem(tile_index, across) * wide
-    lane = jax.lax.broadcasted_iota(jnp.int32, (_PIXELS,), 0)
+    lane = jax.lax.broadcasted_iota(jnp.int32, (PIXELS,), 0)
     row, column = top + jax.lax.div(lane, jnp.int32(wide)), left + jax.lax.rem(lane, jnp.int32(wide))
     inside = (lane < high * wide) & (row < scene.height) & (column < scene.width)
 
@@ -216,10 +159,10 @@ def _search_tile(refs: _Refs, scene: Scene, tile: tuple[int, int]) -> _Tile:
     rays = Rays(u, v)
 
     mask = raycast.code_mask(scene)
-    sky = jnp.broadcast_to((jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask, (_PIXELS,))
+    sky = jnp.broadcast_to((jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask, (PIXELS,))
     best: tuple = (sky,)
     if raycast.has_separate_rows(scene):
-        best = (sky, jnp.full((_PIXELS,), len(scene.object_ids), jnp.int32))
+        best = (sky, jnp.full((PIXELS,), len(scene.object_ids), jnp.int32))
     best = _nearest(scene, refs, tile_index, rays, znear, best)
     return _Tile(row, column, inside, rays, zfar, best)
 
@@ -245,7 +188,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     top_colour, bottom_colour = ([refs.view[index] for index in colour] for colour in (_SKY_TOP, _SKY_BOTTOM))
     texels: Any = _BlockTexels(refs.texels, refs.levels)
     inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[_FOVY], texels=texels)
-    zero = jnp.zeros((_PIXELS,), jnp.float32)
+    zero = jnp.zeros((PIXELS,), jnp.float32)
     far, normal, colour = zero, (zero,) * 3, (zero,) * 3
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance:
 
@@ -379,7 +322,7 @@ def draw(
 
 
 def can_search(scene: Scene) -> bool:
-    """Return True if the kernel finds the nearest opaque primitives of this scene, on any platform; see `nearest_primitives`."""
+    """Return True if `nearest_primitives` searches this scene, on any platform."""
     return bool(raycast.primitive_rows(scene, transparent=False)) and reading.CLEAR_FROM_BEHIND not in scene.transparent
 
 

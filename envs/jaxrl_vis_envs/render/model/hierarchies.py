@@ -25,13 +25,13 @@ class Hierarchies(NamedTuple):
     """Hierarchies of N objects, meshes or height fields, in the order of `Scene.object_ids`. Equal meshes share theirs.
 
     Attributes:
-        nodes: [S, 4] int32: low and high corner of a node's box in cells (ten bits an axis, x lowest); its link: of an inner node,
-            the node after its subtree; of a leaf, -1 - its first row of ``maps``; and 0.
+        nodes: [S, 4] int32: low and high corner of a node's box in cells (ten bits an axis, x lowest); its link, which is the
+            node after its subtree, and of a leaf -1 - its first row of ``maps``; and 0.
         maps: [W, 12] float32, maps to unit triangles, the columns `meshes.MAP`, `LEAF` rows for each leaf.
         rows: [W] int32, rows of `Scene.triangles`.
         first: [N] int32, first node of an object in the first octant.
-        steps: [N] int32, number of its nodes. Those of octant i start at ``first + i * steps``; bit a of i is set for directions
-            that are negative along axis a.
+        steps: [N] int32, number of its nodes. Those of octant i start at ``first + i * steps``; bit a of i is set for
+            directions that are negative along axis a.
         frame: [N, 6] float32, metres, frame of the geom: low corner of the object's box, and lengths of a cell.
         ball: [N, 4] float32, metres: bounding sphere, centre in the frame of the geom and radius.
         objects: [N] int32, indices of the objects among those of the scene.
@@ -195,7 +195,7 @@ def _cut_costs(low: np.ndarray, high: np.ndarray, key: np.ndarray, count: int) -
 
 
 def _costs(lows: np.ndarray, highs: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return the area of the box around the first 1, 2, ... bins times the leaves that they need; infinite if they are empty."""
+    """Return the area of the box around the first 1, 2, ... bins times the leaves that they need; infinite without any."""
     size = np.maximum.accumulate(highs, axis=1) - np.minimum.accumulate(lows, axis=1)
     size = np.where(np.isfinite(size), size, 0.0)
     area = size[..., 0] * size[..., 1] + size[..., 1] * size[..., 2] + size[..., 2] * size[..., 0]

@@ -16,13 +16,13 @@ import jaxrl_vis_envs
 from jaxrl_vis.bench.scenes import clutter
 from jaxrl_vis_envs.compiling.compilation import kernels, tracing_for
 from jaxrl_vis_envs.render import Scene, images
-from jaxrl_vis_envs.render.gpu import walk
+from jaxrl_vis_envs.render.gpu import search
 from jaxrl_vis_envs.render.model import hierarchies, meshes
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 
 SIZE = (21, 30)  # tiles hang over the image
-SEARCH = images._Search(functools.partial(walk.nearest, interpret=True), functools.partial(walk.blocked, interpret=True))
+SEARCH = images._Search(functools.partial(search.nearest, interpret=True), functools.partial(search.blocked, interpret=True))
 ARM = ("sphere", "capsule", "box")
 
 _SCENE = """
@@ -75,13 +75,13 @@ def prepared(lens: str = "", glass: str = "", **options: Any) -> tuple[Scene, mu
     return Scene.from_mjmodel(mj_model, "front", *SIZE, **options), mj_model, SimpleNamespace(**poses)
 
 
-def drawn(scene: Scene, poses: SimpleNamespace, outputs: Outputs, search: images._Search, missing: int) -> Planes:
+def drawn(scene: Scene, poses: SimpleNamespace, outputs: Outputs, searches: images._Search, missing: int) -> Planes:
     """Draw two images; in the second, the geom ``missing`` has no pose. The kernel is for a GPU, the plain way for this CPU."""
 
     def draw(places: jax.Array) -> Planes:
         given = SimpleNamespace(**{**vars(poses), "geom_xpos": places})
-        with tracing_for("cpu" if search == images._Search() else "cuda"):
-            return images._draw(outputs, scene, *prepare(scene, given), search)
+        with tracing_for("cpu" if searches == images._PLAIN else "cuda"):
+            return images._draw(outputs, scene, *prepare(scene, given), searches)
 
     places = jnp.stack([poses.geom_xpos, poses.geom_xpos.at[missing].set(jnp.nan)])
     return jax.tree.map(np.asarray, jaxrl_vis_envs.jit(jax.vmap(draw), runs_once=True)(places))
@@ -98,7 +98,7 @@ def drawn(scene: Scene, poses: SimpleNamespace, outputs: Outputs, search: images
 def test_kernel_draws_what_the_plain_renderer_draws(given: tuple, outputs: Outputs, options: dict[str, Any]) -> None:
     scene, mj_model, poses = prepared(*given, **options)
     later = mj_model.geom("later").id
-    expected, ours = (drawn(scene, poses, outputs, search, later) for search in (images._Search(), SEARCH))
+    expected, ours = (drawn(scene, poses, outputs, searches, later) for searches in (images._PLAIN, SEARCH))
     labels = expected.segmentation
     assert len(np.unique(labels)) > 18 and len(scene.hierarchies.first) > 32
     for name in ("later", "veil", *(["close"] if len(given) == 1 else [])):
@@ -135,15 +135,15 @@ def test_kernel_finds_the_shadows_that_rays_of_mujoco_find() -> None:
     ]
     hidden = (np.array(hits) >= 0.0) & (np.array(hits) < distance)
     axes, position = mj_data.cam_xmat[0].reshape(3, 3), mj_data.cam_xpos[0]
-    segments = walk.Segments(
+    segments = search.Segments(
         tuple(jnp.asarray(((start - position) @ axes).T, jnp.float32)),
         tuple(jnp.asarray((direction @ axes).T, jnp.float32)),
         jnp.full(len(start), 1e-4),
         jnp.asarray(distance, jnp.float32),
     )
     found = {
-        name: np.asarray(jaxrl_vis_envs.jit(functools.partial(search, scene, unit), runs_once=True)(segments))
-        for name, search in (("plain", images._Search().blocked), ("kernel", SEARCH.blocked))
+        name: np.asarray(jaxrl_vis_envs.jit(functools.partial(blocked, scene, unit), runs_once=True)(segments))
+        for name, blocked in (("plain", images._PLAIN.blocked), ("kernel", SEARCH.blocked))
     }
     assert 0.2 < hidden.mean() < 0.8
     np.testing.assert_array_equal(found["plain"], found["kernel"])
@@ -181,5 +181,5 @@ def test_hierarchies_hold_every_triangle_once_within_its_boxes(octant: int) -> N
 
 def test_kernels_for_triangles_are_lowered_for_nvidia() -> None:
     with tracing_for("cuda"), kernels(True):
-        text = lowered_for_nvidia(walk.probe_program)
+        text = lowered_for_nvidia(search.probe_program)
     assert "find_triangle" in text and "find_blocker" in text
