@@ -258,6 +258,7 @@ def warp_options(scene: str, **variant: bool) -> set[str]:
         "enable_specular",
         "enable_emission",
         "enable_per_light_ambient",
+        "enable_vertex_normals",
         "enable_backface_culling",
     }
     return {name for name, on in options.items() if on}

@@ -179,6 +179,23 @@ def test_hierarchies_hold_every_triangle_once_within_its_boxes(octant: int) -> N
             assert (points >= lowest - 1e-2).all() and (points <= highest + 1e-2).all()
 
 
+@pytest.mark.parametrize("glass", ["", 'material="glass"'], ids=["opaque", "transparent"])
+def test_scenes_with_triangles_are_searched_by_kernels_on_a_gpu(glass: str) -> None:
+    scene, _, _ = prepared(glass=glass, haze=True, shadows=True)
+    with tracing_for("cuda"):
+        with kernels(True):
+            assert images._fast(scene, Outputs(rgb=True, depth=True)) is images._draw_walking
+            assert images.kernel.can_search(scene)  # its primitives, too
+        with kernels(False):
+            assert images._fast(scene, Outputs(rgb=True, depth=True)) is None
+    with tracing_for("cpu"):
+        assert images._fast(scene, Outputs(rgb=True, depth=True)) is None
+
+
+def test_planes_seen_through_from_behind_take_the_plain_search() -> None:
+    assert not images.kernel.can_search(prepared(plane_backs=True)[0])
+
+
 def test_kernels_for_triangles_are_lowered_for_nvidia() -> None:
     with tracing_for("cuda"), kernels(True):
         text = lowered_for_nvidia(search.probe_program)
