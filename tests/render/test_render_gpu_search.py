@@ -22,7 +22,10 @@ from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 
 SIZE = (21, 30)  # tiles hang over the image
-SEARCH = images._Search(functools.partial(search.nearest, interpret=True), functools.partial(search.blocked, interpret=True))
+KERNEL = functools.partial(search.by_kernel, interpret=True)
+SEARCH = images._Search(
+    search.layout, functools.partial(search.nearest, interpret=True), functools.partial(search.blocked, walk=KERNEL)
+)
 ARM = ("sphere", "capsule", "box")
 
 _SCENE = """

@@ -41,13 +41,21 @@ class _View(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """Search for objects: `blocks.nearest` and `triangles.blocked`, or functions of the same form for all pixels at once."""
+    """Search for objects.
 
-    nearest: Callable[..., blocks.Nearest] = blocks.nearest
-    blocked: Callable[..., jax.Array] = triangles.blocked
+    Attributes:
+        layout: Order of the pixels.
+        nearest: `blocks.nearest`, or a function of this form.
+        blocked: `search.blocked`.
+    """
+
+    layout: Callable[[Scene], blocks.Layout]
+    nearest: Callable[..., blocks.Nearest]
+    blocked: Callable[..., jax.Array]
 
 
-_PLAIN = _Search()
+_PLAIN = _Search(blocks.layout, blocks.nearest, search.blocked)
+_BY_KERNELS = _Search(search.layout, search.nearest, functools.partial(search.blocked, walk=search.by_kernel))
 
 
 class _Path(NamedTuple):
@@ -147,7 +155,7 @@ def _draw_walking(
     outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
 ) -> Planes:
     """Render as `_draw`, with the nearest objects found by GPU kernels."""
-    return _draw(outputs, scene, rotation, unit, light_table, _Search(search.nearest, search.blocked))
+    return _draw(outputs, scene, rotation, unit, light_table, _BY_KERNELS)
 
 
 def _draw(
@@ -168,7 +176,7 @@ def _draw(
         light_table: Lights, from `lights.pack`.
         searches: Search for objects.
     """
-    layout = blocks.layout(scene) if searches == _PLAIN else blocks.whole(scene)
+    layout = searches.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # Barrier: XLA would otherwise repeat the per-object work in every pixel.
     unit = camera.barrier(unit)

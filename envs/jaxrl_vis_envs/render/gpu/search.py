@@ -1,8 +1,9 @@
-"""GPU search for triangles: what rays of the camera and rays to the lights meet, by the kernel in `walk`.
+"""Search for triangles along hierarchies: what rays of the camera, on a GPU, and rays to the lights meet.
 
 Only the search is done by kernels. Depths, normals and colours are computed by the plain renderer from the triangles found.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,13 +16,15 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.gpu import kernel
 from jaxrl_vis_envs.render.gpu.tiles import pack_bits
-from jaxrl_vis_envs.render.gpu.walk import TILE, Refs, walk
+from jaxrl_vis_envs.render.gpu.walk import LANES, TILE, Refs, by_kernel, in_plain_jax
 from jaxrl_vis_envs.render.model import hierarchies, reading
 from jaxrl_vis_envs.render.pixel import blocks, raycast, shapes
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.pixel.triangles import Segments, may_meet
 from jaxrl_vis_envs.render.scene import Scene
+
+Walk = Callable[..., list[jax.Array]]
 
 _PROBE = """
 <mujoco>
@@ -36,19 +39,25 @@ def can_search(scene: Scene) -> bool:
     return scene.hierarchies is not None and use_gpu_kernels(probe)
 
 
+def layout(scene: Scene) -> blocks.Layout:
+    """Return the layout of all pixels in one block, tile by tile."""
+    tiles = blocks.tiles(scene, *TILE)
+    return tiles._replace(rows=tiles.rows.reshape(1, -1), columns=tiles.columns.reshape(1, -1))
+
+
 def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays, interpret: bool = False) -> blocks.Nearest:
     """Return the nearest opaque objects of all pixels, as `blocks.nearest`. Not differentiable.
 
     Args:
         scene: Scene with triangles.
         unit: Rendered objects.
-        rays: [1, H * W], those of all pixels, row by row.
+        rays: [1, P], those of all pixels, in the order of `layout`.
         interpret: Run without a GPU, slowly.
     """
     scene, unit = jax.lax.stop_gradient((scene, unit))
     rays, row = Rays(rays.u[0], rays.v[0]), None
     if kernel.can_search(scene):
-        key, row = kernel.nearest_primitives(scene, unit, interpret)
+        key, row = jax.tree.map(lambda plane: _cut(scene, plane), kernel.nearest_primitives(scene, unit, interpret))
     elif raycast.has_separate_rows(scene):
         key, row = raycast.nearest_row(scene, unit, rays)
     else:
@@ -65,13 +74,13 @@ def nearest_triangle(
     Args:
         scene: Scene with triangles.
         unit: Rendered objects.
-        rays: [H * W], those of all pixels, row by row.
-        depth: [H * W] float32, metres, maximum depth.
+        rays: [P], those of all pixels, in the order of `layout`.
+        depth: [P] float32, metres, maximum depth.
         interpret: Run without a GPU, slowly.
 
     Returns:
-        Depth [H * W] float32 of the triangle, or ``depth`` if there is none; its row in `Scene.triangles` and the row of its
-        object, [H * W] int32 each, -1 if there is none.
+        Depth [P] float32 of the triangle, or ``depth`` if there is none; its row in `Scene.triangles` and the row of its
+        object, [P] int32 each, -1 if there is none.
     """
     trees = scene.hierarchies
     assert trees is not None
@@ -91,31 +100,32 @@ def nearest_triangle(
         nearest=jnp.broadcast_to(scene.znear, depth.shape),
         farthest=depth,
     )
-    best, hit, row = walk(scene, refs, any_hit=False, interpret=interpret)
+    best, hit, row = by_kernel(refs, any_hit=False, interpret=interpret)
     is_hit = hit >= 0
     row = trees.rows.at[jnp.maximum(row, 0)].get(mode="promise_in_bounds")
     owner = trees.objects.at[jnp.maximum(hit, 0)].get(mode="promise_in_bounds")
     return best, jnp.where(is_hit, row, -1), jnp.where(is_hit, owner, -1)
 
 
-def blocked(scene: Scene, unit: shapes.UnitShapes, segments: Segments, interpret: bool = False) -> jax.Array:
-    """Return True where a segment enters a mesh or a height field, as `triangles.blocked`. Not differentiable.
+def blocked(scene: Scene, unit: shapes.UnitShapes, segments: Segments, walk: Walk = in_plain_jax) -> jax.Array:
+    """Return True where a segment enters a mesh or a height field, of any transparency: [P] bool. Not differentiable.
 
     Args:
         scene: Scene with triangles.
         unit: Rendered objects.
-        segments: [H * W], one for each pixel, row by row.
-        interpret: Run without a GPU, slowly.
+        segments: [P]. Each `LANES` successive ones should start close together, and have similar directions.
+        walk: `walk.by_kernel` or `walk.in_plain_jax`.
     """
     scene, unit, segments = jax.lax.stop_gradient((scene, unit, segments))
     trees = scene.hierarchies
     assert trees is not None
+    count = segments.nearest.shape[0]
+    segments = jax.tree.map(lambda plane: jnp.pad(plane, (0, -count % LANES)), segments)  # the added ones are empty
     middle, radius = _balls(trees, unit)
-    by_tile = jax.tree.map(lambda plane: _cut(scene, plane), segments)
+    by_tile = jax.tree.map(lambda plane: plane.reshape(-1, LANES), segments)
     meets = jax.vmap(may_meet, in_axes=(0, None, None))(by_tile, middle, radius)
     start, direction = jnp.stack(segments.start), jnp.stack(segments.direction)
-    shown = segments.farthest > segments.nearest
-    common = jnp.sum(jnp.where(shown, direction, 0.0), axis=1)
+    common = jnp.sum(jnp.where(segments.farthest > segments.nearest, direction, 0.0), axis=1)
     order = jnp.arange(len(radius), dtype=jnp.int32)
     refs = _shared_refs(trees, unit, order, _apply(unit.axes[trees.objects], common[None]))._replace(
         words=pack_bits(meets),
@@ -126,15 +136,15 @@ def blocked(scene: Scene, unit: shapes.UnitShapes, segments: Segments, interpret
         nearest=segments.nearest,
         farthest=segments.farthest,
     )
-    return walk(scene, refs, any_hit=True, interpret=interpret)[0] >= 0
+    return walk(refs, any_hit=True)[0][:count] >= 0
 
 
 def _cut(scene: Scene, plane: jax.Array) -> jax.Array:
-    """Cut a plane [H * W] into tiles [tiles, 32], with zeros beyond the image."""
+    """Bring a plane [H * W] into the order of `layout`, with zeros beyond the image."""
     (high, wide), (down, across) = TILE, (-(-scene.height // TILE[0]), -(-scene.width // TILE[1]))
     plane = plane.reshape(scene.height, scene.width)
     plane = jnp.pad(plane, ((0, down * high - scene.height), (0, across * wide - scene.width)))
-    return plane.reshape(down, high, across, wide).swapaxes(1, 2).reshape(down * across, high * wide)
+    return plane.reshape(down, high, across, wide).swapaxes(1, 2).reshape(-1)
 
 
 def _balls(trees: hierarchies.Hierarchies, unit: shapes.UnitShapes) -> tuple[jax.Array, jax.Array]:
@@ -210,8 +220,7 @@ def probe_program() -> Any:
     pixels = jax.ShapeDtypeStruct((64,), jnp.float32)
 
     def search(scene: Scene, unit: shapes.UnitShapes, one: jax.Array) -> Any:
-        return nearest_triangle(scene, unit, Rays(one, one), one), blocked(
-            scene, unit, Segments((one,) * 3, (one,) * 3, one, one)
-        )
+        segments = Segments((one,) * 3, (one,) * 3, one, one)
+        return nearest_triangle(scene, unit, Rays(one, one), one), blocked(scene, unit, segments, by_kernel)
 
     return jax.jit(search).trace(scene, unit, pixels)

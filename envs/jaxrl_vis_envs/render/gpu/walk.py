@@ -1,8 +1,8 @@
-"""GPU kernel that walks bounding volume hierarchies (Pallas with Triton), see `hierarchies`.
+"""GPU kernel in which rays walk bounding volume hierarchies (Pallas with Triton), see `hierarchies`.
 
-One program has one warp and a tile of 32 pixels. Every lane walks on its own the objects that its ray may meet, in the order of
-the tile's bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a leaf for the
-lanes that have reached one.
+One program has one warp, and the rays of a tile of 32 pixels. Every lane walks on its own the objects that its ray may meet, in
+the order of the tile's bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a
+leaf for the lanes that have reached one. The same code runs as plain JAX, with arrays in the place of memory blocks.
 """
 
 import functools
@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
@@ -19,12 +18,12 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.model import hierarchies
 from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot
 from jaxrl_vis_envs.render.pixel.triangles import SEAM
-from jaxrl_vis_envs.render.scene import Scene
 
 TILE = (4, 8)
 """Rows and columns of a tile. Tuned on an H100, as are the following."""
 
-_LANES = 32
+LANES = 32
+"""Rays of a program, those of one tile."""
 # Nodes that a lane may visit, and objects that it may look at, in one step.
 _NODES, _OBJECTS = 4, 2
 _COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
@@ -35,7 +34,7 @@ _ROUNDING = 1e-6
 
 
 class Refs(NamedTuple):
-    """Memory blocks read by a program. Those of one environment first, then those of the scene; N objects, P pixels.
+    """Memory blocks read by a program: N objects, and P rays, `LANES` of each tile.
 
     Attributes:
         words: [tiles, words], bits of the objects that may be met from a tile.
@@ -68,7 +67,7 @@ class Refs(NamedTuple):
 
 
 class _Ray(NamedTuple):
-    """Rays in the frames of the objects that they walk: points are ``start + t * direction``. Vectors of [32] float32.
+    """Rays in the frames of the objects that they walk: points are ``start + t * direction``. Vectors of [L] float32.
 
     They meet the face of a box at c cells at ``t = c * inverse - begin``, axis by axis.
     """
@@ -80,7 +79,7 @@ class _Ray(NamedTuple):
 
 
 class _State(NamedTuple):
-    """State of the lanes, [32] each.
+    """State of the lanes, [L] each.
 
     Attributes:
         word: Number of the next word of objects.
@@ -104,31 +103,35 @@ class _State(NamedTuple):
     row: jax.Array
 
 
-def walk(scene: Scene, refs: Refs, any_hit: bool, interpret: bool) -> list[jax.Array]:
-    """Run the kernel for all pixels of an image.
+def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Array]:
+    """Let rays walk, by the kernel.
 
     Args:
-        scene: The scene, of which only the image's size is read.
-        refs: Arrays that the kernel reads.
+        refs: Arrays that describe rays and objects.
         any_hit: Find any intersection, not the nearest.
         interpret: Run without a GPU, slowly.
 
     Returns:
-        Planes [H * W] of each ray: the parameter (float32) of its nearest intersection, the object (int32) that it meets, -1
-        for none, and the row of ``maps`` (int32). With ``any_hit``, only the object.
+        Planes [P] of each ray: the parameter (float32) of its nearest intersection, the object (int32) that it meets, -1 for
+        none, and the row of ``maps`` (int32). With ``any_hit``, only the object.
     """
-    pixels = scene.height * scene.width
     kinds = [jnp.int32] if any_hit else [jnp.float32, jnp.int32, jnp.int32]
     return kernel_call(
-        functools.partial(_kernel, height=scene.height, width=scene.width, any_hit=any_hit),
-        out_shape=[jax.ShapeDtypeStruct((pixels,), kind) for kind in kinds],
+        functools.partial(_kernel, any_hit=any_hit),
+        out_shape=[jax.ShapeDtypeStruct(refs.nearest.shape, kind) for kind in kinds],
         grid=(refs.words.shape[0],),
         in_specs=[_whole(array.shape) for array in refs],
-        out_specs=[_whole((pixels,)) for _ in kinds],
+        out_specs=[_whole(refs.nearest.shape) for _ in kinds],
         compiler_params=_COMPILER,
         interpret=interpret,
         name="find_blocker" if any_hit else "find_triangle",
     )(*refs)
+
+
+def in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
+    """Let rays walk as `by_kernel`, all at once. Those of one call should be few, and take similar ways."""
+    ray = jnp.arange(refs.nearest.shape[0], dtype=jnp.int32)
+    return _walk(refs, ray // LANES, ray, any_hit)
 
 
 def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
@@ -136,22 +139,27 @@ def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
     return pl.BlockSpec(shape, lambda tile_index: (0,) * len(shape))
 
 
-def _kernel(*refs: Any, height: int, width: int, any_hit: bool) -> None:
-    """Write the ray parameter of each pixel's nearest intersection, its object (-1 for none) and its row of ``maps``.
-
-    With ``any_hit``, write only an object that the ray meets, whichever is found first.
-    """
+def _kernel(*refs: Any, any_hit: bool) -> None:
     ins, outs = Refs(*refs[: len(Refs._fields)]), refs[len(Refs._fields) :]
     tile = pl.program_id(0)
-    across = np.int32(-(-width // TILE[1]))
-    lane = jax.lax.broadcasted_iota(jnp.int32, (_LANES,), 0)
-    row = jax.lax.div(tile, across) * TILE[0] + jax.lax.div(lane, np.int32(TILE[1]))
-    column = jax.lax.rem(tile, across) * TILE[1] + jax.lax.rem(lane, np.int32(TILE[1]))
-    inside = (row < height) & (column < width)
-    pixel = jnp.where(inside, row * width + column, 0)
-    start, direction = (tuple(_gather(ref, inside, axis, pixel) for axis in range(3)) for ref in (ins.start, ins.direction))
-    nearest, farthest = _gather(ins.nearest, inside, pixel), _gather(ins.farthest, inside, pixel)
-    words = ins.words.shape[1]
+    ray = tile * LANES + jax.lax.broadcasted_iota(jnp.int32, (LANES,), 0)
+    for out, value in zip(outs, _walk(ins, tile, ray, any_hit), strict=True):
+        plgpu.store(out.at[ray], value)
+
+
+def _walk(refs: Refs, tile: jax.Array, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
+    """Let some rays walk, see `by_kernel`.
+
+    Args:
+        refs: Memory blocks of a kernel, or arrays.
+        tile: [] or [L] int32, number of the rays' tile.
+        ray: [L] int32, numbers of the rays.
+        any_hit: Find any intersection, not the nearest.
+    """
+    everywhere = jnp.ones(ray.shape, bool)
+    start, direction = (tuple(_gather(ref, everywhere, axis, ray) for axis in range(3)) for ref in (refs.start, refs.direction))
+    nearest, farthest = _gather(refs.nearest, everywhere, ray), _gather(refs.farthest, everywhere, ray)
+    words = refs.words.shape[1]
 
     def is_looking(state: _State) -> jax.Array:
         return (state.word < words) | (state.left != 0)
@@ -161,9 +169,9 @@ def _kernel(*refs: Any, height: int, width: int, any_hit: bool) -> None:
 
     def advance(state: _State) -> _State:
         is_idle = (state.node >= state.end) & is_looking(state)
-        state = jax.lax.cond(_any(is_idle), lambda: _next_object(ins, tile, start, direction, state), lambda: state)
-        state, leaf = _visit_nodes(ins, nearest, state)
-        state = jax.lax.cond(_any(leaf >= 0), lambda: _test_leaf(ins, nearest, state, leaf), lambda: state)
+        state = jax.lax.cond(_any(is_idle), lambda: _next_object(refs, tile, start, direction, state), lambda: state)
+        state, leaf = _visit_nodes(refs, nearest, state)
+        state = jax.lax.cond(_any(leaf >= 0), lambda: _test_leaf(refs, nearest, state, leaf), lambda: state)
         if not any_hit:
             return state
         done = state.hit >= 0
@@ -173,14 +181,10 @@ def _kernel(*refs: Any, height: int, width: int, any_hit: bool) -> None:
             node=jnp.where(done, state.end, state.node),
         )
 
-    zero, none = jnp.zeros((_LANES,), jnp.float32), jnp.zeros((_LANES,), jnp.int32)
-    # A lane without a pixel has nothing to look at.
-    word = jnp.where(inside, 0, words)
-    begin = _State(word, none, none, none, none, _Ray(*((zero,) * 3,) * 4), farthest, none - 1, none)
+    zero, none = jnp.zeros(ray.shape, jnp.float32), jnp.zeros(ray.shape, jnp.int32)
+    begin = _State(none, none, none, none, none, _Ray(*((zero,) * 3,) * 4), farthest, none - 1, none)
     state = jax.lax.while_loop(going, advance, begin)
-    results = (state.hit,) if any_hit else (state.best, state.hit, state.row)
-    for out, value in zip(outs, results, strict=True):
-        plgpu.store(out.at[pixel], value, mask=inside)
+    return [state.hit] if any_hit else [state.best, state.hit, state.row]
 
 
 def _any(mask: jax.Array) -> jax.Array:
@@ -189,8 +193,10 @@ def _any(mask: jax.Array) -> jax.Array:
 
 
 def _gather(ref: Any, mask: jax.Array, *place: Any) -> jax.Array:
-    """Load the element at a place of each lane [32] where ``mask`` is set, 0 elsewhere."""
+    """Load the element at a place of each lane [L] where ``mask`` is set, 0 elsewhere."""
     place = tuple(jnp.broadcast_to(jnp.asarray(index, jnp.int32), mask.shape) for index in place)
+    if isinstance(ref, jax.Array):
+        return jnp.where(mask, ref.at[place].get(mode="promise_in_bounds"), 0)
     return plgpu.load(ref.at[place], mask=mask, other=0.0 if ref.dtype == jnp.float32 else 0)
 
 
@@ -240,8 +246,8 @@ def _enter(refs: Refs, start: Vector, direction: Vector, state: _State, fresh: j
 
 
 def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State) -> tuple[_State, jax.Array]:
-    """Visit some nodes; return the state and, for lanes that have met a leaf, its first row of ``maps`` [32], -1 for others."""
-    node, leaf = state.node, jnp.full((_LANES,), -1, jnp.int32)
+    """Visit some nodes; return the state and, for lanes that have met a leaf, its first row of ``maps`` [L], -1 for others."""
+    node, leaf = state.node, jnp.full_like(state.node, -1)
     for _ in range(_NODES):
         active = (node < state.end) & (leaf < 0)
         low, high, link = (_gather(refs.nodes, active, jnp.where(active, node, 0), word) for word in range(3))
@@ -264,7 +270,7 @@ def _meets_box(state: _State, low: jax.Array, high: jax.Array, nearest: jax.Arra
 
 
 def _test_leaf(refs: Refs, nearest: jax.Array, state: _State, leaf: jax.Array) -> _State:
-    """Intersect rays with the triangles of leaves, given by their first row of ``maps`` [32], -1 for none."""
+    """Intersect rays with the triangles of leaves, given by their first row of ``maps`` [L], -1 for none."""
     (start, direction), best, hit, row = state.ray[:2], state.best, state.hit, state.row
     for number in range(hierarchies.LEAF):
         place = jnp.where(leaf >= 0, leaf + number, 0)

@@ -47,12 +47,6 @@ def layout(scene: Scene) -> Layout:
     return tiles(scene, near_divisor(scene.height, preferred), near_divisor(scene.width, preferred))
 
 
-def whole(scene: Scene) -> Layout:
-    """Return the layout of one block: all pixels, row by row."""
-    pixels = np.arange(scene.height * scene.width)[None]
-    return Layout(pixels // scene.width, pixels % scene.width, None)
-
-
 def tiles(scene: Scene, high: int, wide: int) -> Layout:
     """Split the image of a scene into tiles of height ``high`` and width ``wide``."""
     down, across = -(-scene.height // high), -(-scene.width // wide)

@@ -201,8 +201,8 @@ def next_triangle(
         first = scene.cluster_places[cluster][1]
         # Clusters are in the order of their triangles: one found in an earlier cluster precedes all in this one.
         crossings = zip(
-            _intersect_view(scene, unit, cluster, rays),
-            _intersect_view(scene, unit, cluster, offset_rays),
+            _intersect_triangles(scene, unit, cluster, rays),
+            _intersect_triangles(scene, unit, cluster, offset_rays),
             strict=True,
         )
         for number, ((t, _, is_front), (_, margin, offset_is_front)) in enumerate(crossings):
@@ -213,26 +213,6 @@ def next_triangle(
     start = (jnp.zeros((), jnp.int32), jnp.ones_like(depth), jnp.full(rays.u.shape, unset, jnp.int32))
     _, depths, rows = jax.lax.while_loop(lambda state: state[0] < counts[last], advance, start)
     return depths, jnp.where(rows == unset, -1, rows)
-
-
-def blocked(scene: Scene, unit: shapes.UnitShapes, segments: Segments) -> jax.Array:
-    """Return True where a segment enters a mesh or a height field, [P] bool, of any transparency. Not differentiable.
-
-    The segments should start close together, and have similar directions.
-    """
-    scene, unit, segments = jax.lax.stop_gradient((scene, unit, segments))
-    counts = jnp.cumsum(may_meet(segments, _in_camera(scene, unit)[0], scene.clusters[:, 3]), dtype=jnp.int32)
-    last = counts.shape[0] - 1
-
-    def add_cluster(state: tuple) -> tuple:
-        step, found = state
-        cluster = jnp.minimum(_kth(counts, step), last)
-        for t, margin, is_front in _intersect_triangles(scene, unit, cluster, segments.start, segments.direction):
-            found |= is_front & (margin >= -SEAM) & (t > segments.nearest) & (t < segments.farthest)
-        return step + 1, found
-
-    start = (jnp.zeros((), jnp.int32), jnp.zeros(segments.nearest.shape, bool))
-    return jax.lax.while_loop(lambda state: state[0] < counts[last], add_cluster, start)[1]
 
 
 def may_meet(segments: Segments, middle: jax.Array, radius: jax.Array) -> jax.Array:
@@ -270,7 +250,7 @@ def may_meet(segments: Segments, middle: jax.Array, radius: jax.Array) -> jax.Ar
 def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
     """Return the depth [P] of a cluster's nearest triangle, with its index in the lowest bits; infinite if there is none."""
     best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
-    for number, (t, margin, is_front) in enumerate(_intersect_view(scene, unit, cluster, rays)):
+    for number, (t, margin, is_front) in enumerate(_intersect_triangles(scene, unit, cluster, rays)):
         meets = is_front & (margin >= -SEAM)
         key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
         best = jnp.minimum(best, jnp.where(meets, key, best))
@@ -278,21 +258,13 @@ def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array
     return jax.lax.bitcast_convert_type(jnp.minimum(best, infinite), jnp.float32)
 
 
-def _intersect_view(
+def _intersect_triangles(
     scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays
 ) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
-    """Yield `_intersect_triangles` of the camera's rays, with masks that are True only beyond the near plane."""
-    start, direction, _ = camera.ray_parts(scene, rays)
-    for t, margin, is_front in _intersect_triangles(scene, unit, cluster, start, direction):
-        yield t, margin, is_front & (t > scene.znear)
+    """Yield the depth of each triangle's plane, the minimum barycentric coordinate there, and a mask; [P] each.
 
-
-def _intersect_triangles(
-    scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, start: Vector, direction: Vector
-) -> Iterator[tuple[jax.Array, jax.Array, jax.Array]]:
-    """Yield the ray parameter at each triangle's plane, the minimum barycentric coordinate there, and a mask; [P] each.
-
-    The triangles are those of one cluster. A negative coordinate is outside. The mask is True for triangles that face the ray.
+    The triangles are those of one cluster. A negative coordinate is outside. The mask is True for triangles that face the ray
+    beyond the near plane.
     """
     location = scene.cluster_places[cluster]
     axes, origin = unit.axes[location[0]], unit.origin[location[0]]
@@ -302,10 +274,11 @@ def _intersect_triangles(
     # Composed maps from the camera's frame to each unit triangle: few numbers, so that a ray needs only one map.
     local_maps = jnp.sum(maps[:, :, :3, None] * axes[None, None], axis=2)
     begin = jnp.sum(maps[:, :, :3] * origin, axis=2) + maps[:, :, 3]
+    start, direction, _ = camera.ray_parts(scene, rays)
     for number in range(meshes.CLUSTER):
         ray = camera.multiply(local_maps[number], direction)
         offset = camera.multiply(local_maps[number], start)
         origin_local = tuple(begin[number, axis] + offset[axis] for axis in range(3))
         t = -origin_local[2] / jnp.where(ray[2] < 0.0, ray[2], -1.0)
         first, second = origin_local[0] + t * ray[0], origin_local[1] + t * ray[1]
-        yield t, jnp.minimum(jnp.minimum(first, second), 1.0 - first - second), ray[2] < 0.0
+        yield t, jnp.minimum(jnp.minimum(first, second), 1.0 - first - second), (ray[2] < 0.0) & (t > scene.znear)
