@@ -82,8 +82,9 @@ class Case:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Outputs to measure, of which a peer has the first."""
-        return MESH_OUTPUTS if self.config.get("scene") in models.MESH_SCENES else OUTPUTS
+        """Outputs to measure, of which a peer has the first. Depths alone have no shadows."""
+        outputs = MESH_OUTPUTS if self.config.get("scene") in models.MESH_SCENES else OUTPUTS
+        return tuple(output for output in outputs if output != "depth" or not self.config.get("shadows"))
 
 
 def cases(scene: str, settings: Settings, sizes: tuple[int, ...], min_poses: int = 0) -> Iterator[Case]:
