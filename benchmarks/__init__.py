@@ -1,7 +1,6 @@
 """Scripts around the package that run from a checkout and are not part of the wheel.
 
     peers/        other renderers, physics and learners, compared with ours
-    mesh_kernels/ two designs for triangle meshes on a GPU, for one decision; deleted after it
     ledger/       stored records: tables of README and docs (`make tables`), records older than their code (`make stale`)
     claims/       tables of the learning studies and claims of the thesis; check_claims.py also checks sentences
     parity.py     tasks against recordings of the originals, made by record_originals.py

@@ -2,10 +2,8 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -24,7 +22,7 @@ COMPARED = 32
 # Renderings of the same scene differ by rounding and on silhouettes. On a CPU, in all scenes and
 # sizes, depths agree in at least 99.92 % of the pixels (mujoco.Renderer) and 99.99 % (Warp), and colours without a texture
 # differ by at most 1.0 (mujoco.Renderer) and 0.6 grey levels (Warp).
-MIN_DEPTH_AGREEMENT = 0.995
+MIN_DEPTH_AGREEMENT, MIN_LABEL_AGREEMENT = 0.995, 0.99
 MAX_DIFFERENCE = 1.5  # grey levels of 255, the mean over pixels and channels
 
 
@@ -34,28 +32,42 @@ class Comparison:
 
     Attributes:
         config: Entries of the record.
-        mj_model: Model, rendered by its first camera.
-        scene: Our scene of the model.
-        batches: Poses, see `models.random_poses`; the first ``config["images"]`` of each are rendered.
+        mj_model: Model, rendered by its first cameras.
+        cameras: Number of these cameras, of which each renders an image of every pose.
+        scene: Our scene of the model, seen by the first.
+        batches: Poses, see `models.random_poses`; the first ``config["images"]`` over the cameras of each are rendered.
         repeats: Maximum number of timed repeats.
         rate: Our images per second.
         colours: Our images of the first poses of the first batch, [K, H, W, 3] uint8.
         depth: Depth in metres, inf for the sky, [K, H, W] float32.
+        labels: Geoms, -1 for the sky, [K, H, W] int32.
         textured: Mask of the pixels that show a texture, [K, H, W] bool.
     """
 
     config: dict[str, Any]
     mj_model: mujoco.MjModel
+    cameras: int
     scene: Scene
     batches: list[dict[str, np.ndarray]]
     repeats: int
     rate: float
     colours: np.ndarray
     depth: np.ndarray
+    labels: np.ndarray
     textured: np.ndarray
 
+    @property
+    def labelled(self) -> bool:
+        """True if labels are among the measured outputs."""
+        return self.config["pixels"] == images.MESH_OUTPUTS[0]
+
     def agreement(
-        self, colours: np.ndarray, depth: np.ndarray, max_textured_difference: float = MAX_DIFFERENCE
+        self,
+        colours: np.ndarray,
+        depth: np.ndarray,
+        max_textured_difference: float = MAX_DIFFERENCE,
+        max_difference: float = MAX_DIFFERENCE,
+        labels: np.ndarray | None = None,
     ) -> dict[str, float]:
         """Compare a peer's images with ours. Surplus images of either are ignored.
 
@@ -63,11 +75,13 @@ class Comparison:
             colours: Images of the peer, [K, H, W, 3] uint8.
             depth: Depth in metres, inf for the sky, [K, H, W] float32.
             max_textured_difference: Bound on the mean difference over textured pixels, grey levels of 255.
+            max_difference: Bound on the mean difference over pixels without a texture, grey levels of 255.
+            labels: Geoms, -1 for the sky, [K, H, W] int32; None if the peer has none.
 
         Returns:
-            Entries of the record: ``depth_agreement`` (see `depth_agreement`), ``colour_difference`` and
-            ``textured_difference``: the mean absolute difference over channels and over pixels without and with a texture, in
-            grey levels of 255. A difference over no pixels is omitted.
+            Entries of the record: ``depth_agreement`` (see `depth_agreement`), ``label_agreement`` (a fraction of the pixels),
+            ``colour_difference`` and ``textured_difference``: the mean absolute difference over channels and over pixels
+            without and with a texture, in grey levels of 255. A difference over no pixels is omitted.
 
         Raises:
             AssertionError: The peer's images differ from ours.
@@ -79,8 +93,12 @@ class Comparison:
         complaints = []
         if agreement["depth_agreement"] < MIN_DEPTH_AGREEMENT:
             complaints.append(f"depths agree in {agreement['depth_agreement']} of the pixels, not in {MIN_DEPTH_AGREEMENT}")
+        if labels is not None:
+            agreement["label_agreement"] = round(float(np.mean(self.labels[:count] == labels[:count])), 4)
+            if agreement["label_agreement"] < MIN_LABEL_AGREEMENT:
+                complaints.append(f"labels agree in {agreement['label_agreement']} of the pixels, not in {MIN_LABEL_AGREEMENT}")
         for name, pixels, bound in (
-            ("colour_difference", ~textured, MAX_DIFFERENCE),
+            ("colour_difference", ~textured, max_difference),
             ("textured_difference", textured, max_textured_difference),
         ):
             if pixels.any():
@@ -100,26 +118,28 @@ def compare(case: images.Case, repeats: int, rate: float) -> Comparison:
         repeats: Maximum number of timed repeats.
         rate: Our images per second.
     """
-    config, mj_model = {**case.config, "pixels": images.OUTPUTS[0]}, case.mj_model
-    size = config["image_size"]
-    scene = Scene.from_mjmodel(mj_model, 0, size, size)
+    config, mj_model = {**case.config, "pixels": case.outputs[0]}, case.mj_model
+    scene = images.make_scene(case)
 
-    def draw(poses: dict[str, jax.Array]) -> tuple[Any, Any, Any]:
-        planes = render_planes(scene, SimpleNamespace(**poses), segmentation=True, quantized=True)
+    def draw(scene: Scene, poses: Any) -> tuple[Any, Any, Any]:
+        planes = render_planes(scene, poses, segmentation=True, quantized=True)
         return planes.rgb, planes.depth, planes.segmentation
 
-    compared = {name: jnp.asarray(rows[:COMPARED]) for name, rows in case.batches[0].items()}
-    colours, depth, segmentation = (np.asarray(plane) for plane in jaxrl_vis_envs.jit(jax.vmap(draw))(compared))
+    compared = {name: jnp.asarray(rows[: COMPARED // case.cameras]) for name, rows in case.batches[0].items()}
+    drawn = jaxrl_vis_envs.jit(lambda scene, poses: images.draw_all(case, scene, poses, draw))(scene, compared)
+    colours, depth, segmentation = map(np.asarray, drawn)
     textured = np.append(textured_geoms(mj_model), scene.sky == "texture")  # index -1, the last, is the sky
     return Comparison(
         config=config,
         mj_model=mj_model,
+        cameras=case.cameras,
         scene=scene,
         batches=case.batches,
         repeats=repeats,
         rate=rate,
         colours=np.moveaxis(colours, 1, -1),
         depth=np.where(depth < float(scene.zfar), depth, np.inf),
+        labels=segmentation,
         textured=textured[segmentation],
     )
 
@@ -141,12 +161,12 @@ def measure_beside_ours(
         for scene in (settings.scene,) if settings.scene else scenes:
             for case in images.cases(scene, settings, image_sizes(settings), min_poses):
                 rates = {}
-                for output in images.OUTPUTS:
+                for output in case.outputs:
                     ours = images.measure_output(case, output, settings.repeats)
                     rates[output] = ours.value
                     yield ours
                 # A peer has one output: our first.
-                yield measure_peer(compare(case, settings.repeats, rates[images.OUTPUTS[0]]))
+                yield measure_peer(compare(case, settings.repeats, rates[case.outputs[0]]))
 
     return measure
 

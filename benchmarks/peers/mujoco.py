@@ -42,23 +42,25 @@ def check() -> None:
 def measure(comparison: Comparison) -> Measurement:
     """Measure images per second of colours and depth, one pose at a time, as this renderer works. Every image is timed.
 
-    Shadows, reflections and haze are off; multisampling follows the model (`models.load` switches it off).
+    Shadows are as in ours, reflections and haze are off; multisampling follows the model (`models.load` switches it off).
 
     Raises:
         AssertionError: Its images differ from ours.
     """
     config, mj_model, poses = comparison.config, comparison.mj_model, comparison.batches[0]
-    size, count = config["image_size"], min(POSES, len(poses["geom_xpos"]))
+    size, cameras = config["image_size"], comparison.cameras
+    count = min(POSES, len(poses["geom_xpos"]) * cameras)
     colours, depths, seconds = [], [], []
     mj_data, flags = mujoco.MjData(mj_model), mujoco.mjtRndFlag
     with mujoco.Renderer(mj_model, height=size, width=size) as renderer:
-        for flag in (flags.mjRND_SHADOW, flags.mjRND_REFLECTION, flags.mjRND_HAZE):
+        for flag in (flags.mjRND_REFLECTION, flags.mjRND_HAZE):
             renderer.scene.flags[flag] = False
+        renderer.scene.flags[flags.mjRND_SHADOW] = config.get("shadows", False)
         options = mujoco.MjvOption()
         options.sitegroup[:] = 0
 
-        def draw() -> tuple[np.ndarray, np.ndarray]:
-            renderer.update_scene(mj_data, 0, options)
+        def draw(camera: int) -> tuple[np.ndarray, np.ndarray]:
+            renderer.update_scene(mj_data, camera, options)
             colour = renderer.render().copy()
             renderer.enable_depth_rendering()
             metres = renderer.render().copy()
@@ -66,9 +68,9 @@ def measure(comparison: Comparison) -> Measurement:
             return colour, metres
 
         for index in [0, *range(count)]:  # the first pose twice: once to warm up
-            _set_poses(mj_data, poses, index)  # not timed: poses are input
+            _set_poses(mj_data, poses, index // cameras)  # not timed: poses are input
             start = time.perf_counter()
-            colour, metres = draw()
+            colour, metres = draw(index % cameras)
             seconds.append(time.perf_counter() - start)
             colours.append(colour)
             depths.append(metres)

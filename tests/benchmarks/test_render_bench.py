@@ -15,7 +15,7 @@ from jaxrl_vis import bench
 from jaxrl_vis.bench import record, variation
 from jaxrl_vis.bench.scenes import images, models, operations
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis_envs.render import Scene
+from jaxrl_vis_envs.render import Scene, render
 
 BALL = """
 <mujoco>
@@ -188,8 +188,28 @@ def test_a_peer_must_draw_the_same(drawn_ball: image_comparison.Comparison) -> N
     moved = np.where(np.isfinite(ours.depth), ours.depth * 1.05, np.inf)
     with pytest.raises(AssertionError, match="depths agree in .* of the pixels"):
         ours.agreement(ours.colours, moved)
+    with pytest.raises(AssertionError, match="labels agree in 0.0 of the pixels"):
+        ours.agreement(ours.colours, ours.depth, labels=ours.labels + 1)
+    assert ours.agreement(ours.colours, ours.depth, labels=ours.labels)["label_agreement"] == 1.0
     # A peer may draw fewer images than we do.
     assert ours.agreement(ours.colours[:2], ours.depth[:2])["depth_agreement"] == 1.0
+
+
+def test_images_of_several_cameras_are_in_the_order_of_poses() -> None:
+    spec = mujoco.MjSpec.from_string(BALL)
+    spec.worldbody.add_camera(pos=[0.0, 0.0, 3.0])
+    mj_model = spec.compile()
+    batches = [models.random_poses(mj_model, 2, seed) for seed in (1, 2)]
+    case = images.Case({"image_size": 8, "images": 4, "cameras": 2}, mj_model, batches)
+    drawn = image_comparison.compare(case, repeats=1, rate=1.0).depth
+    for camera in range(2):
+        scene = Scene.from_mjmodel(mj_model, camera, 8, 8)
+        for world in range(2):
+            mj_data = mujoco.MjData(mj_model)
+            for name in models.POSES:
+                getattr(mj_data, name)[:] = batches[0][name][world]
+            depth = np.asarray(render(scene, mj_data).depth)
+            np.testing.assert_allclose(drawn[2 * world + camera], np.where(depth < float(scene.zfar), depth, np.inf), rtol=1e-5)
 
 
 def test_textures_have_a_bound_of_their_own(drawn_ball: image_comparison.Comparison) -> None:
@@ -238,6 +258,7 @@ def warp_options(scene: str, **variant: bool) -> set[str]:
         "enable_specular",
         "enable_emission",
         "enable_per_light_ambient",
+        "enable_vertex_normals",
         "enable_backface_culling",
     }
     return {name for name, on in options.items() if on}

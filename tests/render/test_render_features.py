@@ -206,13 +206,13 @@ def test_shapes_without_thickness_are_sheets_and_without_area_are_hidden():
 
 def test_shadows_fall_where_the_light_is_hidden():
     light = '<light directional="true" dir="0 0 -1" diffuse=".5 .5 .5" ambient="0 0 0" castshadow="{}"/>'
-    body = '<geom type="plane" size="2 2 .1"/><geom type="{}" size=".2 .2 .2" pos="0 0 .5"/>'
+    body = '<geom type="plane" size="2 2 .1"/><geom type="{}" pos="0 0 .5"/>'
     body += '<camera name="above" pos="1.5 0 1.5" xyaxes="0 1 0 -1 0 1"/>'
     dark = HEAD.format(0.1, 0.1, 0.1)
-    for kind in ("sphere", "cylinder", "capsule"):
-        lit, shadowed = (
-            drawn(light.format("true") + body.format(kind), size=33, header=dark, shadows=shadows) for shadows in (False, True)
-        )
+    octahedron = '<mesh name="m" vertex=".2 0 0 -.2 0 0 0 .2 0 0 -.2 0 0 0 .2 0 0 -.2"/>'
+    for kind in ('sphere" size=".2', 'cylinder" size=".2 .2', 'capsule" size=".2 .2', 'mesh" mesh="m'):
+        given = {"size": 33, "header": dark, "assets": octahedron}
+        lit, shadowed = (drawn(light.format("true") + body.format(kind), shadows=shadows, **given) for shadows in (False, True))
         floor = lit.segmentation == 0
         changed = floor & (shadowed.rgb[..., 0] < lit.rgb[..., 0] - 20)
         assert 0.005 < changed.sum() / floor.sum() < 0.2, kind
@@ -220,7 +220,7 @@ def test_shadows_fall_where_the_light_is_hidden():
         np.testing.assert_array_equal(lit.rgb[rest], shadowed.rgb[rest])
         top = (lit.segmentation == 1) & (lit.normals @ np.array([0, np.sqrt(0.5), np.sqrt(0.5)]) > 0.5)
         np.testing.assert_array_equal(lit.rgb[top], shadowed.rgb[top])  # nothing shadows its own lit side
-        without = drawn(light.format("false") + body.format(kind), size=33, header=dark, shadows=True)
+        without = drawn(light.format("false") + body.format(kind), shadows=True, **given)
         np.testing.assert_array_equal(without.rgb, lit.rgb)
 
 
@@ -319,23 +319,13 @@ REFUSALS = {
         {"groups": (5,)},
         ("flex",),
     ),
-    "shadows of a mesh": (
-        '<geom name="statue" type="mesh" mesh="m"/>' + ABOVE,
-        '<mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>',
-        "statue.*shadows=False",
-        {"shadows": True},
-        ("statue",),
-    ),
 }
 
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_errors_name_the_object_and_the_remedy(case):
-    body, assets, message, options, culprits = REFUSALS[case]
-    deformable = ""
-    if "<mesh" not in assets:
-        deformable, assets = f"<deformable>{assets}</deformable>", ""
-    xml = f"<mujoco>{deformable}<asset>{assets}</asset><worldbody>{body}</worldbody></mujoco>"
+    body, deformables, message, options, culprits = REFUSALS[case]
+    xml = f"<mujoco><deformable>{deformables}</deformable><worldbody>{body}</worldbody></mujoco>"
     mj_model = mujoco.MjModel.from_xml_string(xml)
     with pytest.raises(ValueError, match=message) as refusal:
         Scene.from_mjmodel(mj_model, "above", **options)

@@ -12,6 +12,7 @@ from small_scene import MORE_SPHERES, ORTHOGRAPHIC, small_scene
 import jaxrl_vis_envs
 from jaxrl_vis_envs.render import render_planes
 from jaxrl_vis_envs.render.gpu import kernel
+from jaxrl_vis_envs.render.gpu.tiles import tile_shape
 
 
 @pytest.fixture
@@ -73,7 +74,7 @@ def test_the_kernel_has_the_gradients_of_the_plain_renderer(with_kernel):
 
 @pytest.mark.parametrize("size", [8, 32, 64, 84, 100, 128, 250])
 def test_tiles_cover_the_image_with_little_overhang(size):
-    high, wide = kernel.tile_shape(size, size)
+    high, wide = tile_shape(size, size)
     drawn = -(-size // high) * -(-size // wide) * 128
     assert high * wide <= 128
     assert drawn <= max(1.3 * size * size, 128)

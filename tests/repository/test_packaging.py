@@ -305,7 +305,7 @@ def test_wheel_holds_both_packages_and_nothing_else(wheel: Path) -> None:
 
 def test_wheel_is_small(wheel: Path) -> None:
     policies = sum(file.compress_size for file in zipfile.ZipFile(wheel).infolist() if "/pretrained/" in file.filename)
-    assert wheel.stat().st_size - policies <= 6_000_000
+    assert wheel.stat().st_size - policies <= 6_100_000
     assert max(file.file_size for file in zipfile.ZipFile(wheel).infolist()) <= 5_000_000
 
 

@@ -31,6 +31,7 @@ def _rows(file: Path, peer: str) -> list[tuple[dict[str, Any], dict[str, Any] | 
     records = load(file)
     peers = {str({**record["config"], "images": 0}): record for record in records if record["name"] == peer}
     ours = [record for record in records if record["name"] == _OURS and record["config"]["pixels"] in _OUTPUTS]
+    ours = [record for record in ours if record["config"]["scene"] in _ORDER]
     drawn = [record for record in ours if record["config"]["scene"] in _TEXTURED or not record["config"]["textures"]]
     drawn = sorted(drawn, key=_rank)
     return [(record, peers.get(str({**record["config"], "images": 0}))) for record in drawn]

@@ -3,7 +3,8 @@
 There are three stages: all linear work, once per environment (`pixel.shapes`, `pixel.lights`); the nearest object of each pixel
 (`pixel.raycast`, `pixel.triangles`), an integer that is never differentiated; and, once per pixel, depth, normal and colour of
 that object from a row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two stages are one kernel on a GPU
-(`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`).
+(`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`). In scenes with meshes or height fields, a
+kernel on a GPU searches for their triangles (`gpu.search`).
 """
 
 import dataclasses
@@ -19,9 +20,9 @@ from jaxrl_vis_envs.compiling.compilation import dispatch_by_platform, target_pl
 from jaxrl_vis_envs.render import camera, cords
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.cpu import passes
-from jaxrl_vis_envs.render.gpu import kernel
+from jaxrl_vis_envs.render.gpu import kernel, search
 from jaxrl_vis_envs.render.outputs import Frame, Outputs, Planes
-from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent
+from jaxrl_vis_envs.render.pixel import blocks, lights, lookup, raycast, shade, shapes, surface, transparent, triangles
 from jaxrl_vis_envs.render.pixel.prepare import check_poses, prepare
 from jaxrl_vis_envs.render.scene import Scene
 
@@ -36,6 +37,25 @@ class _View(NamedTuple):
     unit: shapes.UnitShapes
     table: jax.Array
     lights: jax.Array
+    blocked: Callable[..., jax.Array]
+
+
+class _Search(NamedTuple):
+    """Search for objects.
+
+    Attributes:
+        layout: Order of the pixels.
+        nearest: `blocks.nearest`, or a function of this form.
+        blocked: `search.blocked`.
+    """
+
+    layout: Callable[[Scene], blocks.Layout]
+    nearest: Callable[..., blocks.Nearest]
+    blocked: Callable[..., jax.Array]
+
+
+_PLAIN = _Search(blocks.layout, blocks.nearest, search.blocked)
+_BY_KERNELS = _Search(search.layout, search.nearest, functools.partial(search.blocked, walk=search.by_kernel))
 
 
 class _Path(NamedTuple):
@@ -96,6 +116,7 @@ def render_planes(
 def _in_32_bits(scene: Scene) -> Scene:
     """Convert the leaves, which may be Python numbers or 64-bit arrays, to the dtypes that `Scene` documents."""
     leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
+    leaves.remove("hierarchies")  # built once, never replaced
     dtypes = {name: _INTEGERS.get(name, jnp.float32) for name in leaves}
     return scene.replace(**{name: jnp.asarray(getattr(scene, name), dtype) for name, dtype in dtypes.items()})
 
@@ -105,7 +126,7 @@ def _fast(scene: Scene, outputs: Outputs) -> Callable[..., Planes] | None:
     for path in (kernel, passes):
         if path.can_render(scene, outputs):
             return path.draw
-    return None
+    return _draw_walking if search.can_search(scene) else None
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
@@ -130,7 +151,21 @@ def _differentiate(path: _Path, outputs: Outputs, primals: tuple, tangents: tupl
         return jax.jvp(functools.partial(_draw, outputs), primals, tangents)
 
 
-def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> Planes:
+def _draw_walking(
+    outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array
+) -> Planes:
+    """Render as `_draw`, with the nearest objects found by GPU kernels."""
+    return _draw(outputs, scene, rotation, unit, light_table, _BY_KERNELS)
+
+
+def _draw(
+    outputs: Outputs,
+    scene: Scene,
+    rotation: jax.Array,
+    unit: shapes.UnitShapes,
+    light_table: jax.Array,
+    searches: _Search = _PLAIN,
+) -> Planes:
     """Render the requested planes of a scene with objects, in plain JAX.
 
     Args:
@@ -139,8 +174,9 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
         rotation: [3, 3] float32, see `camera.camera_pose`.
         unit: Rendered objects.
         light_table: Lights, from `lights.pack`.
+        searches: Search for objects.
     """
-    layout = blocks.layout(scene)
+    layout = searches.layout(scene)
     rays = camera.pixel_rays(scene, layout.rows, layout.columns)
     # Barrier: XLA would otherwise repeat the per-object work in every pixel.
     unit = camera.barrier(unit)
@@ -155,10 +191,12 @@ def _draw(outputs: Outputs, scene: Scene, rotation: jax.Array, unit: shapes.Unit
             length = blocks.restore(scene, layout, along)
         return Planes(None, depth, None, None, length)
     # Barriers: XLA would otherwise search for the nearest object again for each output.
-    near = jax.lax.optimization_barrier(blocks.nearest(scene, unit, rays))
+    near = jax.lax.optimization_barrier(searches.nearest(scene, unit, rays))
     rows = lookup.object_table(scene, unit)
-    view = _View(rotation, unit, rows, light_table)
-    pixels = blocks.merge_blocks((rays, near))
+    view = _View(rotation, unit, rows, light_table, searches.blocked)
+    pixels = (rays, near)
+    if near.triangle is None or not any(scene.light_shadows):  # shadows of triangles need pixels that are close together
+        pixels = blocks.merge_blocks(pixels)
     planes = blocks.scan(lambda *block: _finish(scene, view, outputs, *block), *pixels)
     planes = jax.lax.optimization_barrier(planes)
     planes = jax.tree.map(lambda plane: blocks.restore(scene, layout, plane), planes)
@@ -182,7 +220,8 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
         normal = tuple(jnp.where(hit_mask, component, 0.0) for component in hit.normal)
         sheets = transparent.intersect_sheets(scene, view.unit, view.table, rays, far)
         if outputs.rgb:
-            front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays)
+            blocked = _blocked_where(scene, view, hit_mask) if nearest.triangle is not None else None
+            front = shade.shade(scene, view.unit, lights.unpack(scene, view.lights), row, hit, rays, blocked)
             background = shade.sky(scene, view.rotation, rays)
             colour = tuple(jnp.where(hit_mask, one, other) for one, other in zip(front, background, strict=True))
             if scene.haze[0] >= 0:
@@ -195,6 +234,15 @@ def _finish(scene: Scene, view: _View, outputs: Outputs, rays: Rays, nearest: bl
         # The extra last entry is the sky's label, selected by index -1.
         labels = jnp.asarray(np.array([*scene.object_ids, -1], np.int32))[shown]
     return Planes(colour, far if outputs.depth else None, labels, normal if outputs.normals else None, length)
+
+
+def _blocked_where(scene: Scene, view: _View, shown: jax.Array) -> Callable[[triangles.Segments], jax.Array]:
+    """Return the test for triangles on segments from pixels [P], False unless ``shown``."""
+
+    def blocked(segments: triangles.Segments) -> jax.Array:
+        return view.blocked(scene, view.unit, segments._replace(farthest=jnp.where(shown, segments.farthest, 0.0)))
+
+    return blocked
 
 
 def _declared_last(scene: Scene, view: _View, rays: Rays, nearest: blocks.Nearest, index: jax.Array) -> jax.Array:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxrl_vis_envs.render import mounts, viewpoint
 from jaxrl_vis_envs.render.model import cameras, meshes, reading, tendons
 from jaxrl_vis_envs.render.model import textures as atlases
+from jaxrl_vis_envs.render.model.hierarchies import Hierarchies, build_hierarchies
 
 
 def _leaf() -> Any:
@@ -83,6 +84,7 @@ class Scene:
         triangles: [R, 36] float32, triangles of all meshes and height fields, see `meshes.build_triangles`.
         clusters: [K, 8] float32, bounding spheres (metres) and cones of normals of the rendered triangle clusters, see there.
         cluster_places: [K, 2] int32: index of the cluster's object among the G, and first row of its triangles.
+        hierarchies: Hierarchies over the triangles, see `hierarchies.Hierarchies`; None in a scene without triangles.
         object_ids: G indices of the rendered objects (a tendon's once for each of its capsules), in the reverse of MuJoCo's
             drawing order: of two objects at the same depth, MuJoCo shows the one drawn later, this renderer the one listed
             first. That is descending order, with the reflecting object, if any, at the end.
@@ -147,6 +149,7 @@ class Scene:
     triangles: jax.Array = _leaf()
     clusters: jax.Array = _leaf()
     cluster_places: jax.Array = _leaf()
+    hierarchies: Hierarchies | None = _leaf()
     object_ids: tuple[int, ...] = _static()
     object_types: tuple[int, ...] = _static()
     transparent: tuple[int, ...] = _static()
@@ -223,7 +226,7 @@ class Scene:
         Raises:
             ValueError: ``mj_model`` is not a `mujoco.MjModel`, the camera, a texture or a geom in ``leave_out`` does not exist,
                 a size is not a positive integer, groups are not integers, ``lights`` is invalid, or something visible is not
-                supported (skins, flexes, shadows of meshes).
+                supported (skins, flexes).
         """
         reading.check_model(mj_model)
         reading.check_size(height=height, width=width)
@@ -236,7 +239,7 @@ class Scene:
         appearance = reading.object_appearance(mj_model)
         types = reading.object_types(mj_model)
         drawn = reading.drawn_objects(mj_model, appearance["rgba"], groups, site_groups, tendon_groups, leave_out)
-        reading.check_supported(mj_model, types, drawn, groups, leave_out, shadows)
+        reading.check_supported(mj_model, groups, leave_out)
         clear_planes = reading.planes_clear_from_behind(mj_model, camera_id, camera, plane_backs)
         transparency = reading.transparency(appearance["rgba"][:, 3], clear_planes)
         ids, reordered = reading.drawing_order(mj_model, types, np.flatnonzero(drawn), transparency[drawn] == reading.SOLID)
@@ -255,14 +258,15 @@ class Scene:
         leaves["body_mass"], parents = reading.body_masses(mj_model, (camera_mount, *light_facts["light_mounts"]))
         arrays = {name: np.asarray(value, np.float32) for name, value in leaves.items()}
         clear = transparency[ids] == reading.CLEAR
-        arrays |= {
+        fine = meshes.build_triangles(mj_model, ids, types[ids], clear)
+        further_arrays = {
             "texels": texels,
             "texture": reading.object_textures(mj_model).astype(np.int32),
-            **meshes.build_triangles(mj_model, ids, types[ids], clear),
+            "hierarchies": build_hierarchies(fine["triangles"], fine["cluster_places"]),
         }
         return cls(
             # All in one call: `jnp.asarray` would compile a program per shape.
-            **jax.device_put(arrays),
+            **jax.device_put(arrays | fine | further_arrays),
             object_ids=tuple(ids.tolist()),
             object_types=tuple(types[ids].tolist()),
             transparent=tuple(transparency[ids].tolist()),

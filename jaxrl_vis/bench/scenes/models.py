@@ -21,8 +21,8 @@ SPREADS = {"scattered": 1.0, "start": 0.01}
 """Spread of the joints, see `scatter_joints`: at the start just enough that no two images are equal."""
 
 
-def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.MjModel:
-    """Load the model of a scene, with multisampling and shadows off. Its first camera is the viewpoint.
+def load(scene: str, textures: bool = True, highlights: bool = True, shadows: bool = False) -> mujoco.MjModel:
+    """Load the model of a scene, with multisampling off. Its first camera is the viewpoint.
 
     Args:
         scene: ``finger`` (from the dm_control suite), ``fetch_reach`` (ours), ``primitives`` (127 mixed primitives on and
@@ -30,6 +30,7 @@ def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.M
             the path of an MJCF file with a camera.
         textures: Whether to keep the textures of materials and sky.
         highlights: Whether to keep the specular component of lights.
+        shadows: Whether lights that cast shadows keep doing so.
 
     Raises:
         RequestError: The scene is unknown, its package is missing, or it has no camera.
@@ -50,8 +51,10 @@ def load(scene: str, textures: bool = True, highlights: bool = True) -> mujoco.M
                 raise RequestError(f"{path} is no MuJoCo model: {' '.join(str(error).split())}") from error
     if not mj_model.ncam:
         raise RequestError(f"scene {scene} has no camera: give it one in its <worldbody>")
-    mj_model.vis.quality.offsamples = mj_model.vis.quality.shadowsize = 0
-    mj_model.light_castshadow[:] = 0
+    mj_model.vis.quality.offsamples = 0
+    if not shadows:
+        mj_model.vis.quality.shadowsize = 0
+        mj_model.light_castshadow[:] = 0
     if not textures:
         mj_model.mat_texid[:] = -1
         # The sky is identified by its texture type.

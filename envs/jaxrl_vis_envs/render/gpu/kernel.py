@@ -20,13 +20,14 @@ from jaxrl_vis_envs.compiling.compilation import use_gpu_kernels
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
+from jaxrl_vis_envs.render.gpu.tiles import PIXELS, rectangles, tile_shape, tile_words
+from jaxrl_vis_envs.render.model import reading
 from jaxrl_vis_envs.render.outputs import Outputs, Planes
 from jaxrl_vis_envs.render.pixel import lights, lookup, raycast, shade, shapes, surface
 from jaxrl_vis_envs.render.pixel.prepare import prepare
 from jaxrl_vis_envs.render.scene import Scene
 
-# Tuned on an H200: pixels per tile (a power of two, some of which may be idle), and launch parameters.
-_PIXELS = 128
+# Tuned on an H200.
 _COMPILER = plgpu.CompilerParams(num_warps=4, num_stages=1)
 # Indices of the camera's parameters in the vector that the kernel reads.
 _LENS, _CLIP, _ROTATION, _SKY_TOP, _SKY_BOTTOM, _FOVY = range(4), range(4, 6), range(6, 15), range(15, 18), range(18, 21), 21
@@ -63,56 +64,6 @@ def supports(scene: Scene) -> bool:
     return is_simple and not (textured and scene.projection == "intrinsic") and set(scene.object_types) <= _TYPES
 
 
-def tile_shape(height: int, width: int) -> tuple[int, int]:
-    """Return the rows and columns of a tile: about twice as wide as high, with little overhang beyond the image's border."""
-
-    def cost(shape: tuple[int, int]) -> float:
-        high, wide = shape
-        return -(-height // high) * -(-width // wide) * (1.0 + 0.1 * abs(np.log2(wide / high) - 1.0))
-
-    return min(((_PIXELS // wide, wide) for wide in range(8, _PIXELS + 1)), key=cost)
-
-
-def rectangles(scene: Scene, unit: shapes.UnitShapes) -> jax.Array:
-    """Return bounds [G, 4] float32 (min u, max u, min v, max v) of each object's bounding sphere; infinite for planes."""
-    is_infinite = np.array(scene.object_types) == shapes.PLANE
-    endless = np.array([-camera.INFINITE, camera.INFINITE] * 2, np.float32)
-    return jnp.where(is_infinite[:, None], endless, camera.sphere_sides(scene, unit.ball[:, :3], unit.ball[:, 3]))
-
-
-def tile_words(scene: Scene, sides: jax.Array, tile: tuple[int, int]) -> tuple[jax.Array, np.ndarray]:
-    """Determine which objects may be visible in which tiles.
-
-    Args:
-        scene: The scene.
-        sides: [G, 4] from `rectangles`.
-        tile: Rows and columns of a tile.
-
-    Returns:
-        Bits [tiles, words] int32, in which bit b of word w stands for object ``order[32 w + b]``; and the order [G], sorted by
-        type.
-    """
-    order = np.argsort(np.array(scene.object_types), kind="stable").astype(np.int32)
-    high, wide = tile
-    tops, lefts = np.arange(0, scene.height, high), np.arange(0, scene.width, wide)
-    middle_u, middle_v, half_u, half_v = camera.lens(scene)
-
-    def u_at(column: np.ndarray) -> jax.Array:
-        return middle_u + jnp.asarray((2.0 * column + 1.0 - scene.width) / scene.width, jnp.float32) * half_u
-
-    def v_at(row: np.ndarray) -> jax.Array:
-        return middle_v + jnp.asarray((scene.height - 1.0 - 2.0 * row) / scene.height, jnp.float32) * half_v
-
-    sides = sides[order]
-    across = (sides[:, 0] <= u_at(lefts + wide)[:, None]) & (sides[:, 1] >= u_at(lefts - 1)[:, None])
-    down = (sides[:, 2] <= v_at(tops - 1)[:, None]) & (sides[:, 3] >= v_at(tops + high)[:, None])
-    meets = (down[:, None] & across[None, :]).reshape(len(tops) * len(lefts), -1)
-    words = -(-len(order) // 32)
-    meets = jnp.pad(meets, ((0, 0), (0, 32 * words - len(order)))).reshape(-1, words, 32)
-    bits = jnp.asarray(np.left_shift(np.uint32(1), np.arange(32, dtype=np.uint32)))
-    return jax.lax.bitcast_convert_type(jnp.sum(jnp.where(meets, bits, 0), axis=-1, dtype=jnp.uint32), jnp.int32), order
-
-
 class _Refs(NamedTuple):
     """Memory blocks read by a kernel, all of one environment."""
 
@@ -134,7 +85,7 @@ def _nearest(scene: Scene, refs: _Refs, tile_index: Any, rays: Rays, znear: Any,
     """Return the minimum of ``best`` and the keys of a tile's objects: (key,), or (depth bits, row) if rows are separate."""
     mask = raycast.code_mask(scene)
     start, direction, inverse_square = camera.ray_parts(scene, rays)
-    kinds = sorted(scene.object_types)
+    kinds = sorted(scene.object_types[row] for row in raycast.primitive_rows(scene, transparent=False))
     bare_balls = not any(
         textured for kind, textured in zip(scene.object_types, scene.atlas.mappings, strict=True) if kind == shapes.SPHERE
     )
@@ -171,14 +122,33 @@ def _nearest(scene: Scene, refs: _Refs, tile_index: Any, rays: Rays, znear: Any,
     return best
 
 
-def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
-    count = len(_Refs._fields)
-    refs, out = _Refs(*refs[:count]), list(refs[count:])
+class _Tile(NamedTuple):
+    """Pixels of a tile, [PIXELS] each, of which some may lie beyond the image, and what is nearest there.
+
+    Attributes:
+        row: Row of the pixel.
+        column: Its column.
+        inside: True within the image.
+        rays: The rays.
+        zfar: [] float32, m.
+        best: Keys, or depth bits and rows, as from `_nearest`.
+    """
+
+    row: Any
+    column: Any
+    inside: Any
+    rays: Rays
+    zfar: Any
+    best: tuple
+
+
+def _search_tile(refs: _Refs, scene: Scene, tile: tuple[int, int]) -> _Tile:
+    """Find the nearest objects of the tile that a program renders."""
     high, wide = tile
     across = np.int32(-(-scene.width // wide))
     tile_index = pl.program_id(0)
     top, left = jax.lax.div(tile_index, across) * high, jax.lax.rem(tile_index, across) * wide
-    lane = jax.lax.broadcasted_iota(jnp.int32, (_PIXELS,), 0)
+    lane = jax.lax.broadcasted_iota(jnp.int32, (PIXELS,), 0)
     row, column = top + jax.lax.div(lane, jnp.int32(wide)), left + jax.lax.rem(lane, jnp.int32(wide))
     inside = (lane < high * wide) & (row < scene.height) & (column < scene.width)
 
@@ -189,17 +159,26 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     rays = Rays(u, v)
 
     mask = raycast.code_mask(scene)
-    sky_key = (jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask
-    sky = jnp.broadcast_to(sky_key, (_PIXELS,))
+    sky = jnp.broadcast_to((jax.lax.bitcast_convert_type(zfar, jnp.int32) & ~mask) | mask, (PIXELS,))
+    best: tuple = (sky,)
     if raycast.has_separate_rows(scene):
-        none = len(scene.object_ids)
-        best, index = _nearest(scene, refs, tile_index, rays, znear, (sky, jnp.full((_PIXELS,), none, jnp.int32)))
-        hit_mask = index != none
+        best = (sky, jnp.full((PIXELS,), len(scene.object_ids), jnp.int32))
+    best = _nearest(scene, refs, tile_index, rays, znear, best)
+    return _Tile(row, column, inside, rays, zfar, best)
+
+
+def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
+    count = len(_Refs._fields)
+    refs, out = _Refs(*refs[:count]), list(refs[count:])
+    row, column, inside, rays, zfar, best = _search_tile(refs, scene, tile)
+    mask = raycast.code_mask(scene)
+    if raycast.has_separate_rows(scene):
+        index = best[1]
+        hit_mask = index != len(scene.object_ids)
     else:
-        (best,) = _nearest(scene, refs, tile_index, rays, znear, (sky,))
-        index = best & mask
+        index = best[0] & mask
         hit_mask = index != mask
-    near = jax.lax.bitcast_convert_type(best & ~mask, jnp.float32)
+    near = jax.lax.bitcast_convert_type(best[0] & ~mask, jnp.float32)
     pixel = row * scene.width + column
 
     def store(value, plane=None):
@@ -209,7 +188,7 @@ def _kernel(*refs, scene: Scene, outputs: Outputs, tile: tuple[int, int]):
     top_colour, bottom_colour = ([refs.view[index] for index in colour] for colour in (_SKY_TOP, _SKY_BOTTOM))
     texels: Any = _BlockTexels(refs.texels, refs.levels)
     inner = scene.replace(sky_top=top_colour, sky_bottom=bottom_colour, zfar=zfar, fovy=refs.view[_FOVY], texels=texels)
-    zero = jnp.zeros((_PIXELS,), jnp.float32)
+    zero = jnp.zeros((PIXELS,), jnp.float32)
     far, normal, colour = zero, (zero,) * 3, (zero,) * 3
     if outputs.rgb or outputs.depth or outputs.normals or outputs.distance:
 
@@ -314,11 +293,82 @@ def draw(
     Returns:
         The planes.
     """
+    inputs = _inputs(scene, rotation, unit, light_table)
+    pixels = scene.height * scene.width
+    # Outputs in the order in which the kernel writes them.
+    kinds = {
+        "rgb": ((3, pixels), jnp.uint8 if outputs.quantized else jnp.float32),
+        "depth": ((pixels,), jnp.float32),
+        "normals": ((3, pixels), jnp.float32),
+        "distance": ((pixels,), jnp.float32),
+        "segmentation": ((pixels,), jnp.int32),
+    }
+    out_shapes = {name: jax.ShapeDtypeStruct(*kind) for name, kind in kinds.items() if getattr(outputs, name)}
+    planes = kernel_call(
+        functools.partial(_kernel, scene=_without_arrays(scene), outputs=outputs, tile=tile_shape(scene.height, scene.width)),
+        out_shape=list(out_shapes.values()),
+        grid=(inputs.words.shape[0],),
+        in_specs=[_full_block(array.shape) for array in inputs],
+        out_specs=[_full_block(like.shape) for like in out_shapes.values()],
+        compiler_params=_COMPILER,
+        interpret=interpret,
+        name="draw_tiles",
+    )(*inputs)
+    reshaped = {
+        name: plane.reshape(*plane.shape[:-1], scene.height, scene.width)
+        for name, plane in zip(out_shapes, planes, strict=True)
+    }
+    return Planes(**{**dict.fromkeys(Planes._fields), **reshaped})
+
+
+def can_search(scene: Scene) -> bool:
+    """Return True if `nearest_primitives` searches this scene, on any platform."""
+    return bool(raycast.primitive_rows(scene, transparent=False)) and reading.CLEAR_FROM_BEHIND not in scene.transparent
+
+
+def nearest_primitives(scene: Scene, unit: shapes.UnitShapes, interpret: bool = False) -> tuple[jax.Array, jax.Array | None]:
+    """Find the nearest opaque primitive of each pixel. Not differentiable.
+
+    Args:
+        scene: Scene for which `can_search` holds, which may have other objects too.
+        unit: Rendered objects.
+        interpret: Run without a GPU, slowly.
+
+    Returns:
+        Key [H * W] int32 of the pixels, row by row, see `raycast`, and the row of the object [H * W] int32, -1 for the sky; the
+        row is None if it is part of the key.
+    """
+    inputs = _inputs(scene, jnp.eye(3, dtype=jnp.float32), unit, jnp.zeros((0, lights.COLUMNS), jnp.float32))
+    is_separate = raycast.has_separate_rows(scene)
+    pixels = jax.ShapeDtypeStruct((scene.height * scene.width,), jnp.int32)
+    planes = kernel_call(
+        functools.partial(_search_kernel, scene=_without_arrays(scene), tile=tile_shape(scene.height, scene.width)),
+        out_shape=[pixels] * (2 if is_separate else 1),
+        grid=(inputs.words.shape[0],),
+        in_specs=[_full_block(array.shape) for array in inputs],
+        out_specs=[_full_block(pixels.shape)] * (2 if is_separate else 1),
+        compiler_params=_COMPILER,
+        interpret=interpret,
+        name="find_primitive",
+    )(*inputs)
+    return planes[0], jnp.where(planes[1] == len(scene.object_ids), -1, planes[1]) if is_separate else None
+
+
+def _search_kernel(*refs, scene: Scene, tile: tuple[int, int]):
+    count = len(_Refs._fields)
+    found = _search_tile(_Refs(*refs[:count]), scene, tile)
+    for out, plane in zip(refs[count:], found.best, strict=True):
+        plgpu.store(out.at[found.row * scene.width + found.column], plane, mask=found.inside)
+
+
+def _inputs(scene: Scene, rotation: jax.Array, unit: shapes.UnitShapes, light_table: jax.Array) -> _Refs:
+    """Return the arrays that a kernel reads; arguments as in `draw`."""
     tile = tile_shape(scene.height, scene.width)
-    words, order = tile_words(scene, rectangles(scene, unit), tile)
+    rows = raycast.primitive_rows(scene, transparent=False)
+    words, order = tile_words(scene, rectangles(scene, unit), tile, rows)
     ids = np.array(scene.object_ids, np.int32)
     lens, sky = jnp.stack(camera.lens(scene)), (scene.sky_top, scene.sky_bottom)
-    inputs = _Refs(
+    return _Refs(
         words=words,
         order=jnp.asarray(order),
         axes=unit.axes,
@@ -332,31 +382,6 @@ def draw(
         view=jnp.concatenate([lens, jnp.stack([scene.znear, scene.zfar]), rotation.reshape(9), *sky, scene.fovy[None]]),
         ids=jnp.asarray(ids),
     )
-    pixels = scene.height * scene.width
-    # Outputs in the order in which the kernel writes them.
-    kinds = {
-        "rgb": ((3, pixels), jnp.uint8 if outputs.quantized else jnp.float32),
-        "depth": ((pixels,), jnp.float32),
-        "normals": ((3, pixels), jnp.float32),
-        "distance": ((pixels,), jnp.float32),
-        "segmentation": ((pixels,), jnp.int32),
-    }
-    out_shapes = {name: jax.ShapeDtypeStruct(*kind) for name, kind in kinds.items() if getattr(outputs, name)}
-    planes = kernel_call(
-        functools.partial(_kernel, scene=_without_arrays(scene), outputs=outputs, tile=tile),
-        out_shape=list(out_shapes.values()),
-        grid=(words.shape[0],),
-        in_specs=[_full_block(array.shape) for array in inputs],
-        out_specs=[_full_block(like.shape) for like in out_shapes.values()],
-        compiler_params=_COMPILER,
-        interpret=interpret,
-        name="draw_tiles",
-    )(*inputs)
-    reshaped = {
-        name: plane.reshape(*plane.shape[:-1], scene.height, scene.width)
-        for name, plane in zip(out_shapes, planes, strict=True)
-    }
-    return Planes(**{**dict.fromkeys(Planes._fields), **reshaped})
 
 
 def probe() -> None:

@@ -157,14 +157,7 @@ def bounds(mj_model: mujoco.MjModel) -> np.ndarray:
     return np.concatenate([mj_model.geom_rbound, sites, mj_model.tendon_width])
 
 
-def check_supported(
-    mj_model: mujoco.MjModel,
-    types: np.ndarray,
-    drawn: np.ndarray,
-    groups: tuple[int, ...],
-    leave_out: tuple[str, ...],
-    shadows: bool,
-) -> None:
+def check_supported(mj_model: mujoco.MjModel, groups: tuple[int, ...], leave_out: tuple[str, ...]) -> None:
     """Raise a one-line ValueError that lists all visible objects that are not supported, with a hint."""
     deformables = (
         ("skin", mj_model.skin_group, mujoco.mjtObj.mjOBJ_SKIN),
@@ -175,11 +168,6 @@ def check_supported(
         if visible:
             names = ", ".join(f"{kind} {mujoco.mj_id2name(mj_model, accessor, i) or f'number {i}'}" for i in visible)
             raise ValueError(f"cannot render {names}: move it to a hidden group, or use leave_out=({kind!r},)")
-    if shadows:
-        fine = np.isin(types, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD))
-        casting = [object_name(mj_model, int(index)) for index in np.flatnonzero(drawn & fine)]
-        if casting:
-            raise ValueError(f"cannot render shadows of {', '.join(casting)} (triangles): use shadows=False, or leave_out")
 
 
 def object_name(mj_model: mujoco.MjModel, index: int) -> str:

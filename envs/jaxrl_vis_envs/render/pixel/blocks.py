@@ -162,15 +162,26 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> Nearest:
     unit = jax.lax.stop_gradient(unit)
     bounds = jax.lax.optimization_barrier(triangles.opaque_bounds(jax.lax.stop_gradient(scene), unit))
 
-    def add_triangles(rays: Rays, key: jax.Array, row: jax.Array | None) -> Nearest:
-        depth, triangle, owner = triangles.nearest_triangle(
-            scene, unit, rays, raycast.decode(scene, key, row)[0], bounds=bounds
-        )
-        mask = raycast.code_mask(scene)
-        triangle_key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
-        is_triangle = triangle >= 0
-        return Nearest(
-            jnp.where(is_triangle, triangle_key, key), None if row is None else jnp.where(is_triangle, owner, row), triangle
-        )
+    def with_triangles(rays: Rays, key: jax.Array, row: jax.Array | None) -> Nearest:
+        depth = raycast.decode(scene, key, row)[0]
+        return add_triangles(scene, key, row, triangles.nearest_triangle(scene, unit, rays, depth, bounds=bounds))
 
-    return scan(add_triangles, rays, key, row)
+    return scan(with_triangles, rays, key, row)
+
+
+def add_triangles(scene: Scene, key: jax.Array, row: jax.Array | None, found: tuple) -> Nearest:
+    """Return what is nearest of primitives and triangles.
+
+    Args:
+        scene: The scene.
+        key: [P] int32, keys of the nearest primitives.
+        row: [P] int32, their rows if the scene has separate rows, else None.
+        found: Nearest triangles in front of them, from `triangles.nearest_triangle`.
+    """
+    depth, triangle, owner = found
+    mask = raycast.code_mask(scene)
+    triangle_key = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~mask) | (owner & mask)
+    is_triangle = triangle >= 0
+    return Nearest(
+        jnp.where(is_triangle, triangle_key, key), None if row is None else jnp.where(is_triangle, owner, row), triangle
+    )

@@ -7,6 +7,7 @@ tessellates and lights likewise, are lit at every pixel. There are no reflection
 (MuJoCo's renderer does not support point lights).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -21,7 +22,10 @@ from jaxrl_vis_envs.render.pixel.arithmetic import Vector, clip_to_unit, normali
 from jaxrl_vis_envs.render.pixel.lookup import Row
 from jaxrl_vis_envs.render.pixel.raycast import entry
 from jaxrl_vis_envs.render.pixel.surface import Hit
+from jaxrl_vis_envs.render.pixel.triangles import Segments
 from jaxrl_vis_envs.render.scene import Scene
+
+Blocked = Callable[[Segments], jax.Array]
 
 # Ambient light that MuJoCo uses in a scene without any light.
 _AMBIENT_WITHOUT_LIGHTS = 0.3
@@ -29,15 +33,29 @@ _AMBIENT_WITHOUT_LIGHTS = 0.3
 _SKY_DISTANCE = 0.7
 
 
-def shade(scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, rays: Rays) -> Vector:
+def shade(
+    scene: Scene,
+    unit: shapes.UnitShapes | None,
+    lights: list[lighting.Light],
+    row: Row,
+    hit: Hit,
+    rays: Rays,
+    blocked: Blocked | None = None,
+) -> Vector:
     """Compute the colour of surfaces, including their textures; arguments and result as in `light_surface`."""
-    colour = light_surface(scene, unit, lights, row, hit, rays)
+    colour = light_surface(scene, unit, lights, row, hit, rays, blocked)
     texture = texturing.texture_colour(scene, row, hit)
     return colour if texture is None else tuple(value * texel for value, texel in zip(colour, texture, strict=True))
 
 
 def light_surface(
-    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, rays: Rays
+    scene: Scene,
+    unit: shapes.UnitShapes | None,
+    lights: list[lighting.Light],
+    row: Row,
+    hit: Hit,
+    rays: Rays,
+    blocked: Blocked | None = None,
 ) -> Vector:
     """Compute the colour of surfaces without their textures.
 
@@ -48,6 +66,7 @@ def light_surface(
         row: Object at each pixel.
         hit: Intersection at each pixel.
         rays: [P].
+        blocked: Function that returns True where segments [P] meet a triangle; None if there are no triangles or no shadows.
 
     Returns:
         Red, green and blue, each [P] float32 in [0, 1].
@@ -59,23 +78,37 @@ def light_surface(
         else:
             to_camera = normalized((-u, -v, jnp.ones_like(u)))
         return _light_points(scene, unit, lights, row, hit, to_camera)
+    # Corners are lit, but shadows fall on points.
+    lit = [_shadow_mask(scene, unit, light, hit, blocked) if light.shadows else None for light in lights]
     colour: Vector = (0.0, 0.0, 0.0)
     for share, corner in surface.corners(row, hit):
         to_camera = normalized(tuple(-p for p in corner.point))
-        corner_colour = _light_points(scene, unit, lights, row, corner, to_camera)
+        corner_colour = _light_points(scene, unit, lights, row, corner, to_camera, lit)
         colour = tuple(total + share * value for total, value in zip(colour, corner_colour, strict=True))
     return colour
 
 
 def _light_points(
-    scene: Scene, unit: shapes.UnitShapes | None, lights: list[lighting.Light], row: Row, hit: Hit, to_camera: Vector
+    scene: Scene,
+    unit: shapes.UnitShapes | None,
+    lights: list[lighting.Light],
+    row: Row,
+    hit: Hit,
+    to_camera: Vector,
+    lit: list[jax.Array | None] | None = None,
 ) -> Vector:
-    """Compute the colour of surface points without textures, each [P] float32 in [0, 1]."""
+    """Compute the colour of surface points without textures, each [P] float32 in [0, 1].
+
+    ``lit`` has the `_shadow_mask` of each light; None to compute it from ``hit``.
+    """
     coloured: list[Any] = [row.emission if lights else row.emission + _AMBIENT_WITHOUT_LIGHTS] * 3
     highlight: list[Any] = [0.0] * 3
-    for light in lights:
-        lit = _shadow_mask(scene, unit, light, hit) if light.shadows else None
-        factors = lighting.light_factors(light, hit.point, hit.normal, to_camera, row.exponent, lit)
+    for number, light in enumerate(lights):
+        if lit is not None:
+            mask = lit[number]
+        else:
+            mask = _shadow_mask(scene, unit, light, hit, None) if light.shadows else None
+        factors = lighting.light_factors(light, hit.point, hit.normal, to_camera, row.exponent, mask)
         for channel in range(3):
             coloured[channel] += factors[0] * light.ambient[channel] + factors[1] * light.diffuse[channel]
             if light.highlights:
@@ -86,7 +119,9 @@ def _light_points(
     )
 
 
-def _shadow_mask(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hit: Hit) -> jax.Array:
+def _shadow_mask(
+    scene: Scene, unit: shapes.UnitShapes | None, light: lighting.Light, hit: Hit, blocked: Blocked | None
+) -> jax.Array:
     """Return 0 where a geom or tendon occludes the light, else 1: [P] float32. Sites cast no shadow."""
     assert unit is not None
     to_light, distance, _ = lighting.light_vector(light, hit.point)
@@ -95,13 +130,18 @@ def _shadow_mask(scene: Scene, unit: shapes.UnitShapes | None, light: lighting.L
     margin = 1e-4 * (1.0 - start[2])
     shadowed = jnp.zeros(start[2].shape, bool)
     for index in range(len(scene.object_ids)):
-        if 0 <= scene.object_ids[index] - scene.geom_count < scene.site_count:
+        is_site = 0 <= scene.object_ids[index] - scene.geom_count < scene.site_count
+        if is_site or scene.object_types[index] in (shapes.MESH, shapes.HFIELD):
             continue
         axes = [[unit.axes[index, i, j] for j in range(3)] for i in range(3)]
         values = ([unit.origin[index, i] for i in range(3)], axes, unit.extra[index], unit.extra_square[index])
         t, meets = entry(scene.object_types[index], values, start, to_light, 1.0)
         blocks = meets & (t > margin)
         shadowed = shadowed | (blocks if distance is None else blocks & (t < distance))
+    if blocked is not None:
+        farthest = jnp.full_like(margin, np.inf) if distance is None else distance
+        to_light = tuple(jnp.broadcast_to(component, margin.shape) for component in to_light)
+        shadowed = shadowed | blocked(Segments(start, to_light, margin, jax.lax.stop_gradient(farthest)))
     return 1.0 - shadowed.astype(jnp.float32)
 
 

@@ -15,16 +15,34 @@ from jaxrl_vis_envs.render import camera
 from jaxrl_vis_envs.render.camera import Rays
 from jaxrl_vis_envs.render.model import meshes, reading
 from jaxrl_vis_envs.render.pixel import shapes
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot, normalized
 from jaxrl_vis_envs.render.scene import Scene
 
-# Relative tolerance by which triangles extend beyond their edges, so that no ray passes between adjacent ones.
-_SEAM = 1e-5
+SEAM = 1e-5
+"""Relative tolerance by which triangles extend beyond their edges, so that no ray passes between adjacent ones."""
+
 # Horizontal and vertical offset of a second ray in `next_triangle`, relative to half the image's height. Few edges have that
 # direction, and it is far larger than the rounding error of an edge.
 _OFFSET = (2e-5, -6e-6)
 # Part of a pixel by which the bounds of a cluster are rounded outwards, more than the rounding error of a large image.
 _ROUNDING = 1e-2
 _NUMBER = meshes.CLUSTER - 1  # mask of the lowest bits of a depth, which hold a triangle's index in its cluster
+
+
+class Segments(NamedTuple):
+    """Parts of rays in the camera's frame, [P] float32 each; empty where ``farthest`` is not above ``nearest``.
+
+    Attributes:
+        start: Three components, metres.
+        direction: Three components, unit vectors.
+        nearest: Distance from the start at which the part begins, m.
+        farthest: Distance at which it ends, m; may be infinite.
+    """
+
+    start: Vector
+    direction: Vector
+    nearest: jax.Array
+    farthest: jax.Array
 
 
 class Bounds(NamedTuple):
@@ -197,11 +215,43 @@ def next_triangle(
     return depths, jnp.where(rows == unset, -1, rows)
 
 
+def may_meet(segments: Segments, middle: jax.Array, radius: jax.Array) -> jax.Array:
+    """Test which spheres the segments may meet (conservative).
+
+    Args:
+        segments: [P].
+        middle: [K, 3] float32, m, centres in the camera's frame.
+        radius: [K] float32, m.
+
+    Returns:
+        [K] bool.
+    """
+    valid = segments.farthest > segments.nearest
+    # By components, which XLA fuses with the comparisons: tiles times spheres would be large arrays.
+    low = [jnp.min(jnp.where(valid, component, np.inf)) for component in segments.start]
+    high = [jnp.max(jnp.where(valid, component, -np.inf)) for component in segments.start]
+    size = tuple(one - other for one, other in zip(high, low, strict=True))
+    reach = radius * (1.0 + 1e-4) + 0.5 * jnp.sqrt(dot(size, size)) + 1e-5
+    axis = normalized(tuple(jnp.sum(jnp.where(valid, component, 0.0)) for component in segments.direction))
+    turn = tuple(component - a for component, a in zip(segments.direction, axis, strict=True))
+    # At a distance of t, segments are within the radius of their starts plus spread * t around the axis.
+    spread = jnp.sqrt(jnp.max(jnp.where(valid, dot(turn, turn), 0.0)))
+    farthest = jnp.max(jnp.where(valid, segments.farthest, 0.0))
+    # Not a number without any segment.
+    offset = tuple(middle[:, i] - 0.5 * (low[i] + high[i]) for i in range(3))
+    along = dot(offset, axis)
+    aside = tuple(o - along * a for o, a in zip(offset, axis, strict=True))
+    beyond = (along + reach) / jnp.maximum(1.0 - spread, 0.1)
+    is_near = (jnp.sqrt(dot(aside, aside)) <= reach + spread * beyond) & (along >= -reach)
+    is_near &= along <= farthest * (1.0 + spread) + reach
+    return is_near | ((spread > 0.9) & jnp.any(valid))
+
+
 def _intersect_cluster(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, rays: Rays) -> jax.Array:
     """Return the depth [P] of a cluster's nearest triangle, with its index in the lowest bits; infinite if there is none."""
     best = jnp.full(rays.u.shape, np.iinfo(np.int32).max, jnp.int32)
     for number, (t, margin, is_front) in enumerate(_intersect_triangles(scene, unit, cluster, rays)):
-        meets = is_front & (margin >= -_SEAM)
+        meets = is_front & (margin >= -SEAM)
         key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~_NUMBER) | number
         best = jnp.minimum(best, jnp.where(meets, key, best))
     infinite = np.float32(np.inf).view(np.int32)

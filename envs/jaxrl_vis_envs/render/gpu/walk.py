@@ -1,0 +1,288 @@
+"""GPU kernel in which rays walk bounding volume hierarchies (Pallas with Triton), see `hierarchies`.
+
+One program has one warp, and the rays of a tile of 32 pixels. Every lane walks on its own the objects that its ray may meet, in
+the order of the tile's bits, and waits for no other lane to finish an object: a step is some nodes, then the triangles of a
+leaf for the lanes that have reached one. The same code runs as plain JAX, with arrays in the place of memory blocks.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton as plgpu
+
+from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
+from jaxrl_vis_envs.render import camera
+from jaxrl_vis_envs.render.model import hierarchies
+from jaxrl_vis_envs.render.pixel.arithmetic import Vector, dot
+from jaxrl_vis_envs.render.pixel.triangles import SEAM
+
+TILE = (4, 8)
+"""Rows and columns of a tile. Tuned on an H100, as are the following."""
+
+LANES = 32
+"""Rays of a program, those of one tile."""
+# Nodes that a lane may visit, and objects that it may look at, in one step.
+_NODES, _OBJECTS = 4, 2
+_COMPILER = plgpu.CompilerParams(num_warps=1, num_stages=1)
+# Replaces ray components of 0, by which no finite number may be divided.
+_TINY = 1e-20
+# Relative error of the depths at which a ray meets the faces of a box: one within a face rounds either way.
+_ROUNDING = 1e-6
+
+
+class Refs(NamedTuple):
+    """Memory blocks read by a program: N objects, and P rays, `LANES` of each tile.
+
+    Attributes:
+        words: [tiles, words], bits of the objects that may be met from a tile.
+        order: [N], object of each bit; the following two are in this order, all others in that of the objects.
+        near: [N], ray parameter before which no ray meets the object.
+        ball: [N, 4], bounding sphere.
+        pose: [N, 12], map from the camera's frame to the object's: nine numbers of the axes, and the origin.
+        first: [N], first node, in the octant of most rays.
+        start: [3, P], rays in the camera's frame.
+        direction: [3, P].
+        nearest: [P], ray parameter before which no intersection counts.
+        farthest: [P], ray parameter from which no intersection counts.
+        steps, frame, nodes, maps: See `hierarchies.Hierarchies`.
+    """
+
+    words: Any
+    order: Any
+    near: Any
+    ball: Any
+    pose: Any
+    first: Any
+    start: Any
+    direction: Any
+    nearest: Any
+    farthest: Any
+    steps: Any
+    frame: Any
+    nodes: Any
+    maps: Any
+
+
+class _Ray(NamedTuple):
+    """Rays in the frames of the objects that they walk: points are ``start + t * direction``. Vectors of [L] float32.
+
+    They meet the face of a box at c cells at ``t = c * inverse - begin``, axis by axis.
+    """
+
+    start: Vector
+    direction: Vector
+    inverse: Vector
+    begin: Vector
+
+
+class _State(NamedTuple):
+    """State of the lanes, [L] each.
+
+    Attributes:
+        word: Number of the next word of objects.
+        left: Bits of the present word's objects that the lane has not looked at.
+        node, end: Next node, and the node at which the object is finished.
+        walked: Object that is walked.
+        ray: The ray in its frame.
+        best: Ray parameter of the nearest intersection.
+        hit: Its object, -1 for none.
+        row: Its row of ``maps``.
+    """
+
+    word: jax.Array
+    left: jax.Array
+    node: jax.Array
+    end: jax.Array
+    walked: jax.Array
+    ray: _Ray
+    best: jax.Array
+    hit: jax.Array
+    row: jax.Array
+
+
+def by_kernel(refs: Refs, any_hit: bool, interpret: bool = False) -> list[jax.Array]:
+    """Let rays walk, by the kernel.
+
+    Args:
+        refs: Arrays that describe rays and objects.
+        any_hit: Find any intersection, not the nearest.
+        interpret: Run without a GPU, slowly.
+
+    Returns:
+        Planes [P] of each ray: the parameter (float32) of its nearest intersection, the object (int32) that it meets, -1 for
+        none, and the row of ``maps`` (int32). With ``any_hit``, only the object.
+    """
+    kinds = [jnp.int32] if any_hit else [jnp.float32, jnp.int32, jnp.int32]
+    return kernel_call(
+        functools.partial(_kernel, any_hit=any_hit),
+        out_shape=[jax.ShapeDtypeStruct(refs.nearest.shape, kind) for kind in kinds],
+        grid=(refs.words.shape[0],),
+        in_specs=[_whole(array.shape) for array in refs],
+        out_specs=[_whole(refs.nearest.shape) for _ in kinds],
+        compiler_params=_COMPILER,
+        interpret=interpret,
+        name="find_blocker" if any_hit else "find_triangle",
+    )(*refs)
+
+
+def in_plain_jax(refs: Refs, any_hit: bool) -> list[jax.Array]:
+    """Let rays walk as `by_kernel`, all at once. Those of one call should be few, and take similar ways."""
+    ray = jnp.arange(refs.nearest.shape[0], dtype=jnp.int32)
+    return _walk(refs, ray // LANES, ray, any_hit)
+
+
+def _whole(shape: tuple[int, ...]) -> pl.BlockSpec:
+    """Return a block that gives every program the whole array."""
+    return pl.BlockSpec(shape, lambda tile_index: (0,) * len(shape))
+
+
+def _kernel(*refs: Any, any_hit: bool) -> None:
+    ins, outs = Refs(*refs[: len(Refs._fields)]), refs[len(Refs._fields) :]
+    tile = pl.program_id(0)
+    ray = tile * LANES + jax.lax.broadcasted_iota(jnp.int32, (LANES,), 0)
+    for out, value in zip(outs, _walk(ins, tile, ray, any_hit), strict=True):
+        plgpu.store(out.at[ray], value)
+
+
+def _walk(refs: Refs, tile: jax.Array, ray: jax.Array, any_hit: bool) -> list[jax.Array]:
+    """Let some rays walk, see `by_kernel`.
+
+    Args:
+        refs: Memory blocks of a kernel, or arrays.
+        tile: [] or [L] int32, number of the rays' tile.
+        ray: [L] int32, numbers of the rays.
+        any_hit: Find any intersection, not the nearest.
+    """
+    everywhere = jnp.ones(ray.shape, bool)
+    start, direction = (tuple(_gather(ref, everywhere, axis, ray) for axis in range(3)) for ref in (refs.start, refs.direction))
+    nearest, farthest = _gather(refs.nearest, everywhere, ray), _gather(refs.farthest, everywhere, ray)
+    words = refs.words.shape[1]
+
+    def is_looking(state: _State) -> jax.Array:
+        return (state.word < words) | (state.left != 0)
+
+    def going(state: _State) -> jax.Array:
+        return _any((state.node < state.end) | is_looking(state))
+
+    def advance(state: _State) -> _State:
+        is_idle = (state.node >= state.end) & is_looking(state)
+        state = jax.lax.cond(_any(is_idle), lambda: _next_object(refs, tile, start, direction, state), lambda: state)
+        state, leaf = _visit_nodes(refs, nearest, state)
+        state = jax.lax.cond(_any(leaf >= 0), lambda: _test_leaf(refs, nearest, state, leaf), lambda: state)
+        if not any_hit:
+            return state
+        done = state.hit >= 0
+        return state._replace(
+            word=jnp.where(done, words, state.word),
+            left=jnp.where(done, 0, state.left),
+            node=jnp.where(done, state.end, state.node),
+        )
+
+    zero, none = jnp.zeros(ray.shape, jnp.float32), jnp.zeros(ray.shape, jnp.int32)
+    begin = _State(none, none, none, none, none, _Ray(*((zero,) * 3,) * 4), farthest, none - 1, none)
+    state = jax.lax.while_loop(going, advance, begin)
+    return [state.hit] if any_hit else [state.best, state.hit, state.row]
+
+
+def _any(mask: jax.Array) -> jax.Array:
+    """Return True if a lane's mask is set, [] bool."""
+    return jnp.max(mask.astype(jnp.int32)) > 0
+
+
+def _gather(ref: Any, mask: jax.Array, *place: Any) -> jax.Array:
+    """Load the element at a place of each lane [L] where ``mask`` is set, 0 elsewhere."""
+    place = tuple(jnp.broadcast_to(jnp.asarray(index, jnp.int32), mask.shape) for index in place)
+    if isinstance(ref, jax.Array):
+        return jnp.where(mask, ref.at[place].get(mode="promise_in_bounds"), 0)
+    return plgpu.load(ref.at[place], mask=mask, other=0.0 if ref.dtype == jnp.float32 else 0)
+
+
+def _next_object(refs: Refs, tile: jax.Array, start: Vector, direction: Vector, state: _State) -> _State:
+    """Give idle lanes the next object whose bounding sphere their ray meets in front of its hit, if one of the next few is."""
+    words = refs.words.shape[1]
+    inverse_square = 1.0 / dot(direction, direction)
+    idle, (word, left, walked) = state.node >= state.end, state[:2] + state[4:5]
+    fresh = jnp.zeros(idle.shape, bool)
+    for _ in range(_OBJECTS):
+        looks = idle & ~fresh
+        empty = looks & (left == 0) & (word < words)
+        left = jnp.where(empty, _gather(refs.words, empty, tile, jnp.where(empty, word, 0)), left)
+        word = jnp.where(empty, word + 1, word)
+        looks &= left != 0
+        place = jnp.where(looks, 32 * word - 1 - jax.lax.clz(left & -left), 0)
+        left = jnp.where(looks, left & (left - 1), left)
+        is_nearer = _gather(refs.near, looks, place) < state.best
+        middle = tuple(_gather(refs.ball, looks, place, axis) - start[axis] for axis in range(3))
+        along = dot(middle, direction) * inverse_square
+        apart = tuple(m - along * d for m, d in zip(middle, direction, strict=True))
+        radius = _gather(refs.ball, looks, place, 3)
+        is_ahead = (along > 0.0) | (dot(middle, middle) <= radius * radius)
+        takes = looks & is_nearer & is_ahead & (dot(apart, apart) <= radius * radius)
+        walked = jnp.where(takes, _gather(refs.order, takes, place), walked)
+        fresh |= takes
+        # Objects are sorted: all that follow are farther away, too.
+        stops = looks & ~is_nearer
+        word, left = jnp.where(stops, words, word), jnp.where(stops, 0, left)
+    state = state._replace(word=word, left=left, walked=walked)
+    return jax.lax.cond(_any(fresh), lambda: _enter(refs, start, direction, state, fresh), lambda: state)
+
+
+def _enter(refs: Refs, start: Vector, direction: Vector, state: _State, fresh: jax.Array) -> _State:
+    """Move ``fresh`` lanes to the root of the object that they now walk, and their rays to its frame."""
+    pose = [_gather(refs.pose, fresh, state.walked, column) for column in range(12)]
+    frame = [_gather(refs.frame, fresh, state.walked, column) for column in range(6)]
+    axes = [pose[3 * row : 3 * row + 3] for row in range(3)]
+    own_direction = camera.multiply(axes, direction)
+    own_start = tuple(o + s for o, s in zip(pose[9:], camera.multiply(axes, start), strict=True))
+    over = tuple(1.0 / jnp.where(jnp.abs(d) < _TINY, _TINY, d) for d in own_direction)
+    inverse = tuple(cell * o for cell, o in zip(frame[3:], over, strict=True))
+    begin = tuple((s - low) * o for s, low, o in zip(own_start, frame[:3], over, strict=True))
+    ray = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), _Ray(own_start, own_direction, inverse, begin), state.ray)
+    first, steps = (_gather(ref, fresh, state.walked) for ref in (refs.first, refs.steps))
+    return state._replace(node=jnp.where(fresh, first, state.node), end=jnp.where(fresh, first + steps, state.end), ray=ray)
+
+
+def _visit_nodes(refs: Refs, nearest: jax.Array, state: _State) -> tuple[_State, jax.Array]:
+    """Visit some nodes; return the state and, for lanes that have met a leaf, its first row of ``maps`` [L], -1 for others."""
+    node, leaf = state.node, jnp.full_like(state.node, -1)
+    for _ in range(_NODES):
+        active = (node < state.end) & (leaf < 0)
+        low, high, link = (_gather(refs.nodes, active, jnp.where(active, node, 0), word) for word in range(3))
+        meets = active & _meets_box(state, low, high, nearest)
+        is_leaf = link < 0
+        leaf = jnp.where(meets & is_leaf, -1 - link, leaf)
+        # A leaf has no subtree: the next node follows in any case.
+        node = jnp.where(active, jnp.where(meets | is_leaf, node + 1, link), node)
+    return state._replace(node=node), leaf
+
+
+def _meets_box(state: _State, low: jax.Array, high: jax.Array, nearest: jax.Array) -> jax.Array:
+    """Return True where rays meet the boxes of nodes in front of their hit."""
+    enter, leave = nearest, state.best
+    for axis in range(3):
+        faces = (((corner >> 10 * axis) & hierarchies.CELLS).astype(jnp.float32) for corner in (low, high))
+        one, other = (face * state.ray.inverse[axis] - state.ray.begin[axis] for face in faces)
+        enter, leave = jnp.maximum(enter, jnp.minimum(one, other)), jnp.minimum(leave, jnp.maximum(one, other))
+    return enter <= leave * (1.0 + _ROUNDING)
+
+
+def _test_leaf(refs: Refs, nearest: jax.Array, state: _State, leaf: jax.Array) -> _State:
+    """Intersect rays with the triangles of leaves, given by their first row of ``maps`` [L], -1 for none."""
+    (start, direction), best, hit, row = state.ray[:2], state.best, state.hit, state.row
+    for number in range(hierarchies.LEAF):
+        place = jnp.where(leaf >= 0, leaf + number, 0)
+        numbers = tuple(_gather(refs.maps, leaf >= 0, place, column) for column in range(12))
+        slope = dot(numbers[8:11], direction)
+        t = -(dot(numbers[8:11], start) + numbers[11]) / jnp.where(slope < 0.0, slope, -1.0)
+        point = tuple(s + t * d for s, d in zip(start, direction, strict=True))
+        first, second = (dot(numbers[4 * i : 4 * i + 3], point) + numbers[4 * i + 3] for i in range(2))
+        margin = jnp.minimum(jnp.minimum(first, second), 1.0 - first - second)
+        # Of two objects at the same depth, the one listed first is visible.
+        is_nearer = (t < best) | ((t == best) & (state.walked < hit))
+        meets = (leaf >= 0) & (slope < 0.0) & (margin >= -SEAM) & (t > nearest) & is_nearer
+        best, hit = jnp.where(meets, t, best), jnp.where(meets, state.walked, hit)
+        row = jnp.where(meets, place, row)
+    return state._replace(best=best, hit=hit, row=row)
