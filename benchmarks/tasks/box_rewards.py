@@ -16,8 +16,8 @@ import numpy as np
 import jaxrl_vis_envs
 from benchmarks.tasks import controllers, environments
 from jaxrl_vis_envs import goals
+from jaxrl_vis_envs.goals import object_mask
 from jaxrl_vis_envs.physics import mjx_model
-from jaxrl_vis_envs.pixels import object_mask
 
 _PAIRS = 20_000
 _EDGES = (0.0, 1e-4, 1e-3, 5e-3, 0.02, np.inf)  # m

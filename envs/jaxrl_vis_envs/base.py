@@ -84,7 +84,7 @@ class GoalEnv(abc.ABC):
     difficulty: float | None = None  # mean distance from start to goal, in multiples of `threshold`
     metric_names: tuple[str, ...] = ("success", "goal_distance")  # keys of `State.metrics` logged at the last step, as means
     frame_stack: int = 1  # F, number of most recent images stacked in an observation
-    marks_object: bool = False  # images mark the pixels of the object that goals are about (`pixels.object_mask`)
+    marks_object: bool = False  # images mark the pixels of the object that goals are about (`goals.object_mask`)
 
     if not TYPE_CHECKING:  # with this method, type checkers would accept any attribute
 

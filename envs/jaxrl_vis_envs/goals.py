@@ -4,6 +4,8 @@ There are two rewards. The *oracle* compares true states within a threshold (the
 only if the observation equals the goal in every element (thesis, equation 5.4), so it needs no state estimate and has no false
 positives. Arrays may have any leading batch axes; only the axes of one goal are reduced. NumPy arrays are scored with NumPy, so
 that a learner on the host (see `adapters`) needs neither transfers nor compilation.
+
+Images can mark the pixels of the object that a goal is about (`mark_object`), and indicators compare only these.
 """
 
 from typing import Any
@@ -99,3 +101,13 @@ def indicator_reward(
         allowed = int((1.0 - share) * np.prod(goal.shape[-num_axes:]) + 1e-6)  # 0.99 has no exact binary representation
         equal = numpy.sum(difference > tolerance, axis=axes) <= allowed
     return numpy.where(equal, positive, negative).astype(jnp.float32)
+
+
+def mark_object(image: jax.Array, mask: jax.Array) -> jax.Array:
+    """Write a mask [H, W] bool into the lowest bit of the first channel of an image [C, H, W] uint8."""
+    return image.at[0].set(image[0] & 0xFE | mask.astype(jnp.uint8))
+
+
+def object_mask(image: jax.Array) -> jax.Array:
+    """Read the mask that `mark_object` wrote, of a stack the newest image's: [..., C, H, W] uint8 -> [..., 1, H, W] bool."""
+    return (image[..., :1, :, :] & 1).astype(bool)

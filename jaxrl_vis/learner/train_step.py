@@ -41,7 +41,7 @@ from jaxrl_vis.learner.resolved import Resolved, resolve
 from jaxrl_vis.types import Episodes, LoopState, Metrics, ReplayState, Statistics, TrainState
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.compiling.compilation import targets_cpu, tracing_for_default_device
-from jaxrl_vis_envs.pixels import object_mask
+from jaxrl_vis_envs.goals import object_mask
 
 JIT_OPTIONS: dict[str, dict[str, Any]] = {"init": {"runs_once": True}, "learn": {"donate_argnums": 0}}
 """Further arguments of `jaxrl_vis_envs.jit`, by program."""

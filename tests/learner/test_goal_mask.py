@@ -15,7 +15,7 @@ from jaxrl_vis.learner.memory.rewards import make_reward
 from jaxrl_vis.learner.memory.sampling import Choice, Sampler
 from jaxrl_vis.types import Batch, Episodes
 from jaxrl_vis_envs import goals
-from jaxrl_vis_envs.pixels import object_mask
+from jaxrl_vis_envs.goals import object_mask
 
 # Places of the box beside the gripper's start (m), and whether the arm is lifted as in goal images or where it starts.
 PLACES = {

@@ -173,6 +173,7 @@ def test_nothing_imports_the_folder_of_sources() -> None:
 def test_leaves_load_no_mujoco(clean_environment: dict[str, str]) -> None:
     code = """
 import sys
+from jaxrl_vis import indicator
 from jaxrl_vis.learner import auxtasks
 from jaxrl_vis.learner.ddpg import losses
 from jaxrl_vis.learner.networks import networks

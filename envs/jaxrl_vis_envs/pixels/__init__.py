@@ -20,7 +20,6 @@ from jaxrl_vis_envs.pixels.observations import (
     encode_depth,
     encode_zbuffer,
     image_observer,
-    object_mask,
 )
 from jaxrl_vis_envs.pixels.views import OUTPUTS, Views
 from jaxrl_vis_envs.pixels.wrapping import PixelEnv, wrap
@@ -38,6 +37,5 @@ __all__ = [
     "encode_depth",
     "encode_zbuffer",
     "image_observer",
-    "object_mask",
     "wrap",
 ]

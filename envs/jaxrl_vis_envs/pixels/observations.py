@@ -8,8 +8,8 @@ outside. With ``depth_encoding="zbuffer"`` it is the content of OpenGL's depth b
 states are stored as joint positions (`State.history`) and rendered again: rendering is cheaper than the physics, and the state
 contains no images.
 
-If an object is marked, the lowest bit of the first channel is 1 in its pixels and 0 elsewhere (`object_mask`). The shape of an
-observation and the size of a replay thus stay the same, and no pixel changes by more than one grey level.
+If an object is marked, the lowest bit of the first channel is 1 in its pixels and 0 elsewhere (`goals.object_mask`). The shape
+of an observation and the size of a replay thus stay the same, and no pixel changes by more than one grey level.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 
 from jaxrl_vis_envs import checks
+from jaxrl_vis_envs.goals import mark_object
 from jaxrl_vis_envs.physics import mjx_model
 from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.randomization import Domain, varied_scene
@@ -129,22 +130,12 @@ def image_observer(mj_model: mujoco.MjModel, camera: str, config: PixelsConfig, 
         mj_model: MuJoCo model.
         camera: Name of one of its cameras.
         config: Size, channels, depth range, frame stack.
-        marked: Name of the body whose pixels are marked (`object_mask`); None for none.
+        marked: Name of the body whose pixels are marked (`goals.object_mask`); None for none.
 
     Raises:
         ValueError: There is no such camera, or something in its view cannot be rendered.
     """
     return ImageObserver(mj_model, camera, config, marked)
-
-
-def mark_object(image: jax.Array, mask: jax.Array) -> jax.Array:
-    """Write a mask [H, W] bool into the lowest bit of the first channel of an image [C, H, W] uint8."""
-    return image.at[0].set(image[0] & 0xFE | mask.astype(jnp.uint8))
-
-
-def object_mask(image: jax.Array) -> jax.Array:
-    """Read the mask that `mark_object` wrote, of a stack the newest image's: [..., C, H, W] uint8 -> [..., 1, H, W] bool."""
-    return (image[..., :1, :, :] & 1).astype(bool)
 
 
 def encode_depth(depth: jax.Array, depth_range: tuple[float, float]) -> jax.Array:

@@ -72,7 +72,7 @@ class MjxGoalEnv(GoalEnv):
 
     @classmethod
     def select_marked(cls, config: Any) -> str | None:
-        """Return the name of the body that images mark with these settings (`pixels.object_mask`); None for none."""
+        """Return the name of the body that images mark with these settings (`goals.object_mask`); None for none."""
         del config
         return None
 
