@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import render_models
-from mujoco import mjx
 from PIL import Image
 from render_comparison import dilated, matched_shares, near_edges
 
 from jaxrl_vis.bench.scenes.models import forward, scatter_joints
+from jaxrl_vis_envs.physics.mjx_model import mjx
 from jaxrl_vis_envs.render import Frame, Scene
 from jaxrl_vis_envs.render.camera import camera_pose, pixel_rays, ray_parts
 from jaxrl_vis_envs.render.reference import ReferenceRenderer
