@@ -48,7 +48,6 @@ def episode_kernel(
         The function from inputs [B, I] float32 to outputs [B, ``outputs``]; axes of `jax.vmap` are merged into B.
     """
 
-    @custom_vmap
     def run(inputs: jax.Array) -> jax.Array:
         batch = inputs.shape[0]
         programs = pl.cdiv(batch, WARP_SIZE)
@@ -57,6 +56,13 @@ def episode_kernel(
         launch = _trace_kernel(name, compute, constants, outputs, interpret, inputs.T.shape, jax.sharding.get_abstract_mesh())
         results, _ = launch(inputs.T)
         return results.T[:batch]
+
+    return _merge_vmap_axes(run)
+
+
+def _merge_vmap_axes(call: Callable[[jax.Array], jax.Array]) -> Callable[[jax.Array], jax.Array]:
+    """Return a function of inputs [B, I] that merges axes of `jax.vmap` into B."""
+    run = custom_vmap(call)
 
     @run.def_vmap
     def _(size: int, in_batched: list[bool], inputs: jax.Array) -> tuple[jax.Array, bool]:
@@ -111,20 +117,13 @@ def warp_kernel(
         The function from inputs [B, I] float32 to outputs [B, ``outputs``]; axes of `jax.vmap` are merged into B.
     """
 
-    @custom_vmap
     def run(inputs: jax.Array) -> jax.Array:
         mesh = jax.sharding.get_abstract_mesh()
         launch = _trace_warp_kernel(name, compute, constants, table.shape[0], outputs, interpret, inputs.shape, mesh)
         results, _ = launch(inputs, jnp.asarray(table, jnp.float32))
         return results
 
-    @run.def_vmap
-    def _(size: int, in_batched: list[bool], inputs: jax.Array) -> tuple[jax.Array, bool]:
-        del in_batched  # there is one input, so it is batched
-        flat = run(inputs.reshape(-1, inputs.shape[-1]))
-        return flat.reshape(size, -1, flat.shape[-1]), True
-
-    return run
+    return _merge_vmap_axes(run)
 
 
 @functools.lru_cache(maxsize=16)
