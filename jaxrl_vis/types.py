@@ -2,7 +2,7 @@
 
     E  environments in a rollout          B  transitions in a batch       C, H, W  channels, height, width of an image
     N  episodes that the replay holds     A  action components            G        components of the true goal state
-    T  control steps of an episode        S  seeds trained in parallel
+    T  control steps of an episode        S  seeds trained in parallel    P        G, and components of the task's true state
 
 An observation is a planar image [C, H, W] uint8 or a state vector [S] float32; "..." stands for its own axes.
 """
@@ -37,12 +37,15 @@ class Episodes(Replaceable):
         states: [E, T+2, G] float32, the true goal-space states at the same times.
         actions: [E, T, A] float32, as executed (with exploration noise).
         stored: [E, T, ...] uint8 or float32, values that auxiliary tasks computed for each step, by task (`AuxTask.episode`).
+        full_states: [E, T+1, P - G] float32, observations of the task's state variant (`MjxGoalEnv.observe_state`), for critics
+            that also observe these; None for others.
     """
 
     observations: jax.Array
     states: jax.Array
     actions: jax.Array
     stored: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    full_states: jax.Array | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -81,6 +84,7 @@ class Batch(Replaceable):
             None.
         success: [B] float32, 1 where the true state after the action reaches the goal, else 0; for diagnostics only. None if
             rewards span several steps.
+        full_states: [2, B, P - G] float32, `Episodes.full_states` before and after the action; None if not collected.
     """
 
     observations: jax.Array
@@ -94,6 +98,7 @@ class Batch(Replaceable):
     targets: dict[str, Any] = dataclasses.field(default_factory=dict)
     reached: jax.Array | None = None
     success: jax.Array | None = None
+    full_states: jax.Array | None = None
 
     @property
     def observation_t(self) -> jax.Array:
@@ -133,10 +138,13 @@ class Statistics(NamedTuple):
     Attributes:
         observations: Statistics of observations; also used for goals, unless these have their own.
         own_goals: Separate statistics of goals; None if they share ``observations``.
+        states: Statistics of true states [P], those of `Episodes.full_states` and then of `Episodes.states`; None if the
+            critic does not observe them.
     """
 
     observations: NormalizerState
     own_goals: NormalizerState | None
+    states: NormalizerState | None = None
 
     @property
     def goals(self) -> NormalizerState:
@@ -153,16 +161,18 @@ class TrainState(Replaceable):
         agent: State of the algorithm, a pytree that it defines (`learner.algorithm`).
         normalizer: Observation statistics.
         goal_normalizer: Separate statistics of goals; None if they share ``normalizer``.
+        state_normalizer: Statistics of true states (`Statistics.states`); None if the critic does not observe them.
     """
 
     agent: Any
     normalizer: NormalizerState
     goal_normalizer: NormalizerState | None = None
+    state_normalizer: NormalizerState | None = None
 
     @property
     def statistics(self) -> Statistics:
-        """Statistics of observations and goals."""
-        return Statistics(self.normalizer, self.goal_normalizer)
+        """Statistics of observations, goals and true states."""
+        return Statistics(self.normalizer, self.goal_normalizer, self.state_normalizer)
 
 
 @jax.tree_util.register_dataclass

@@ -179,6 +179,9 @@ class DDPGOptions:
     """Quantity whose logarithm the actor minimises, with log weightings. value: log(Q_max - Q) plus the action penalty, as in
     the authors' release, so the penalty's relative weight grows with Q_max - Q. loss: log(Q_max - Q + penalty), which keeps
     their ratio."""
+    critic_states: Annotated[bool, OfAlgorithm(("ddpg", "td3"))] = False
+    """The critic observes the true state and goal state in addition to the images, which makes it easier to train; the policy
+    still sees images only (asymmetric actor-critic, Pinto et al., 2018)."""
     clip_targets_above: bool = True
     """Clip critic targets at R+/(1-gamma) too (they are always clipped at R-/(1-gamma) below)."""
     random_action_probability: Fraction = 0.3

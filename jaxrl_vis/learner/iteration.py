@@ -77,6 +77,10 @@ def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, co
             observations = jnp.concatenate([observations, goals])
         axes = (0,)
     train = train.replace(normalizer=normalizer.update(train.normalizer, observations, axes, sampler.shards))
+    if train.state_normalizer is not None:
+        assert episodes.full_states is not None
+        states = jnp.concatenate([episodes.full_states, episodes.states[:, :-1]], axis=-1)
+        train = train.replace(state_normalizer=normalizer.update(train.state_normalizer, states, shards=sampler.shards))
     if train.goal_normalizer is None:
         return train
     return train.replace(goal_normalizer=normalizer.update(train.goal_normalizer, goals, axes, sampler.shards))

@@ -120,7 +120,8 @@ class TrainStep:
         """Shapes of one seed's replay, or of one device's part of it, without allocating it."""
         observation = self.env.observation_spec
         stored = self.auxiliary.stored_spec(observation, self.env.horizon)
-        return self.replay.spec(observation, self.env.goal_state_size, self.env.action_size, stored)
+        full_state_size = _full_state_size(self.env, self.config)
+        return self.replay.spec(observation, self.env.goal_state_size, self.env.action_size, stored, full_state_size)
 
     @property
     def replay_bytes(self) -> int:
@@ -130,7 +131,7 @@ class TrainStep:
     @property
     def parts_spec(self) -> list[Played]:
         """Shapes and placement of the parts of a rollout, as `learn` takes them."""
-        spec = played_spec(self.env, self.part_size, self.config.run.seeds)
+        spec = played_spec(self.env, self.part_size, self.config.run.seeds, _full_state_size(self.env, self.config))
         spec = self.layout.with_shardings(spec, self.layout.by_environment)
         return [spec] * math.ceil(self.config.run.num_envs / self.part_size)
 
@@ -199,6 +200,23 @@ def _object_mask(env: GoalEnv, config: Config, resolved: Resolved) -> Callable[[
     return object_mask
 
 
+def _full_state_size(env: GoalEnv, config: Config) -> int:
+    """Return the size of `Episodes.full_states`, 0 if the critic does not observe true states.
+
+    Raises:
+        RequestError: The critic should observe them, but all agents of this environment do, or it has none.
+    """
+    if not config.ddpg.critic_states:
+        return 0
+    name = config.environment.env
+    if len(env.observation_spec.shape) != 3:
+        raise RequestError(f"critic_states is for images, and {name} observes states: leave it out")
+    observe_state = getattr(env, "observe_state", None)
+    if observe_state is None:
+        raise RequestError(f"critic_states needs a task with observe_state, which {name} has not: leave it out")
+    return jax.eval_shape(lambda: observe_state(env.reset(jax.random.key(0)).data)).shape[0]
+
+
 def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, policy_alone: bool = False) -> TrainStep:
     """Build the programs of a run. Nothing is compiled or allocated yet.
 
@@ -215,19 +233,26 @@ def make_train_step(env: GoalEnv, config: Config, layout: Layout | None = None, 
     layout = make_layout(config) if layout is None else layout
     shards = layout.shards
     auxiliary = make_auxiliary(config, env.observation_spec, env.action_size, env.frame_stack, compute_dtype(config))
-    setup = Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards)
+    full_state_size = _full_state_size(env, config)
+    critic_state_size = full_state_size + env.goal_state_size if full_state_size else 0
+    setup = Setup(config, resolved, env.observation_spec, env.action_size, auxiliary, shards, critic_state_size)
     maker = find("algorithm", config.run.algorithm, ALGORITHMS, config.environment.env_folder)
     algorithm = call("algorithm", config.run.algorithm, maker, setup, of=Algorithm)
     statistics = normalizer.init(env.observation_spec)
-    unseen = Statistics(statistics, statistics if config.study.normalizers == "separate" else None)
+    unseen = Statistics(
+        statistics,
+        statistics if config.study.normalizers == "separate" else None,
+        normalizer.init(jax.ShapeDtypeStruct((critic_state_size,), jnp.float32)) if critic_state_size else None,
+    )
     if policy_alone:
         algorithm = algorithm.of_policies(unseen)
-    acting = Acting(env, algorithm, config.environment.observation_noise)
+    observe_state: Any = getattr(env, "observe_state") if full_state_size and not policy_alone else None  # noqa: B009
+    acting = Acting(env, algorithm, config.environment.observation_noise, observe_state)
     stacked = env.frame_stack if len(env.observation_spec.shape) == 3 else 1
     replay = make_replay(config.run.replay_transitions, config.run.num_envs, env.horizon, stacked, config.study.replay_mean_age)
     replay = replay._replace(num_envs=config.run.num_envs // shards.count)
     stored = auxiliary.stored_spec(env.observation_spec, env.horizon)
-    replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, stored)
+    replay_spec = replay.spec(env.observation_spec, env.goal_state_size, env.action_size, stored, full_state_size)
     as_goal, mask = env.as_goal if env.converts_goals else None, _object_mask(env, config, resolved)
     sampler = Sampler(config, resolved, replay, env.threshold, as_goal, auxiliary, shards, mask)
     insert = iterations.make_insert(config, sampler, auxiliary)

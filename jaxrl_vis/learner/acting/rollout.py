@@ -50,11 +50,13 @@ class Acting(NamedTuple):
         env: The environment.
         algorithm: Algorithm of the agents.
         observation_noise: Standard deviation of the camera's noise, in the observation's unit.
+        observe_state: Function from `State.data` to `Episodes.full_states` of one step; None to collect none.
     """
 
     env: GoalEnv
     algorithm: Algorithm
     observation_noise: float = 0.0
+    observe_state: Callable[[Any], jax.Array] | None = None
 
 
 def explore(action: jax.Array, exploration: Exploration, key: jax.Array, draws: Draws = ONE) -> jax.Array:
@@ -141,7 +143,7 @@ def play(
         record: Function of the state of one environment that returns a pytree to record, after reset and after each step.
         draws: Source of random numbers for these environments.
     """
-    env, algorithm, deviation = acting
+    env, algorithm, deviation, observe_state = acting
     num_seeds = keys.shape[0]
 
     def by_seed(leaf: jax.Array) -> jax.Array:
@@ -158,6 +160,9 @@ def play(
         noisy = jax.vmap(lambda key, part: add_noise(key, part, deviation, draws))(noise_keys, by_seed(observations))
         return noisy.reshape(observations.shape)
 
+    def full_state(state: State) -> jax.Array | None:
+        return None if observe_state is None else stored(jax.vmap(observe_state)(state.data))
+
     def recorded(state: State) -> Any:
         return None if record is None else jax.tree.map(stored, jax.vmap(record)(state))
 
@@ -166,7 +171,7 @@ def play(
     assert state.obs is not None
     first_observation = perturb(state.obs["observation"], policy_keys, _FIRST_NOISE)
     goal = perturb(state.obs["desired_goal"], policy_keys, _GOAL_NOISE)
-    first_state, first_record = state.achieved_state, recorded(state)
+    first_state, first_full_state, first_record = state.achieved_state, full_state(state), recorded(state)
     policies = jax.vmap(algorithm.policy_params)(train.agent, train.statistics)
     aims = jax.vmap(algorithm.aim)(policies, by_seed(goal))
 
@@ -179,17 +184,19 @@ def play(
         state = jax.vmap(env.advance)(state, action)
         observation = perturb(jax.vmap(env.observe)(state), step_keys, _STEP_NOISE)
         step_results = tuple(stored(leaf) for leaf in (observation, state.achieved_state, action))
-        return (state, observation), (step_results, recorded(state))
+        return (state, observation), (step_results, full_state(state), recorded(state))
 
     carry = (state.replace(obs=None), first_observation)
     step_keys = jax.vmap(lambda key: jax.random.split(key, env.horizon), out_axes=1)(policy_keys)
-    (state, _), ((observations, states, actions), records) = jax.lax.scan(step, carry, step_keys)
+    (state, _), ((observations, states, actions), full_states, records) = jax.lax.scan(step, carry, step_keys)
     outcome = {name: by_seed(state.metrics[name]) for name in env.metric_names}
+    first, rest = (first_full_state, first_record), (full_states, records)
+    full_states, record_of_all = jax.tree.map(lambda first, rest: _episode_major(first[None], rest), first, rest)
 
     episodes = Episodes(
         observations=_episode_major(stored(first_observation)[None], observations, stored(goal)[None]),
         states=_episode_major(stored(first_state)[None], states, stored(state.goal_state)[None]),
         actions=jnp.moveaxis(actions, 0, 2),
+        full_states=full_states,
     )
-    record_of_all = jax.tree.map(lambda first, rest: _episode_major(first[None], rest), first_record, records)
     return Rollout(episodes, outcome, record_of_all)

@@ -75,13 +75,14 @@ class RolloutPart:
         return jax.vmap(jax.random.fold_in, (None, 0))(key, self.first + jnp.arange(count))
 
 
-def played_spec(env: GoalEnv, size: int, seeds: int) -> Played:
+def played_spec(env: GoalEnv, size: int, seeds: int, full_state_size: int = 0) -> Played:
     """Return shapes and dtypes of the result of one part, without tracing its program.
 
     Args:
         env: The environment.
         size: P, number of environments in the part.
         seeds: S.
+        full_state_size: P - G, size of `Episodes.full_states`; 0 if they are not collected.
     """
 
     def spec(shape: tuple[int, ...], dtype: Any = jnp.float32) -> Any:
@@ -92,5 +93,6 @@ def played_spec(env: GoalEnv, size: int, seeds: int) -> Played:
         observations=spec((*slots, *env.observation_spec.shape), env.observation_spec.dtype),
         states=spec((*slots, env.goal_state_size)),
         actions=spec((seeds, size, env.horizon, env.action_size)),
+        full_states=spec((seeds, size, env.horizon + 1, full_state_size)) if full_state_size else None,
     )
     return episodes, {name: spec((seeds, size)) for name in env.metric_names}

@@ -375,13 +375,16 @@ def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = No
         draw_noise: Sampler of the noise on actions in targets; None for no noise.
     """
     config, resolved = setup.config, setup.resolved
-    networks = Networks(config, setup.observation_spec, setup.action_size, resolved.critic_output_bias, critic_heads)
+    sizes = setup.action_size, resolved.critic_output_bias, critic_heads, setup.critic_state_size
+    networks = Networks(config, setup.observation_spec, *sizes)
     steps = make_ddpg(networks, config, resolved, setup.auxiliary, setup.shards)
     policy = make_policy(networks)
 
     def policy_params(agent: Agent, statistics: Statistics) -> PolicyParams:
         return policy.params(networks.with_encoder(agent.actor, agent.critic), statistics)
 
-    diagnose = functools.partial(_value_at_goals, networks)
     update = make_update(config, steps, draw_noise)
-    return Algorithm(steps.init, policy.act, update, policy_params, policy.aim, diagnose, networks)
+    algorithm = Algorithm(steps.init, policy.act, update, policy_params, policy.aim, networks=networks)
+    if setup.critic_state_size:  # true states at goal images are unknown
+        return algorithm
+    return algorithm._replace(diagnose=functools.partial(_value_at_goals, networks))

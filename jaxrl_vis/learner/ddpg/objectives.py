@@ -6,7 +6,8 @@ encodes those that it needs in one pass:
     critic, actor (online, with gradient)   before, goal, and for auxiliary tasks after, views
     their targets                           goal, after
 
-The actor's loss evaluates its actions on the latents from the critic's forward pass, without a gradient through these.
+The actor's loss evaluates its actions on the latents from the critic's forward pass, without a gradient through these. With
+``critic_states``, the critic's heads also read the true states, which the actor never observes.
 """
 
 import dataclasses
@@ -163,7 +164,7 @@ class Objectives:
             assert batch.reward is not None
             latents = _collect_latents(self.auxiliary, encoded)
             target = self._target(copies, inputs, latents, batch, noise)
-            values = networks.values(critic, latents.pair, batch.action)
+            values = networks.values(critic, latents.pair, batch.action, inputs.states_t)
             value = _minimum(values)
             keep = losses.keep_mask(batch.reward, value, self.resolved.reward_negative, self.resolved.filter_threshold)
             others = self._auxiliary(critic, latents, inputs, image, batch)
@@ -194,7 +195,7 @@ class Objectives:
         action = networks.act(copies.target_actor, of_actor)
         if noise is not None:
             action = jnp.clip(action + noise, -1.0, 1.0)
-        value_tp1 = _minimum(networks.values(copies.target_critic, of_critic, action))
+        value_tp1 = _minimum(networks.values(copies.target_critic, of_critic, action, inputs.states_tp1))
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
@@ -217,7 +218,7 @@ class Objectives:
         if self.auxiliary.weighting.log:
             others = {name: self.shards.global_mean(loss) for name, loss in others.items()}
         action = self.networks.act(actor, self.auxiliary.main_latents(latents.pair, weights) if has_encoder else latents.pair)
-        value = self.networks.value(critic, critic_latents.pair, action)
+        value = self.networks.value(critic, critic_latents.pair, action, inputs.states_t)
         best = self.resolved.reward_positive / (1.0 - self.resolved.discount) if self.auxiliary.weighting.log else None
         loss = losses.actor_loss(
             value, action, self.config.ddpg.action_penalty, best, self.shards.global_mean, self.config.ddpg.actor_log

@@ -91,6 +91,7 @@ class Replay(NamedTuple):
         goal_state_size: int,
         action_size: int,
         stored: Mapping[str, jax.ShapeDtypeStruct] | None = None,
+        full_state_size: int = 0,
     ) -> ReplayState:
         """Create an empty replay.
 
@@ -99,6 +100,7 @@ class Replay(NamedTuple):
             goal_state_size: G.
             action_size: A.
             stored: Shapes and dtypes of the arrays stored with one episode, by auxiliary task (`Auxiliary.stored_spec`).
+            full_state_size: P - G, size of `Episodes.full_states`; 0 if they are not stored.
         """
         episodes, horizon = self.num_episodes, self.horizon
         fields = {
@@ -112,6 +114,7 @@ class Replay(NamedTuple):
                 states=jnp.zeros((episodes, horizon + 2, goal_state_size), jnp.float32),
                 actions=jnp.zeros((episodes, horizon, action_size), jnp.float32),
                 stored=fields,
+                full_states=jnp.zeros((episodes, horizon + 1, full_state_size), jnp.float32) if full_state_size else None,
             ),
             size=jnp.zeros((), jnp.int32),
         )
@@ -203,11 +206,13 @@ class Replay(NamedTuple):
         last = jnp.minimum(time + steps, self.horizon) if steps > 1 else time + 1
         goal_episode = episode if goal_episode is None else goal_episode
         episodes, slots = jnp.stack([episode, goal_episode, episode]), jnp.stack([time, goal_slot, last])
+        full_states = state.episodes.full_states
         return Batch(
             observations=self._read(observations, episodes, slots, jnp.array([[False], [True], [False]])),
             action=actions[episode, time],
             state_tp1=states[episode, time + 1],
             goal_state=states[goal_episode, goal_slot],
+            full_states=None if full_states is None else full_states[episodes[::2], slots[::2]],
         )
 
     def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, stands_still: jax.Array) -> jax.Array:

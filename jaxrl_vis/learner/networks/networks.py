@@ -38,10 +38,12 @@ class BatchScaling(NamedTuple):
     Attributes:
         observations: Scaling of observations before and after the action; also of goals, unless they have their own.
         goals: Separate scaling of goals; None if they share ``observations``.
+        states: Scaling of true states [P]; None if the critic does not observe them.
     """
 
     observations: Scaling
     goals: Scaling | None
+    states: Scaling | None = None
 
 
 _OBSERVED = ("before", "goal", "after")  # in the order of `Inputs.observed`
@@ -56,10 +58,23 @@ class Inputs(NamedTuple):
     Attributes:
         observed: [3 B, ...], observations before the action, goals, observations after the action.
         views: [B, ...] images computed by auxiliary tasks, by name.
+        states: [2, B, P] true states before and after the action, each followed by the goal's; None if the critic does not
+            observe them.
     """
 
     observed: jax.Array
     views: Mapping[str, jax.Array]
+    states: jax.Array | None = None
+
+    @property
+    def states_t(self) -> jax.Array | None:
+        """True states [B, P] before the action, and of the goal; None if there are none."""
+        return None if self.states is None else self.states[0]
+
+    @property
+    def states_tp1(self) -> jax.Array | None:
+        """True states [B, P] after the action, and of the goal; None if there are none."""
+        return None if self.states is None else self.states[1]
 
     @property
     def size(self) -> int:
@@ -90,9 +105,10 @@ class Networks:
             networks.
         encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
         act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
-        values: (critic, latents [2, B, latent], action [B, A]) -> values of all heads [K, B] float32.
+        values: (critic, latents [2, B, latent], action [B, A], states [B, P] or None) -> values of all heads [K, B] float32.
         value: The same for the first head only: [B] float32.
         critic_heads: K, number of heads of the critic on one encoder. With several, their parameters have a leading axis [K].
+        critic_state_size: P, size of the true states that the critic's heads also read; 0 for none.
     """
 
     config: Config
@@ -100,6 +116,7 @@ class Networks:
     action_size: int
     critic_output_bias: float
     critic_heads: int = 1
+    critic_state_size: int = 0
 
     def __post_init__(self) -> None:
         """Check the image size, and the maximum shift against it.
@@ -183,7 +200,8 @@ class Networks:
 
     def init_critic(self, key: jax.Array) -> Params:
         """Initialise the critic."""
-        head, width = self.head(1, self.critic_output_bias), 2 * self.latent_size + self.action_size
+        head = self.head(1, self.critic_output_bias)
+        width = 2 * self.latent_size + self.action_size + self.critic_state_size
         critic = self._init(key, head, width)
         if self.critic_heads == 1:
             return critic
@@ -227,20 +245,22 @@ class Networks:
     def batch_scaling(self, statistics: Statistics) -> BatchScaling:
         """Return the scaling that `prepare_batch` takes. It stays the same for all gradient steps of an iteration."""
         of_goals = None if statistics.own_goals is None else self.scaling(statistics.own_goals)
-        return BatchScaling(self.scaling(statistics.observations), of_goals)
+        of_states = None if statistics.states is None else self.scaling(statistics.states)
+        return BatchScaling(self.scaling(statistics.observations), of_goals, of_states)
 
     def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
         """Apply `prepare` to all observations of B transitions."""
-        of_observations, of_goals = scaling
+        of_observations, of_goals, of_states = scaling
+        states = None if of_states is None else self._normalized(_with_goals(batch), *of_states)
         views = {name: self.prepare(of_observations, images, batch.shift) for name, images in batch.views.items()}
         if of_goals is None:  # together, and while they are bytes
             count, size, *shape = batch.observations.shape
             shift = None if batch.shift is None else jnp.tile(batch.shift, (count, 1))
             together = self.prepare(of_observations, batch.observations.reshape(count * size, *shape), shift)
-            return Inputs(together, views)
+            return Inputs(together, views, states)
         scalings = (of_observations, of_goals, of_observations)
         pieces = [self.prepare(own, rows, batch.shift) for own, rows in zip(scalings, batch.observations, strict=True)]
-        return Inputs(jnp.concatenate(pieces), views)
+        return Inputs(jnp.concatenate(pieces), views, states)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """Normalise and reorder observations [B, ...] for the encoders: [B, blocks, block size], or [B, S] for states.
@@ -287,16 +307,28 @@ class Networks:
         """Compute actions [B, A] float32 in (-1, 1) from latents [2, B, latent] of observations and goals."""
         return jnp.tanh(self.head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
-    def values(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        """Compute each head's values [K, B] float32 of actions [B, A]; latents [2, B, latent] as for `act`."""
+    def values(self, critic: Params, latents: jax.Array, action: jax.Array, states: jax.Array | None = None) -> jax.Array:
+        """Compute each head's values [K, B] float32 of actions [B, A]; latents [2, B, latent] as for `act`.
+
+        ``states`` [B, P] are normalised true states (`Inputs.states`); None if the critic does not observe them.
+        """
         if self.critic_heads == 1:
-            return self._value(critic["head"], latents, action)[None]
-        return jax.vmap(self._value, (0, None, None))(critic["head"], latents, action)
+            return self._value(critic["head"], latents, action, states)[None]
+        return jax.vmap(self._value, (0, None, None, None))(critic["head"], latents, action, states)
 
-    def value(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        """Compute the first head's values [B] float32 of actions [B, A]; latents [2, B, latent] as for `act`."""
+    def value(self, critic: Params, latents: jax.Array, action: jax.Array, states: jax.Array | None = None) -> jax.Array:
+        """Compute the first head's values [B] float32; arguments as for `values`."""
         head = critic["head"]
-        return self._value(head if self.critic_heads == 1 else jax.tree.map(lambda leaf: leaf[0], head), latents, action)
+        first = head if self.critic_heads == 1 else jax.tree.map(lambda leaf: leaf[0], head)
+        return self._value(first, latents, action, states)
 
-    def _value(self, head: Params, latents: jax.Array, action: jax.Array) -> jax.Array:
-        return self.head(1, self.critic_output_bias).apply({"params": head}, latents, action)[..., 0]
+    def _value(self, head: Params, latents: jax.Array, action: jax.Array, states: jax.Array | None) -> jax.Array:
+        inputs = (latents, action) if states is None else (latents, action, states)
+        return self.head(1, self.critic_output_bias).apply({"params": head}, *inputs)[..., 0]
+
+
+def _with_goals(batch: Batch) -> jax.Array:
+    """Append the goal's true state to those before and after the action: [2, B, P]."""
+    assert batch.full_states is not None
+    goals = jnp.broadcast_to(batch.goal_state, (len(batch.full_states), *batch.goal_state.shape))
+    return jnp.concatenate([batch.full_states, goals], axis=-1)
