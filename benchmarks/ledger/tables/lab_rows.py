@@ -69,9 +69,11 @@ class Learning:
 _IMAGES = "{image_size}x{image_size} {pixels}"
 
 
+_STEPS = f"{{value}} env-steps/s ({{envs:,}} environments, {_IMAGES})"
+
+
 def _environment(env: str, more: str = "", gpu: str = "H100") -> Speed:
-    text = f"{{value}} env-steps/s ({{envs:,}} environments, {_IMAGES})"
-    figures = (Figure("env/steps", {"env": env}, text),)
+    figures = (Figure("env/steps", {"env": env}, _STEPS),)
     return Speed(f"`bench env --env {env}`{more}", {gpu: figures, "2 CPU cores": figures})
 
 
@@ -102,6 +104,10 @@ SPEED = (
     _environment("VisualHandReach", ", 20 physics steps each"),
     _environment("VisualFingerTurn", ", 21 physics steps of 10 ms each, 3 stacked images"),
     _environment("VisualSawyerReach", gpu="H200"),
+    Speed(
+        "`bench env --env VisualFetchPush`, 20 physics steps each, with contacts ([more](push_speed.md))",
+        {"H100": (Figure("env/steps", {"env": "VisualFetchPush"}, _STEPS),)},
+    ),
     Speed(
         "`bench render --scene fetch_reach`: images of new poses ([more](renderer_speed.md))",
         {
