@@ -1,4 +1,4 @@
-"""Tables of docs/lab/renderer_speed.md, written from the records of our and other renderers on the same poses."""
+"""Tables of docs/lab/renderer_speed.md and docs/lab/meshes.md, from records of our and other renderers on the same poses."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,8 @@ from benchmarks.ledger.tables.lab_results import short
 from jaxrl_vis.bench.record import load
 
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"
-_OURS = "render/scene"
+_MESH_RECORDS = "render-nvidia-h100-80gb-hbm3-x1.json"
+_OURS, _WARP = "render/scene", "render/peer_warp"
 _ORDER = ("finger", "fetch_reach", "primitives")
 _TEXTURED = ("finger", "primitives")  # fetch_reach has no textures to omit
 _OUTPUTS = {"rgbd": "RGB-D", "depth": "depth"}
@@ -51,9 +52,25 @@ def _table(file: Path, peer: str, title: str, with_depth: bool) -> str:
 
 def warp_table(results: Path) -> str:
     """Write the comparison of MuJoCo Warp's renderer with ours, in images per second, as Markdown."""
-    return _table(results / _WARP_RECORDS, "render/peer_warp", "MuJoCo Warp 4.0.0", with_depth=False)
+    return _table(results / _WARP_RECORDS, _WARP, "MuJoCo Warp 4.0.0", with_depth=False)
 
 
 def mujoco_table(results: Path) -> str:
     """Write the comparison of MuJoCo's own renderer with ours, in images per second, as Markdown."""
     return _table(results / _MUJOCO_RECORDS, "render/peer_mujoco", "`mujoco.Renderer`", with_depth=True)
+
+
+def mesh_table(results: Path) -> str:
+    """Write the comparison of MuJoCo Warp's renderer with ours on scenes of meshes, in images per second, as Markdown."""
+    records = [record for record in load(results / _MESH_RECORDS) if record["config"]["pixels"] == "rgbds"]
+    ours = {str(record["config"]): record for record in records if record["name"] == _OURS}
+    lines = ["| scene | images | ours | MuJoCo Warp 4.0.0 | ratio |", "|---|---|---|---|---|"]
+    for record in records:
+        if record["name"] != _WARP:
+            continue
+        config, size = record["config"], record["config"]["image_size"]
+        names = [name for name in ("textures", "shadows") if config.get(name)]
+        scene = config["scene"] + (f", with {' and '.join(names)}" if names else "")
+        rates = f"{short(ours[str(config)]['value'])} | {short(record['value'])} | {record['details']['ours_over_peer']:.3g}"
+        lines.append(f"| {scene} | {size}x{size}, {config['images']:,} | {rates} |")
+    return "\n".join(lines)
