@@ -21,7 +21,7 @@ from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
 from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, gate_path, logistic, write_gate
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
-from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
+from jaxrl_vis.stalks.phenotyping.detector.sections import STALK
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes

@@ -319,7 +319,7 @@ def test_what_cannot_be_read_is_told_in_one_line(tmp_path, files, images, part):
 def test_regions_of_many_stalks_are_neither_stalks_nor_background(tmp_path):
     from tiny_detector import TINY
 
-    from jaxrl_vis.stalks.phenotyping.detector.losses import STALK, UNCLEAR
+    from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
     from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
 
     data = json.loads(coco("r.png"))

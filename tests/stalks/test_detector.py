@@ -16,7 +16,8 @@ from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap, r
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals
 from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
-from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR, assign
+from jaxrl_vis.stalks.phenotyping.detector.losses import assign
+from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut, paste
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations

@@ -14,7 +14,7 @@ from tiny_detector import IMAGE, TINY
 from jaxrl_vis import cli
 from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector, padded_shape
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
+from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.training.detector_training import beginning, image_batch, update_networks
 from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, cut_out, resize_crops, settings_for

@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, roi_align, strip_half_width, suppress
-from jaxrl_vis.stalks.phenotyping.detector.detector_networks import PADDING, STRIDE, Detector
+from jaxrl_vis.stalks.phenotyping.detector.detector_networks import ANCHOR_STRIDE, PADDING, STRIDE, Detector
+from jaxrl_vis.stalks.phenotyping.detector.sections import decode_sections, section_anchors
 
 # Relative difference of resolutions up to which a camera counts as one of training, where images were reduced by exactly four:
 # with 0.988 to 1.024 times that factor, F1 on 12 images of the shifted family was 0.952 instead of 0.969.
@@ -32,13 +33,16 @@ class Settings:
             they shrink in proportion.
         crop_height, crop_width: Height and width of a stalk crop, pixels.
         band_height: Height of the band in the resized image, pixels.
+        section: Height of the sections that the networks detect in the resized image, pixels, 16 or 32 (see `sections`); 0 for
+            networks that detect the parts of stalks in the band.
         anchor_widths: Widths of the anchors in the resized image, pixels.
         channels, hidden: Sizes of the detector; see `detector_networks.Detector`.
         segmenter: Channels of each level of the segmentation network.
-        candidates: Number of top-scoring boxes that enter the suppression of proposals. Most are duplicates of easy stalks:
-            with 480, two thirds of the stalks missed in crowded images had no candidate.
+        candidates: Number of top-scoring boxes that enter the suppression of proposals, with sections in equal parts for all
+            bands. Most are duplicates of easy stalks: with 480, two thirds of the stalks missed in crowded images had no
+            candidate.
         proposals: Number of proposals passed to the box head.
-        max_stalks: Maximum number of stalks in an image.
+        max_stalks: Maximum number of stalks in an image, or of their sections.
         proposal_threshold: Strip overlap above which proposals are suppressed as duplicates.
         threshold: Strip overlap above which detections are suppressed as duplicates.
         min_score: Minimum score of a detection.
@@ -61,6 +65,7 @@ class Settings:
     proposal_threshold: float = 0.7
     threshold: float = 0.4
     min_score: float = 0.05
+    section: int = 0
 
     def scale_for(self, width: int, pixels_per_metre: float | None) -> float:
         """Return the factor by which an image is resized before detection.
@@ -79,7 +84,8 @@ class Settings:
 
     def detector(self, dtype: Any = jnp.float32) -> Detector:
         """Return the detector of these settings, with convolutions in ``dtype``."""
-        return Detector(self.channels, self.hidden, len(self.anchor_widths), dtype)
+        rows = max(self.section // ANCHOR_STRIDE[0], 1)
+        return Detector(self.channels, self.hidden, len(self.anchor_widths), rows, dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,14 +119,15 @@ def normalise(images: jax.Array) -> jax.Array:
     return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
 
 
-def region_features(features: jax.Array, stalks: jax.Array) -> jax.Array:
+def region_features(features: jax.Array, stalks: jax.Array, section: bool = False) -> jax.Array:
     """Pool features [H, W, C] of an image along stalks [R, 6] to [R, *GRID, C].
 
     A region follows the axis, so that a leaning stalk stands upright in it: in a clump, two stalks that lean differently have
-    nearly the same box. It includes some context on all sides, which the box head needs.
+    nearly the same box. It includes some context on all sides, which the box head needs, and with sections the bands above and
+    below.
     """
     tall = jnp.maximum(stalks[:, 3] - stalks[:, 1], 1e-3)
-    more = 0.08 * tall
+    more = (1.0 if section else 0.08) * tall
     slope = (stalks[:, 5] - stalks[:, 4]) / tall
     half = 1.5 * strip_half_width(stalks) + 6.0
     top, bottom = stalks[:, 4] - more * slope, stalks[:, 5] + more * slope
@@ -156,6 +163,34 @@ def best_proposals(
     return stalks[places], best, jnp.isfinite(best)
 
 
+def section_proposals(
+    logits: jax.Array, codes: jax.Array, anchors: jax.Array, settings: Settings
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Select the best proposals of sections of one image after non-maximum suppression in each band.
+
+    Args:
+        logits: Objectness logits [K] of the anchors.
+        codes: Box offsets [K, 6].
+        anchors: [B, A, 6], see `section_anchors`.
+        settings: Number of proposals and the suppression threshold.
+
+    Returns:
+        Proposals [P, 6], their bands [P] int32, and whether each is valid [P] bool.
+    """
+    bands, each = anchors.shape[:2]
+    count = min(max(settings.candidates // bands, 1), each)
+    scores, places = jax.lax.top_k(logits.reshape(bands, each), count)
+
+    def of_band(scores, places, codes, anchors):
+        stalks = decode_sections(codes[places], anchors[places])
+        selected = suppress(band_overlap(stalks, stalks, 4), scores, settings.proposal_threshold)
+        return stalks, jnp.where(selected & (stalks[:, 2] - stalks[:, 0] > 2.0), scores, -jnp.inf)
+
+    stalks, scores = jax.vmap(of_band)(scores, places, codes.reshape(bands, each, 6), anchors)
+    best, places = jax.lax.top_k(scores.reshape(-1), min(settings.proposals, bands * count))
+    return stalks.reshape(-1, 6)[places], places // count, jnp.isfinite(best)
+
+
 def clip_to_image(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
     """Clip the boxes of stalks [N, 6] to an image of ``shape`` (height, width), and their axes to the clipped boxes."""
     left, top, right, bottom, above, below = jnp.moveaxis(stalks, -1, 0)
@@ -178,8 +213,10 @@ def classify_proposals(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
     """Score and refine proposals [P, 6] of one image with features [H, W, C], and remove duplicates."""
-    logits, codes = heads(network, params, region_features(features, proposals), "classify")
-    stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
+    regions = region_features(features, proposals, settings.section > 0)
+    logits, codes = heads(network, params, regions, "classify")
+    scores = jax.nn.sigmoid(logits)
+    stalks = (decode_sections if settings.section else decode)(codes, proposals)
     valid = valid & (scores >= settings.min_score)
     selected = suppress(band_overlap(stalks, stalks), jnp.where(valid, scores, -1.0), settings.threshold, valid)
     best, places = jax.lax.top_k(jnp.where(selected, scores, -1.0), min(settings.max_stalks, scores.shape[0]))
@@ -188,7 +225,7 @@ def classify_proposals(
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.float32) -> Found:
-    """Detect the stalks in one image.
+    """Detect the stalks in one image, or their sections.
 
     Args:
         params: Parameters of the detector.
@@ -198,11 +235,15 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
     """
     network = settings.detector(dtype)
     shape = (image.shape[0], image.shape[1])
-    anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
     features = network.apply(params, normalise(image)[None], method="features")
     assert isinstance(features, jax.Array)
     logits, codes = heads(network, params, features, "propose")
-    proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
+    if settings.section:
+        anchors = jnp.asarray(section_anchors(shape, settings.section, settings.anchor_widths))
+        proposals, _, valid = section_proposals(logits[0], codes[0], anchors, settings)
+    else:
+        anchors = jnp.asarray(make_anchors(shape, settings.band_height, settings.anchor_widths))
+        proposals, _, valid = best_proposals(logits[0], codes[0], anchors, settings, shape)
     detected = classify_proposals(network, params, features[0], proposals, valid, settings)
     return dataclasses.replace(detected, pooled=_pool_features(features[0], image))
 

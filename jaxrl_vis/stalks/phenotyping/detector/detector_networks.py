@@ -43,12 +43,14 @@ class Detector(nn.Module):
         channels: Channels from the finest to the coarsest level; multiples of 8.
         hidden: Units of the box head.
         anchors: Number of anchors at each location.
+        rows: Number of rows of `ANCHOR_STRIDE` that are averaged before the proposals, one per band of sections.
         dtype: Compute dtype of the convolutions.
     """
 
     channels: tuple[int, int, int, int] = (24, 48, 64, 64)
     hidden: int = 128
     anchors: int = 3
+    rows: int = 1
     dtype: jnp.dtype = jnp.float32
 
     def setup(self) -> None:
@@ -87,6 +89,8 @@ class Detector(nn.Module):
         """Return objectness logits [N, K] and box offsets [N, K, 6] of all anchors, in row-major order."""
         x = nn.relu(self.tall(features))
         count = x.shape[0]
+        if self.rows > 1:
+            x = x.reshape(count, -1, self.rows, *x.shape[2:]).mean(axis=2)
         return self.objectness(x).reshape(count, -1), self.offsets(x).reshape(count, -1, 6)
 
     def classify(self, regions: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -10,31 +10,32 @@ from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, best_proposals, heads, normalise, region_features
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
+from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import preprocess_crops
 
-# Kinds of true stalks: NOTHING is padding, UNCLEAR is too occluded to count as positive or negative.
-NOTHING, UNCLEAR, STALK = 0, 1, 2
 
-
-def assign(overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float) -> tuple[jax.Array, ...]:
+def assign(
+    overlaps: jax.Array, kinds: jax.Array, positive: float, negative: float, best_of_stalk: jax.Array | None = None
+) -> tuple[jax.Array, ...]:
     """Assign boxes to true stalks.
 
     Args:
         overlaps: [K, T] overlaps of boxes and true stalks.
-        kinds: [T] int32: NOTHING, UNCLEAR or STALK.
+        kinds: [T] or [K, T] int32: NOTHING, UNCLEAR or STALK.
         positive: Minimum overlap of a positive box.
         negative: Overlap below which a box is negative.
+        best_of_stalk: [K, T] maximum overlap of each true stalk with any box; None to compute it over all boxes.
 
     Returns:
         Index of the assigned stalk [K] int32, positives [K] bool and negatives [K] bool. Boxes between both thresholds, and
         those on unclear stalks that are not positive, are ignored. The best box of a stalk is positive from an overlap of 0.2.
     """
-    unclear = jnp.where((kinds == UNCLEAR)[None, :], overlaps, 0.0).max(axis=1) >= negative
-    overlaps = jnp.where((kinds == STALK)[None, :], overlaps, 0.0)
+    unclear = jnp.where(kinds == UNCLEAR, overlaps, 0.0).max(axis=1) >= negative
+    overlaps = jnp.where(kinds == STALK, overlaps, 0.0)
     best = overlaps.max(axis=1)
     # The best box of each stalk is positive even below the threshold.
-    best_of_stalk = overlaps.max(axis=0)
-    forced = (overlaps >= best_of_stalk[None, :] - 1e-6) & (best_of_stalk > 0.2)[None, :]
+    best_of_stalk = overlaps.max(axis=0) if best_of_stalk is None else best_of_stalk
+    forced = (overlaps >= best_of_stalk - 1e-6) & (best_of_stalk > 0.2)
     which = jnp.where(forced.any(axis=1), jnp.argmax(jnp.where(forced, overlaps, -1.0), axis=1), jnp.argmax(overlaps, axis=1))
     shows = (best >= positive) | forced.any(axis=1)
     return which, shows, (best < negative) & ~unclear & ~shows
@@ -66,8 +67,8 @@ def detector_loss(
 
     def of_image(features, logits, codes, truth, kinds, key):
         which, shows, none = assign(overlap(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
-        loss = _focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
-        placed = _distance(codes, encode(truth[which], anchors), shows)
+        loss = focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
+        placed = distance(codes, encode(truth[which], anchors), shows)
 
         proposals, _, valid = best_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings, shape)
         size = jnp.concatenate([truth[:, 2:4] - truth[:, :2]] * 2 + [truth[:, 2:3] - truth[:, :1]] * 2, axis=-1)
@@ -82,7 +83,7 @@ def detector_loss(
         weight = (shows | none).astype(jnp.float32)
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
-        refinement = _distance(refined, encode(truth[which], proposals), shows)
+        refinement = distance(refined, encode(truth[which], proposals), shows)
         return loss, placed, 2.0 * judgement, 2.0 * refinement
 
     keys = jax.random.split(key, images.shape[0])
@@ -91,13 +92,13 @@ def detector_loss(
     return sum(named.values(), jnp.zeros(())), named
 
 
-def _focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
+def focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
     """Sum the focal loss over the positive and negative anchors."""
     loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
     return (loss * (shows | none)).sum()
 
 
-def _distance(codes: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
+def distance(codes: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
     """Compute the Huber loss of box offsets [K, 6], averaged over the positive boxes."""
     loss = optax.huber_loss(codes, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)

@@ -40,6 +40,7 @@ _SANE: dict[str, tuple[float, float, int]] = {
     **dict.fromkeys(("band_height", "anchor_widths"), (0.1, 4096, 1)),
     **dict.fromkeys(("channels", "segmenter"), (8, 512, 8)),
     "hidden": (1, 4096, 1),
+    "section": (0, 32, 16),
     **dict.fromkeys(("candidates", "proposals", "max_stalks"), (1, 10_000, 1)),
     **dict.fromkeys(("proposal_threshold", "threshold", "min_score"), (0, 1, 1)),
 }

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.host.files import write_atomically
-from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
+from jaxrl_vis.stalks.phenotyping.detector.sections import STALK
 from jaxrl_vis.stalks.phenotyping.report.qc import picture, table
 from jaxrl_vis.stalks.phenotyping.report.qc_style import SCRIPT, STYLE
 from jaxrl_vis.stalks.phenotyping.training.examples import Example

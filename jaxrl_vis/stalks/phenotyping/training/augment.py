@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING
+from jaxrl_vis.stalks.phenotyping.detector.sections import ABSENT, NOTHING, STEP, UNKNOWN, WHOLE
 
 _WELL_ROOT = 94.9  # square root of the full-well capacity (electrons at white) of the synthetic cameras
 _DARK = 0.016  # signal, as a fraction of white, whose shot noise equals the read noise
@@ -56,7 +56,7 @@ def move(
 
     Args:
         images: [N, H, W, 3] uint8, padded at the bottom and on the right.
-        stalks: [N, T, 6], boxes and axes.
+        stalks: [N, T, 6], boxes and axes, or edges [N, T, R, 3], see `sections`.
         kinds: [N, T] int32, see `losses.assign`.
         sizes: [N, 2] int32, height and width of the images without padding.
         key: PRNG key.
@@ -87,6 +87,13 @@ def _transform_stalks(image: jax.Array, stalks: jax.Array, kinds: jax.Array, sha
     def across(x: jax.Array, y: jax.Array) -> jax.Array:
         return wide * (x - width / 2) + shear * (y - height / 2) + width / 2 + over
 
+    if stalks.ndim == 3:
+        rows = (jnp.arange(stalks.shape[1]) + 0.5) * STEP
+        source = (rows - down - height / 2) / tall + height / 2
+        left, right, visible = _edges_at(stalks, source, height, width)
+        left, right = across(left, source), across(right, source)
+        left, right = jnp.where(mirror, width - right, left), jnp.where(mirror, width - left, right)
+        return moved, jnp.stack([left, right, visible], axis=-1), kinds
     left, top, right, bottom, above, below = stalks.T
     first, last = jnp.minimum(above, below), jnp.maximum(above, below)
     above, below = across(above, top), across(below, bottom)
@@ -102,6 +109,22 @@ def _transform_stalks(image: jax.Array, stalks: jax.Array, kinds: jax.Array, sha
     above, below = above + slope * (low - top), below + slope * (high - bottom)
     kinds = jnp.where((end - begin < 3.0) | (high - low < 16.0), NOTHING, kinds)
     return moved, jnp.stack([begin, low, end, high, above, below], axis=-1), kinds
+
+
+def _edges_at(
+    edges: jax.Array, lines: jax.Array, height: jax.Array, width: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Interpolate edges [T, R, 3] at rows ``lines`` [K] of an image; return left, right and visible fraction, each [T, K]."""
+    place = jnp.clip(lines / STEP - 0.5, 0.0, edges.shape[1] - 1.0)
+    first = jnp.minimum(jnp.floor(place).astype(jnp.int32), edges.shape[1] - 2)
+    part = (place - first)[:, None]
+    left, right = jnp.moveaxis((edges[:, first] * (1.0 - part) + edges[:, first + 1] * part)[..., :2], -1, 0)
+    visible = edges[:, jnp.round(place).astype(jnp.int32), 2]
+    # What lies outside the image is black after moving.
+    inside = jnp.clip(jnp.minimum(right, width) - jnp.maximum(left, 0.0), 0.0, None) / jnp.maximum(right - left, 1e-3)
+    partly = jnp.where(inside > 0.0, jnp.minimum(visible, UNKNOWN), ABSENT)
+    visible = jnp.where(inside >= WHOLE, visible, partly)
+    return left, right, jnp.where((lines >= 0.0) & (lines < height), visible, ABSENT)
 
 
 def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Array) -> jax.Array:

@@ -17,7 +17,9 @@ import optax
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, init_detector, padded_shape
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.losses import detector_loss, segmenter_loss
+from jaxrl_vis.stalks.phenotyping.detector.section_losses import section_loss
 from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, move, relight
+from jaxrl_vis.stalks.phenotyping.training.edges import stack_edges
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 from jaxrl_vis.stalks.phenotyping.training.pool import Pool
 from jaxrl_vis.stalks.phenotyping.training.updates import Report, repeat
@@ -51,7 +53,8 @@ class Plan:
 
 
 Images = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Images [N, H, W, 3] uint8, stalks [N, T, 6] float32, kinds [N, T] int32, and sizes without padding [N, 2] int32."""
+"""Images [N, H, W, 3] uint8, stalks [N, T, 6] float32 (or edges [N, T, R, 3] for sections), kinds [N, T] int32, and sizes
+without padding [N, 2] int32."""
 
 
 def image_batch(examples: Sequence[Example], shape: tuple[int, int]) -> Images:
@@ -60,6 +63,8 @@ def image_batch(examples: Sequence[Example], shape: tuple[int, int]) -> Images:
     images = np.zeros((len(examples), *shape, 3), np.uint8)
     for image, example in zip(images, examples):
         image[: example.image.shape[0], : example.image.shape[1]] = example.image
+    if examples[0].edges is not None:
+        return images, *stack_edges([example.edges for example in examples], shape[0]), sizes
     stalks, kinds = (np.stack([getattr(example, name) for example in examples]) for name in ("stalks", "kinds"))
     return images, stalks, kinds, sizes
 
@@ -139,7 +144,10 @@ def update_networks(
 
     def loss(params):
         params = _map_frozen(jax.lax.stop_gradient, params, frozen)
-        total, parts = detector_loss(params["detector"], images, stalks, kinds, settings, dtype, near)
+        if settings.section:
+            total, parts = section_loss(params["detector"], images, stalks, kinds, sizes, settings, dtype, near)
+        else:
+            total, parts = detector_loss(params["detector"], images, stalks, kinds, settings, dtype, near)
         if strips is None:
             return total, parts
         crops, masks = augment_crops(strips[0], strips[1], variation)

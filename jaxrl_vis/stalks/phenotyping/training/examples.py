@@ -15,13 +15,14 @@ import numpy as np
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 from jaxrl_vis.stalks.phenotyping.detector.finder import resize, resize_factor, upper_segment
-from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
+from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, STEP, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, find_calibration, read_calibration
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, rgb8
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, outlined_mask
 from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE
+from jaxrl_vis.stalks.phenotyping.training.edges import Edges, annotated_edges, boxes_of, cut_edges, synthetic_edges
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
 from jaxrl_vis_envs.plants.field import Plot
@@ -39,6 +40,9 @@ _BARELY = 0.02  # visible fraction below which a stalk is ignored
 _THIN = 4
 _AT_STALKS = 0.8  # fraction of the random image crops that are placed around a stalk
 _SCALES = (-0.5, 0.6)  # range of the log scale factor of daylight images
+# The same with sections: at the scale of the finder, stalks of photographs are 15 to 45 pixels wide, and those of daylight images
+# at the training cameras' resolution 5 to 25.
+_SECTION_SCALES = (-1.2, 0.4)
 _HIGHER = 0.3  # fraction of the stalks with an additional crop around the upper height
 
 
@@ -53,6 +57,7 @@ class Example:
         kinds: [T] int32: `losses.NOTHING` (padding), ``UNCLEAR`` or ``STALK``.
         crops: Stalk crops [S, H, W, 3] uint8 at full resolution; S is not padded.
         masks: Masks [S, H, W] bool of the crops.
+        edges: Edges [T, R, 3] of the stalks in the resized image and their kinds [T]; None for networks without sections.
     """
 
     image: np.ndarray
@@ -60,6 +65,7 @@ class Example:
     kinds: np.ndarray
     crops: np.ndarray
     masks: np.ndarray
+    edges: Edges | None = None
 
 
 def synthetic_examples(family: Family, settings: Settings, seed: int, frames: int = 4) -> list[Example]:
@@ -77,7 +83,7 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
     rng = np.random.default_rng([seed, 17])
     by_day = settled.scene.share > 0
     if by_day:  # the scale of third-party images is not known exactly
-        pixels_per_metre *= float(np.exp(rng.uniform(*_SCALES)))
+        pixels_per_metre *= float(np.exp(rng.uniform(*(_SECTION_SCALES if settings.section else _SCALES))))
     length = len(sequence)
     chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
     examples = []
@@ -89,6 +95,11 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         mask_function = functools.partial(_instance_masks, instance, indices)
         example = _example(image, pixels_per_metre, stalks, kinds, mask_function, settings, rng, _HIGHER)
+        if settings.section:
+            scale = image.shape[0] / example.image.shape[0], image.shape[1] / example.image.shape[1]
+            pose, seen = sequence.drive.poses[frame], np.asarray(instance)
+            edges = synthetic_edges(sequence.plot, pose, true, seen, example.image.shape[:2], scale)
+            example = dataclasses.replace(example, edges=edges)
         if by_day:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.
             shape = crop_shape((settings.crop_height, settings.crop_width), family.rig.width / settings.full_width)
@@ -121,15 +132,18 @@ def cut_out(example: Example, max_size: tuple[int, int], rng: np.random.Generato
     size = example.image.shape[:2]
     lines, columns = (min(length, limit) for length, limit in zip(size, max_size))
     low, high = np.zeros(2, int), np.array([size[0] - lines, size[1] - columns])
-    there = np.flatnonzero(example.kinds == STALK)
+    boxes = example.stalks if example.edges is None else boxes_of(example.edges[0])
+    there = np.flatnonzero((example.kinds if example.edges is None else example.edges[1]) == STALK)
     if len(there) and rng.random() < _AT_STALKS:
-        box = example.stalks[rng.choice(there)]
+        box = boxes[rng.choice(there)]
         middle = np.array([box[1] + box[3], box[0] + box[2]]) / 2
         low, high = (
             np.clip(middle - 0.9 * np.array([lines, columns]), 0, high),
             np.clip(middle - [0.1 * lines, 0.1 * columns], 0, high),
         )
     top, left = (int(rng.integers(int(first), int(last) + 1)) for first, last in zip(low, high))
+    if example.edges is not None:
+        top = top // STEP * STEP  # edges are those of every eighth row
     stalks = example.stalks - np.array([left, top, left, top, left, left], np.float32)
     inside = np.array([[lines, columns]]) > np.maximum(stalks[:, [1, 0]], 0.0)
     shown = (np.minimum(stalks[:, [3, 2]], [lines, columns]) - np.maximum(stalks[:, [1, 0]], 0.0) > [16.0, 3.0]) & inside
@@ -137,7 +151,11 @@ def cut_out(example: Example, max_size: tuple[int, int], rng: np.random.Generato
     kinds = np.where(there, example.kinds, NOTHING)
     image = example.image[top : top + lines, left : left + columns]
     return dataclasses.replace(
-        example, image=np.ascontiguousarray(image), stalks=_clip_stalks(stalks, lines, columns), kinds=kinds
+        example,
+        image=np.ascontiguousarray(image),
+        stalks=_clip_stalks(stalks, lines, columns),
+        kinds=kinds,
+        edges=None if example.edges is None else cut_edges(example.edges, top, left, lines),
     )
 
 
@@ -261,9 +279,16 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         kinds = np.array([STALK] * len(stalks) + [UNCLEAR] * len(strips), np.int32)
         stalks = np.concatenate([stalks, strips])
         rng = np.random.default_rng([number, 18])
-        yield _example(
+        example = _example(
             image, resolution_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
         )
+        if settings.section:
+            shape = example.image.shape[:2]
+            masks = [_annotated_mask(each, size) if each["segmentation"] else None for each in annotations]
+            masks += [None] * len(strips)
+            edges = annotated_edges(stalks, kinds, masks, shape, (size[0] / shape[0], size[1] / shape[1]))
+            example = dataclasses.replace(example, edges=edges)
+        yield example
 
 
 def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:

@@ -5,13 +5,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect
 from jaxrl_vis.stalks.phenotyping.detector.finder import segment
-from jaxrl_vis.stalks.phenotyping.detector.losses import STALK, UNCLEAR
+from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR, true_sections
 from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, overlaps_with
 from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
+from jaxrl_vis.stalks.phenotyping.training.edges import stack_edges
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
 _CROPS = 8  # stalk crops per batch
@@ -24,11 +26,11 @@ class Finds:
     """Detections in one image, matched with its annotations.
 
     Attributes:
-        stalks: Boxes and axes [K, 6] float32, pixels of the resized image.
+        stalks: Boxes and axes [K, 6] float32, pixels of the resized image; of sections, if the networks detect these.
         scores: [K] float32.
         right: [K] bool, True for true positives.
         ignored: [K] bool, True for detections of unclear stalks or in crowd regions, which are not counted.
-        labels: Number of annotated stalks.
+        labels: Number of annotated stalks, or of their sections.
     """
 
     stalks: np.ndarray
@@ -77,9 +79,25 @@ def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], se
         image = image_batch([example], shape)[0][0]
         there = jax.device_get(detect(params, image, settings, dtype))
         stalks, scores = there.stalks[there.valid], there.scores[there.valid]
-        matched = match_finds(stalks, scores, example.stalks, example.kinds)
-        finds.append(Finds(stalks, scores, *matched, int((example.kinds == STALK).sum())))
+        truth, kinds = true_targets(example, shape, settings)
+        finds.append(Finds(stalks, scores, *match_finds(stalks, scores, truth, kinds), int((kinds == STALK).sum())))
     return finds
+
+
+def true_targets(example: Example, shape: tuple[int, int], settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the networks are to detect in an example: stalks [T, 6] or sections [B T, 6], and their kinds.
+
+    Args:
+        example: Image with true stalks.
+        shape: Height and width to which it is padded.
+        settings: Settings of the networks.
+    """
+    if not settings.section:
+        return example.stalks, example.kinds
+    edges, kinds = stack_edges([example.edges], shape[0])
+    size = np.array(example.image.shape[:2], np.int32)
+    stalks, kinds = true_sections(jnp.asarray(edges[0]), jnp.asarray(kinds[0]), jnp.asarray(size), settings.section)
+    return np.asarray(stalks).reshape(-1, 6), np.asarray(kinds).reshape(-1)
 
 
 def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,94 @@
+"""Training loss of networks that detect sections, see `sections`; the same terms as in `losses`, band by band."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxrl_vis.stalks.phenotyping.detector.anchors import encode
+from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, overlap
+from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, heads, normalise, region_features, section_proposals
+from jaxrl_vis.stalks.phenotyping.detector.losses import assign, distance, focal
+from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, section_anchors, true_sections
+
+_NEAR = 64  # jittered true sections per image that the head is trained on
+_JITTER = 0.15  # standard deviation, of their width
+
+
+def section_loss(
+    params: Any,
+    images: jax.Array,
+    edges: jax.Array,
+    kinds: jax.Array,
+    sizes: jax.Array,
+    settings: Settings,
+    dtype: Any,
+    key: jax.Array,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Compute the loss of the proposals and the box head on sections, averaged over images.
+
+    Args:
+        params: Parameters of the detector.
+        images: [N, H, W, 3] uint8, resized and padded.
+        edges: Edges of the true stalks [N, T, R, 3], see `sections`.
+        kinds: [N, T] int32, see `losses.assign`.
+        sizes: [N, 2] int32, height and width of the images without padding.
+        settings: Settings of the networks.
+        dtype: Compute dtype of the convolutions.
+        key: PRNG key of the jittered true sections.
+
+    Returns:
+        Total loss, and its terms by name: ``objectness``, ``offsets``, ``head`` and ``boxes``.
+    """
+    network = settings.detector(dtype)
+    anchors = jnp.asarray(section_anchors((images.shape[1], images.shape[2]), settings.section, settings.anchor_widths))
+    features = network.apply(params, normalise(images), method="features")
+    assert isinstance(features, jax.Array)
+    logits, codes = heads(network, params, features, "propose")
+
+    def of_image(features, logits, codes, edges, kinds, size, key):
+        truth, kinds = true_sections(edges, kinds, size, settings.section)
+
+        def assign_anchors(anchors, truth, kinds):
+            which, shows, none = assign(overlap(anchors[:, :4], truth[:, :4]), kinds, 0.5, 0.3)
+            return truth[which], shows, none
+
+        wanted, shows, none = jax.vmap(assign_anchors)(anchors, truth, kinds)
+        shows, none = shows.reshape(-1), none.reshape(-1)
+        loss = focal(logits, shows, none) / jnp.maximum(shows.sum(), 1)
+        placed = distance(codes, encode(wanted, anchors).reshape(-1, 6), shows)
+
+        proposals, bands, valid = section_proposals(*jax.lax.stop_gradient((logits, codes)), anchors, settings)
+        near, near_bands, near_valid = _jittered(truth, kinds, key)
+        proposals, bands = jnp.concatenate([proposals, near]), jnp.concatenate([bands, near_bands])
+        valid = jnp.concatenate([valid, near_valid])
+
+        def similarity(proposal, truth):
+            return 0.5 * (overlap(proposal[None, :4], truth[:, :4]) + band_overlap(proposal[None], truth, 4))[0]
+
+        alike = jax.vmap(similarity)(proposals, truth[bands])
+        best = jnp.zeros(kinds.shape).at[bands].max(jnp.where(kinds[bands] == STALK, alike, 0.0))
+        which, shows, none = assign(alike, kinds[bands], 0.5, 0.45, best[bands])
+        shows, none = shows & valid, none & valid
+        judged, refined = heads(network, params, region_features(features, proposals, True), "classify")
+        weight = (shows | none).astype(jnp.float32)
+        right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
+        judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
+        refinement = distance(refined, encode(truth[bands, which], proposals), shows)
+        return loss, placed, 2.0 * judgement, 2.0 * refinement
+
+    keys = jax.random.split(key, images.shape[0])
+    parts = jax.vmap(of_image)(features, logits, codes, edges, kinds, sizes, keys)
+    named = {name: part.mean() for name, part in zip(("objectness", "offsets", "head", "boxes"), parts)}
+    return sum(named.values(), jnp.zeros(())), named
+
+
+def _jittered(truth: jax.Array, kinds: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Sample true sections [B, T, 6] and jitter them horizontally; return them [M, 6], their bands [M], and validity [M]."""
+    choice, noise = jax.random.split(key)
+    clear = (kinds == STALK).reshape(-1)
+    drawn, places = jax.lax.top_k(jnp.where(clear, jax.random.uniform(choice, clear.shape), -1.0), min(_NEAR, clear.size))
+    stalks = truth.reshape(-1, 6)[places]
+    moves = _JITTER * jax.random.normal(noise, stalks.shape) * (stalks[:, 2:3] - stalks[:, :1])
+    return stalks + moves.at[:, jnp.array([1, 3])].set(0.0), places // kinds.shape[1], drawn >= 0.0

@@ -1,0 +1,158 @@
+"""Edges of stalks in the rows of an image, from synthetic plots, masks or boxes; see `detector.sections`."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxrl_vis.stalks.phenotyping.detector.sections import ABSENT, NOTHING, STALK, STEP, UNCLEAR, UNKNOWN
+from jaxrl_vis_envs.plants import Calibration
+from jaxrl_vis_envs.plants.cameras import Pose
+from jaxrl_vis_envs.plants.field import Plot, Stalk
+from jaxrl_vis_envs.plants.truth import outline
+
+MAX_EDGES = 96
+"""Maximum number of stalks per training image, those of rows behind included; further ones are dropped."""
+_HEIGHTS = 160  # of the outline of a stalk
+_NEAR = 0.1  # m: minimum depth of a stalk
+_FEW = 12  # minimum number of visible pixels of the resized image
+
+Edges = tuple[np.ndarray, np.ndarray]
+"""Edges [T, R, 3] float32, see `sections`, and kinds [T] int32."""
+
+
+def synthetic_edges(
+    plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, shape: tuple[int, int], scale: tuple[float, float]
+) -> Edges:
+    """Compute the edges of all visible stalks of an image; those of rows behind are ``UNCLEAR``.
+
+    Args:
+        plot: Plot with its plants.
+        pose: Pose of the left camera.
+        camera: True calibration of the camera.
+        instance: Instance image [H, W] of the original size.
+        shape: Height and width of the resized image.
+        scale: Vertical and horizontal factors from coordinates of the resized image to those of the original.
+    """
+    thin = max(int(min(scale)), 1)
+    thinned = instance[::thin, ::thin]
+    bins = ((np.arange(thinned.shape[0]) * thin + 0.5) / scale[0] / STEP).astype(int)
+    count = -(-shape[0] // STEP)
+    lines = (np.arange(count) + 0.5) * STEP * scale[0] - 0.5
+    pixel = thin * thin / (scale[0] * scale[1])  # of the resized image
+    found: list[tuple[float, np.ndarray, int]] = []
+    numbers, pixels = np.unique(thinned, return_counts=True)
+    for number, amount in zip(numbers.tolist(), pixels.tolist()):
+        if number < 0 or plot.stalks[number].row < 0 or amount * pixel < _FEW:
+            continue
+        sides = _sides(plot.stalks[number], pose, camera, lines)
+        if sides is None:
+            continue
+        left, right, there = sides
+        seen = np.bincount(np.minimum(bins, count - 1), (thinned == number).sum(axis=1), count)
+        room = np.bincount(np.minimum(bins, count - 1), minlength=count) * np.maximum(right - left, 1.0) / thin
+        visible = np.where(there, np.minimum(seen / np.maximum(room, 1e-6), 1.0), ABSENT)
+        row = np.stack([(left + 0.5) / scale[1], (right + 0.5) / scale[1], visible], axis=-1)
+        kind = STALK if plot.stalks[number].row == 0 else UNCLEAR
+        found.append((amount * (1.0 if kind == STALK else 1e-6), row.astype(np.float32), kind))
+    found.sort(key=lambda each: -each[0])
+    found = found[:MAX_EDGES]
+    edges = np.array([row for _, row, _ in found], np.float32).reshape(-1, count, 3)
+    return edges, np.array([kind for _, _, kind in found], np.int32)
+
+
+def _sides(
+    stalk: Stalk, pose: Pose, camera: Calibration, lines: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return the columns of the edges of a stalk in image rows [R], extrapolated where it is not, and where it is [R] bool."""
+    if pose.to_camera(stalk.points)[:, 2].min() < _NEAR:
+        return None
+    edges = outline(stalk, pose, camera, np.linspace(0.0, stalk.points[:, 2].max(), _HEIGHTS))
+    middle = edges[:, :, 1].mean(axis=1)
+    if np.ptp(middle) < 2.0:
+        return None
+    left, right = (_interpolate(lines, edges[:, side, 1], edges[:, side, 0]) for side in (0, 1))
+    return left, right, (lines >= middle.min()) & (lines <= middle.max())
+
+
+def _interpolate(lines: np.ndarray, at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate ``values`` at rows ``at`` linearly, and extrapolate them by the slope of their ends."""
+    order = np.argsort(at)
+    at, values = at[order], values[order]
+    reach = max(len(at) // 20, 1)
+    inner = np.interp(lines, at, values)
+    for end, other in ((0, reach), (-1, -1 - reach)):
+        slope = (values[end] - values[other]) / (at[end] - at[other]) if at[end] != at[other] else 0.0
+        beyond = lines < at[0] if end == 0 else lines > at[-1]
+        inner = np.where(beyond, values[end] + slope * (lines - at[end]), inner)
+    return inner
+
+
+def boxes_of(edges: np.ndarray) -> np.ndarray:
+    """Return the boxes [T, 4] float32 around the visible rows of edges [T, R, 3]; (0, 0, 0, 0) for stalks without such rows."""
+    boxes = np.zeros((len(edges), 4), np.float32)
+    for box, each in zip(boxes, edges):
+        rows = np.flatnonzero(each[:, 2] > UNKNOWN)
+        if len(rows):
+            box[:] = each[rows, 0].min(), rows[0] * STEP, each[rows, 1].max(), (rows[-1] + 1) * STEP
+    return boxes
+
+
+def cut_edges(edges: Edges, top: int, left: int, lines: int) -> Edges:
+    """Return the edges in a crop of ``lines`` rows that begins at row ``top``, a multiple of `STEP`, and column ``left``."""
+    first = top // STEP
+    rows = edges[0][:, first : first + -(-lines // STEP)] - np.array([left, left, 0], np.float32)
+    return rows, edges[1]
+
+
+def stack_edges(edges: Sequence[Edges | None], height: int) -> Edges:
+    """Batch the edges of N images ``height`` pixels tall: edges [N, T, R, 3] and kinds [N, T], T being `MAX_EDGES`."""
+    rows = -(-height // STEP)
+    batch, kinds = np.zeros((len(edges), MAX_EDGES, rows, 3), np.float32), np.full((len(edges), MAX_EDGES), NOTHING, np.int32)
+    batch[..., 2] = ABSENT
+    for part, kind, each in zip(batch, kinds, edges):
+        if each is not None:
+            count = min(each[0].shape[1], rows)
+            part[: len(each[0]), :count], kind[: len(each[1])] = each[0][:, :count], each[1]
+            # The last band may be padded: edges go on straight there, so that its sections have the right slope.
+            more = np.arange(1, rows - count + 1)[:, None]
+            last = part[:, max(count - 1, 0), None, :2]
+            part[:, count:, :2] = last + more * (last - part[:, max(count - 2, 0), None, :2])
+    return batch, kinds
+
+
+def annotated_edges(
+    stalks: np.ndarray, kinds: np.ndarray, masks: list[np.ndarray | None], shape: tuple[int, int], scale: tuple[float, float]
+) -> Edges:
+    """Compute the edges of annotated stalks.
+
+    Annotations need not contain a whole stalk: along its axis beyond the box, to the top and bottom of the image, its
+    visibility is `UNKNOWN`, so that these sections are neither targets nor background.
+
+    Args:
+        stalks: Boxes and axes [N, 6] in the original image.
+        kinds: Kinds [N] int32.
+        masks: Mask [H, W] bool of each stalk; None if it has only a box.
+        shape: Height and width of the resized image.
+        scale: Vertical and horizontal factors from coordinates of the resized image to those of the original.
+    """
+    count = -(-shape[0] // STEP)
+    lines = (np.arange(count) + 0.5) * STEP * scale[0]
+    edges = np.zeros((min(len(stalks), MAX_EDGES), count, 3), np.float32)
+    for row, stalk, mask in zip(edges, stalks, masks):
+        box_left, top, box_right, bottom, above, below = stalk
+        half = 0.5 * max(float(box_right - box_left - abs(below - above)), 1.0)
+        axis = above + (below - above) * (lines - top) / max(float(bottom - top), 1.0)
+        left, right = axis - half, axis + half
+        there = (lines >= top) & (lines <= bottom)
+        visible = np.where(there, 1.0, UNKNOWN)
+        filled = None if mask is None else np.flatnonzero(mask.any(axis=1))
+        if mask is not None and filled is not None and len(filled) > 1:
+            first = mask.argmax(axis=1)[filled].astype(float)
+            last = mask.shape[1] - mask[:, ::-1].argmax(axis=1)[filled].astype(float)
+            inside = (lines >= filled[0]) & (lines <= filled[-1] + 1)
+            left = np.where(inside, np.interp(lines, filled + 0.5, first), left)
+            right = np.where(inside, np.interp(lines, filled + 0.5, last), right)
+            shown = np.isin(lines.astype(int), filled)
+            visible = np.where(inside, np.where(shown, 1.0, 0.0), UNKNOWN)
+        row[:] = np.stack([left / scale[1], right / scale[1], visible], axis=-1)
+    return edges, np.asarray(kinds[:MAX_EDGES], np.int32)
