@@ -104,7 +104,7 @@ def _storage(path: Path) -> None:
 
 def read_annotations(folder: Path) -> None:
     from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-    from jaxrl_vis.stalks.phenotyping.training.examples import _annotated_mask, _annotated_stalk
+    from jaxrl_vis.stalks.phenotyping.training.annotated import _annotated_mask, _annotated_stalk
 
     data = read_annotations(folder)
     sizes = {each["id"]: (each["height"], each["width"]) for each in data["images"]}
@@ -232,7 +232,7 @@ def read_truth(folder: Path) -> None:
 
     _stalks_by_pair.cache_clear()
     image = np.zeros((*ANNOTATED, 3), np.uint8)
-    for each in find_truth(image, None, PlotFolder("plot", folder, ()), PairFiles("0", None, None)):
+    for each in find_truth(image, None, None, PlotFolder("plot", folder, ()), PairFiles("0", None, None)):
         assert each.mask.dtype == bool and np.isfinite(each.box).all()
 
 

@@ -50,7 +50,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
         views = stalks_in_view(sequence.plot, pair.pose, true, instance, np.asarray(pair.depth))
         ideal = perfect_detections(map(dataclasses.asdict, views), instance)
         finds, ground = find_with_ground(
-            (lambda image, pixels_per_metre, ideal=ideal: ideal) if options.truth else finder, left, right, stated
+            (lambda image, pixels_per_metre, band, ideal=ideal: ideal) if options.truth else finder, left, right, stated
         )
         sightings = measure_pair(finds, left, right, stated, ground=ground)
         owners, _ = match(finds, views)

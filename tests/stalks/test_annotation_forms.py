@@ -320,7 +320,7 @@ def test_regions_of_many_stalks_are_neither_stalks_nor_background(tmp_path):
     from tiny_detector import TINY
 
     from jaxrl_vis.stalks.phenotyping.detector.sections import STALK, UNCLEAR
-    from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
+    from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
 
     data = json.loads(coco("r.png"))
     crowd = {"id": 9, "image_id": 1, "category_id": 1, "iscrowd": 1, "bbox": [60, 10, 30, 70]}

@@ -23,16 +23,10 @@ from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_we
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.images import rgb8
 from jaxrl_vis.stalks.phenotyping.io.masks import decode_counts
+from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
 from jaxrl_vis.stalks.phenotyping.training.augment import augment_crops, move
 from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, _Pool, train
-from jaxrl_vis.stalks.phenotyping.training.examples import (
-    MAX_STALKS,
-    Example,
-    _instance_masks,
-    annotated_examples,
-    settings_for,
-    synthetic_examples,
-)
+from jaxrl_vis.stalks.phenotyping.training.examples import MAX_STALKS, Example, _instance_masks, synthetic_examples
 from jaxrl_vis_envs.plants import family
 
 # One program each, in place of one for every operation in them.

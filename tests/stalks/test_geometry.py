@@ -10,6 +10,7 @@ from PIL import Image, ImageOps
 
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 from jaxrl_vis.stalks.phenotyping.detector.finder import (
+    Band,
     Detection,
     _clear_border_rows,
     _in_whole_image,
@@ -155,7 +156,7 @@ def test_a_row_elsewhere_is_looked_for_at_the_size_that_it_has_there(disparity, 
     left, right, finds = stalks_at(disparity)
     asked = []
 
-    def find(image: np.ndarray, pixels_per_metre: float | None) -> list[Detection]:
+    def find(image: np.ndarray, pixels_per_metre: float | None, band: Band | None) -> list[Detection]:
         assert pixels_per_metre is not None
         asked.append(CAMERA.focal / pixels_per_metre)
         return finds if abs(asked[-1] * disparity / 54.2 - 1.0) < 0.12 else []

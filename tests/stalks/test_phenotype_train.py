@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights,
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import write_calibration
 from jaxrl_vis.stalks.phenotyping.io.masks import encode_mask, outlined_mask
-from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples, settings_for
+from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
 from jaxrl_vis_envs.plants import Calibration
 
 

@@ -16,8 +16,9 @@ from jaxrl_vis.stalks.phenotyping.detector.detect import init_detector, padded_s
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
+from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
 from jaxrl_vis.stalks.phenotyping.training.detector_training import beginning, image_batch, update_networks
-from jaxrl_vis.stalks.phenotyping.training.examples import Example, annotated_examples, cut_out, resize_crops, settings_for
+from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resize_crops
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, match_finds, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import photographs_of, split
 from jaxrl_vis.stalks.phenotyping.training.tuning import FROZEN, Tuning, tune

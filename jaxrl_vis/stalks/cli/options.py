@@ -23,6 +23,8 @@ _COMMANDS = {"phenotyping": "phenotype", "grasping": "grasp"}
 Purpose = Literal["phenotyping", "grasping"]
 DEFAULT_STEPS = 20_000
 """Default maximum number of updates of a training on synthetic images."""
+BAND_WEIGHTS = "weights for stalks in the band; the backbone is kept, and the output layers start anew, for sections"
+"""Note on weights that are trained further for other targets."""
 
 
 def check_extra(extra: Purpose) -> None:

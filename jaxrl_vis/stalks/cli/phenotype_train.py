@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import DEFAULT_STEPS, DetectorTraining, check_extra
+from jaxrl_vis.stalks.cli.options import BAND_WEIGHTS, DEFAULT_STEPS, DetectorTraining, check_extra
 from jaxrl_vis.stalks.cli.tuning import train_on_images
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ def _train(options: DetectorTraining) -> int:
     from jaxrl_vis.stalks.phenotyping.training.detector_training import Plan, train
     from jaxrl_vis.stalks.phenotyping.training.examples import Example, synthetic_examples
 
-    before, settings, origin_before = _start(options)
     family = options.read_family("phenotyping")
+    before, settings, origin_before = _start(options, family.scene.share > 0)
     first = _FIRST_SEED * (1 + options.seed)
     draw = functools.partial(synthetic_examples, family, settings)
     sources: list[Iterator[Example]] = [
@@ -86,15 +86,22 @@ def _train(options: DetectorTraining) -> int:
     return 0
 
 
-def _start(options: DetectorTraining) -> tuple[Any, "Settings", str]:
-    """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin."""
+def _start(options: DetectorTraining, by_day: bool) -> tuple[Any, "Settings", str]:
+    """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
+
+    By day, networks detect sections: nothing in an image of an unknown camera shows where the band is.
+    """
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
+    from jaxrl_vis.stalks.phenotyping.training.detector_training import start_sections
 
     start = options.start or "random"
     if start == "random":
-        return None, Settings(), ""
+        return None, Settings().for_sections() if by_day else Settings(), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
+    if by_day and not settings.section:
+        params, settings = start_sections(params, settings, options.seed)
+        print(f"{start}: {BAND_WEIGHTS}", flush=True)
     # The number of candidates is not tied to the weights: training adapts the head to new ones.
     settings = dataclasses.replace(settings, candidates=Settings().candidates)
     return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
 from jaxrl_vis.report.outputs import check_writable
-from jaxrl_vis.stalks.cli.options import DetectorTraining
+from jaxrl_vis.stalks.cli.options import BAND_WEIGHTS, DetectorTraining
 
 if TYPE_CHECKING:
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
@@ -47,7 +47,7 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
     enable_compilation_cache()
     from jaxrl_vis import __version__
     from jaxrl_vis.stalks.phenotyping.detector.weights import write_weights
-    from jaxrl_vis.stalks.phenotyping.training.examples import any_outlined
+    from jaxrl_vis.stalks.phenotyping.training.annotated import any_outlined
     from jaxrl_vis.stalks.phenotyping.training.tuning import Tuning, tune
 
     start, settings, origin = _start(options, folder, echo)
@@ -81,7 +81,7 @@ def train_on_images(options: DetectorTraining, folder: Path) -> int:
 
 def _read_examples(options: DetectorTraining, folder: Path, settings: Settings, count: int, echo: Any) -> list[Example]:
     """Read all images with their stalks and stalk crops, and report the progress every few seconds."""
-    from jaxrl_vis.stalks.phenotyping.training.examples import annotated_examples
+    from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples
 
     examples, last_report = [], time.monotonic()
     echo(f"reading {count} images ...")
@@ -140,7 +140,8 @@ def _report(
     for name, result in scores.items():
         overlap = overlaps.get(name, math.nan)
         echo(
-            f"{name:6} on {result.images} held-out images: {result.right} of {result.labels} stalks found, "
+            f"{name:6} on {result.images} held-out images: {result.right} of {result.labels} "
+            f"{'sections' if settings.section else 'stalks'} found, "
             f"{result.finds - result.right} false finds, F1 {result.f1:.2f}, AP50 {result.ap50:.2f}"
             + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
         )
@@ -157,17 +158,29 @@ def _report(
 def _start(options: DetectorTraining, folder: Path, echo: Any) -> tuple[Any, Settings, str]:
     """Return the initial parameters (None for random ones), settings of the networks, and a phrase for the origin.
 
+    Without a calibration, networks detect sections: nothing in an image shows where the band is.
+
     Raises:
         RequestError: Weights given by ``--start`` are for stalks of a very different size.
     """
     from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
     from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
-    from jaxrl_vis.stalks.phenotyping.training.examples import settings_for
+    from jaxrl_vis.stalks.phenotyping.io.calibration import find_calibration
+    from jaxrl_vis.stalks.phenotyping.training.annotated import settings_for
+    from jaxrl_vis.stalks.phenotyping.training.detector_training import start_sections
 
     start = options.start or "shipped"
+    calibrated = find_calibration(folder) is not None
     if start == "random":
-        return None, settings_for(folder, Settings(), options.label), ""
+        settings = Settings() if calibrated else Settings().for_sections()
+        return None, settings_for(folder, settings, options.label), ""
     params, settings, _ = read_weights(SHIPPED if start == "shipped" else Path(start))
+    origin = f", from {'the weights that ship' if start == 'shipped' else start}"
+    if not calibrated and not settings.section:
+        params, settings = start_sections(params, settings, options.seed)
+        echo(f"{start}: {BAND_WEIGHTS}")
+    if settings.section:
+        return params, settings_for(folder, settings, options.label), origin
     fitting = settings_for(folder, settings, options.label)
     if not 0.5 <= fitting.band_height / settings.band_height <= 2.0:
         why = (
@@ -186,4 +199,4 @@ def _start(options: DetectorTraining, folder: Path, echo: Any) -> tuple[Any, Set
         anchor_widths=settings.anchor_widths,
         candidates=Settings().candidates,
     )
-    return params, settings, f", from {'the weights that ship' if start == 'shipped' else start}"
+    return params, settings, origin

@@ -24,7 +24,7 @@ import jaxrl_vis
 from jaxrl_vis.host.files import write_atomically
 from jaxrl_vis.host.worker_pool import UnorderedMap, worker_pool
 from jaxrl_vis.stalks.digests import value_digest
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, Detections
+from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection, Detections
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import write_image
 from jaxrl_vis.stalks.phenotyping.io.names import file_name
@@ -54,9 +54,9 @@ from jaxrl_vis.stalks.results_folder import claim, is_current, pair_state, write
 from jaxrl_vis_envs.documents import read_json
 from jaxrl_vis_envs.plants import Calibration
 
-Find = Callable[[np.ndarray, float | None, PlotFolder, PairFiles], list[Detection]]
-"""Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row (None if unknown), and its folder
-and files."""
+Find = Callable[[np.ndarray, float | None, Band | None, PlotFolder, PairFiles], list[Detection]]
+"""Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row and the rows of the band (None if
+unknown), and its folder and files."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")
@@ -249,7 +249,7 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
     except Unusable as problem:
         return {"skipped": str(problem)}
     view = view_pair(
-        lambda image, pixels_per_metre: find(image, pixels_per_metre, plot, pair),
+        lambda image, pixels_per_metre, band: find(image, pixels_per_metre, band, plot, pair),
         left,
         right,
         calibration,

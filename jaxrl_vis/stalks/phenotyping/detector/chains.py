@@ -77,9 +77,7 @@ def _widths(sections: np.ndarray) -> np.ndarray:
     return np.maximum(wide - np.abs(sections[:, 5] - sections[:, 4]), 0.1 * wide)
 
 
-def _distances(
-    upper: np.ndarray, lower: np.ndarray, upper_wide: np.ndarray, lower_wide: np.ndarray, gap: float
-) -> np.ndarray:
+def _distances(upper: np.ndarray, lower: np.ndarray, upper_wide: np.ndarray, lower_wide: np.ndarray, gap: float) -> np.ndarray:
     """Return how badly the axes of pairs of sections [K, 6] continue each other, 0 for well; infinite if they cannot."""
     tall = upper[:, 3] - upper[:, 1]
     slopes = [(part[:, 5] - part[:, 4]) / tall for part in (upper, lower)]

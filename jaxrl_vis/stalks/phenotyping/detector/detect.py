@@ -16,6 +16,9 @@ from jaxrl_vis.stalks.phenotyping.detector.sections import decode_sections, sect
 # Relative difference of resolutions up to which a camera counts as one of training, where images were reduced by exactly four:
 # with 0.988 to 1.024 times that factor, F1 on 12 images of the shifted family was 0.952 instead of 0.969.
 _SAME_CAMERA = 0.06
+SECTION = 32
+"""Height of sections, pixels: for stalks 6 to 60 pixels wide, short enough to lie between leaves, and to be straight."""
+_SECTIONS = 384
 GRID = (14, 7)
 """Height and width of the pooled features of a region."""
 
@@ -81,6 +84,18 @@ class Settings:
             return self.width / width
         factor, usual = self.pixels_per_metre / pixels_per_metre, self.width / self.full_width
         return usual if abs(factor / usual - 1.0) <= _SAME_CAMERA else factor
+
+    def for_sections(self) -> "Settings":
+        """Return these settings for networks that detect sections, of which an image has more than stalks."""
+        usual = Settings()
+        return dataclasses.replace(
+            self,
+            section=SECTION,
+            anchor_widths=usual.anchor_widths,
+            candidates=usual.candidates,
+            proposals=_SECTIONS,
+            max_stalks=_SECTIONS,
+        )
 
     def detector(self, dtype: Any = jnp.float32) -> Detector:
         """Return the detector of these settings, with convolutions in ``dtype``."""

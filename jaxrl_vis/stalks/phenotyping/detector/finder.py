@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import cv2
@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered, cut_chain, link
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, pad
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.doubles import suppress_duplicates
@@ -22,7 +23,13 @@ from jaxrl_vis_envs.plants.truth import BAND, HEIGHTS
 _BATCH, _BATCH_ON_ACCELERATOR = 8, 32  # stalk crops per batch
 _SHOWN = 0.5  # minimum fraction of a stalk's axis outside black borders
 _MAX_ENLARGED = 3.0  # at more, a stalk is only three pixels wide and cannot be recognised
+_COVERED = 0.3  # minimum fraction of the band that the sections of a stalk cover
 _STRETCH = 1.12  # range of stretching in training: the networks accept image heights within this factor
+
+
+Band = Callable[[float], tuple[float, float]]
+"""Function that returns the first and last row of the band in a column of an image, pixels; (0, 0) is the centre of the first
+pixel. Networks that detect sections need it to cut stalks to the band; others recognise the band by themselves."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,24 +177,29 @@ class Finder:
         self.dtype = jnp.bfloat16 if accelerated else jnp.float32
         self._batch = _BATCH_ON_ACCELERATOR if accelerated else _BATCH
 
-    def __call__(self, image: np.ndarray, pixels_per_metre: float | None = None) -> Detections:
+    def __call__(self, image: np.ndarray, pixels_per_metre: float | None = None, band: Band | None = None) -> Detections:
         """Detect and segment the stalks of an image, sorted from left to right, without duplicates.
 
         Args:
             image: [H, W, 3] uint8.
             pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
+            band: Rows of the band; None if the camera is unknown. Without it, networks that detect sections return the part of
+                each stalk with the highest scores.
         """
         frame = find_frame(image)
-        detections = self._find(fill_borders(image, frame), pixels_per_metre, frame)
+        detections = self._find(fill_borders(image, frame), pixels_per_metre, frame, band)
         ordered = sorted(detections, key=lambda detection: sum(detection.axis))
         return Detections((_in_whole_image(detection, frame) for detection in ordered), doubt=detections.doubt)
 
-    def look(self, image: np.ndarray, pixels_per_metre: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(
+        self, image: np.ndarray, pixels_per_metre: float | None, band: Band | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Detect stalks without segmenting them.
 
         Args:
             image: [h, w, 3] uint8, without black borders.
             pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
+            band: Rows of the band in this image; None if the camera is unknown.
 
         Returns:
             Boxes and axes [N, 6] of all detections down to `Settings.min_score`, in continuous image coordinates, their
@@ -196,18 +208,21 @@ class Finder:
         settings = self._settings
         reduced, scale = resize(image, settings, pixels_per_metre)
         added = 0
-        if pixels_per_metre and settings.pixels_per_metre:
+        if pixels_per_metre and settings.pixels_per_metre and not settings.section:
             reduced, added = pad_to_training_height(reduced, settings)
         detected = jax.device_get(detect(self._params["detector"], pad(reduced), settings, self.dtype))
         assert detected.pooled is not None
+        if settings.section:
+            chains = link(detected.stalks[detected.valid], detected.scores[detected.valid], settings.section)
+            return *cut_to_band(chains, scale, band), np.asarray(detected.pooled)
         moved = detected.stalks[detected.valid] - np.array([0, added, 0, added, 0, 0], np.float32)
         return in_image(moved, scale), detected.scores[detected.valid], np.asarray(detected.pooled)
 
-    def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame) -> Detections:
+    def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame, band: Band | None) -> Detections:
         """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
         settings = self._settings
         relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
-        stalks, scores, pooled = self.look(image, pixels_per_metre)
+        stalks, scores, pooled = self.look(image, pixels_per_metre, None if band is None else _in_frame(band, frame))
         doubt = None if self.gate is None else self.gate.doubt(pooled, scores)
         selected = scores >= self._min_score
         stalks, scores = stalks[selected], scores[selected]
@@ -254,6 +269,40 @@ class Finder:
             crops = cut(on_device, filled, shape)
             masks.append(segment(self._params["segmenter"], crops, settings, self.dtype, full))
         return np.concatenate(jax.device_get(masks))[: len(stalks)]
+
+
+def cut_to_band(chains: list[Chain], scale: tuple[float, float], band: Band | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return boxes and axes [N, 6] in the original image, and scores [N], of the parts of chains in the band.
+
+    Without a band, the part of each chain with the highest scores; see `best_rows`.
+
+    Args:
+        chains: Chains in the resized image.
+        scale: Vertical and horizontal factors from coordinates of the resized image to those of the original.
+        band: Rows of the band in the original image.
+    """
+    stalks, scores = [], []
+    for chain in chains:
+        rows = best_rows(chain)
+        if band is not None:
+            column = float(np.median(chain.sections[:, 4:])) * scale[1] - 0.5
+            top, bottom = band(column)
+            rows = (top + 0.5) / scale[0], (bottom + 0.5) / scale[0]
+        if rows[1] - rows[0] > 1.0 and covered(chain, *rows) >= _COVERED:
+            stalks.append(cut_chain(chain, *rows))
+            scores.append(chain.score)
+    return in_image(np.array(stalks, np.float32).reshape(-1, 6), scale), np.array(scores, np.float32)
+
+
+def _in_frame(band: Band, frame: Frame) -> Band:
+    """Convert the rows of the band from coordinates of the whole image to those of a frame."""
+    down, over = frame.lines[0], frame.columns[0]
+
+    def inside(column: float) -> tuple[float, float]:
+        top, bottom = band(column + over)
+        return top - down, bottom - down
+
+    return inside
 
 
 def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.digests import file_digest
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection, Finder
+from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection, Finder
 from jaxrl_vis.stalks.phenotyping.detector.gate import read_gate
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 
@@ -58,7 +58,13 @@ def _cached_finder(weights: Path, min_score: float) -> Finder:
 
 
 def find_stalks(
-    weights: Path, min_score: float, image: np.ndarray, pixels_per_metre: float | None, plot: Any, pair: Any
+    weights: Path,
+    min_score: float,
+    image: np.ndarray,
+    pixels_per_metre: float | None,
+    band: Band | None,
+    plot: Any,
+    pair: Any,
 ) -> list[Detection]:
     """Detect the stalks of an image in any process: a `functools.partial` of this function can be pickled.
 
@@ -67,6 +73,7 @@ def find_stalks(
         min_score: Minimum score of a detection, 0 to 1.
         image: Left image [H, W, 3] uint8.
         pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
+        band: Rows of the band; None if the camera is unknown.
         plot, pair: Folder and files of the image; unused.
     """
-    return _cached_finder(weights, min_score)(image, pixels_per_metre)
+    return _cached_finder(weights, min_score)(image, pixels_per_metre, band)

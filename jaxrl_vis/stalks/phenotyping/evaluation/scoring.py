@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
 from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean_widths, measure_pair_as_thesis
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
@@ -143,7 +143,7 @@ def score_plot(
 
 
 def _true_detections(
-    stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, pixels_per_metre: float | None
+    stalks: list[StalkInView], instance: np.ndarray, image: np.ndarray, pixels_per_metre: float | None, band: Band | None
 ) -> list[Detection]:
     """Return ground-truth detections, with the signature of a detector; the image and its resolution are ignored."""
     return perfect_detections(map(dataclasses.asdict, stalks), instance, MIN_VISIBLE)

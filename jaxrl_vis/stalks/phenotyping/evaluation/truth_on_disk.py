@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
 from jaxrl_vis.stalks.phenotyping.evaluation.perfect import perfect_detections
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image
@@ -15,7 +15,9 @@ from jaxrl_vis_envs.documents import read_json
 _MAX_COORDINATE = 1e6  # pixels
 
 
-def find_truth(image: np.ndarray, pixels_per_metre: float | None, plot: PlotFolder, pair: PairFiles) -> list[Detection]:
+def find_truth(
+    image: np.ndarray, pixels_per_metre: float | None, band: Band | None, plot: PlotFolder, pair: PairFiles
+) -> list[Detection]:
     """Return the ground-truth detections in the left image of a pair of a synthetic plot, with a detector's signature.
 
     Args:

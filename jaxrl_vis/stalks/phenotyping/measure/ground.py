@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.measure.borders import find_frame
 from jaxrl_vis_envs.plants import Calibration
+from jaxrl_vis_envs.plants.truth import BAND
 
 _FOCAL = 1084.0  # pixels: focal length of the downscaled images, in which the grain of the ground remains visible
 _WINDOW = (5, 41)  # height and width in the downscaled image: flat, as the depth of the ground changes from row to row
@@ -25,6 +26,7 @@ _MAX_PITCH, _MAX_ROLL = math.radians(30.0), math.radians(12.0)
 _MIN_WINDOWS = 30
 _MIN_SPAN = 0.3  # minimum horizontal span of the inliers, as a fraction of the image's width
 _MAX_BELOW = 0.1  # maximum fraction of windows below the ground, which are mismatches
+_USUAL_HEIGHT = 0.42  # m: height of the cameras where no ground is found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +50,23 @@ class Ground:
         y = (line - calibration.centre[1]) / calibration.focal
         across, down, forwards = self.normal
         return (1.0 - depth * (across * x + down * y + forwards)) * self.camera_height
+
+    def line(self, column: float, height: float, depth: float, calibration: Calibration) -> float:
+        """Return the row of a point in a column at a ``height`` above the ground and a ``depth``, m; inverse of `height`."""
+        x = (column - calibration.centre[0]) / calibration.focal
+        across, down, forwards = self.normal
+        y = ((1.0 - height / self.camera_height) / depth - across * x - forwards) / down
+        return y * calibration.focal + calibration.centre[1]
+
+
+def band_lines(ground: Ground | None, calibration: Calibration, distance: float, column: float) -> tuple[float, float]:
+    """Return the first and last row of the band in a column of the left image, for stalks at a ``distance`` in m.
+
+    Without a ground plane, cameras are assumed to be level and at their usual height.
+    """
+    plane = ground or Ground((0.0, 1.0 / _USUAL_HEIGHT, 0.0))
+    top, bottom = (plane.line(column, height, distance, calibration) for height in reversed(BAND))
+    return top, bottom
 
 
 def find_ground(

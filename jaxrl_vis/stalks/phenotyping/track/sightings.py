@@ -1,6 +1,7 @@
 """Sightings: the stalks detected in one stereo pair, with their measurements where possible."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,17 +11,18 @@ import cv2
 import numpy as np
 
 from jaxrl_vis.config import fields
-from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
+from jaxrl_vis.stalks.phenotyping.detector.finder import Band, Detection
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
-from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
+from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_lines, find_ground
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure
 from jaxrl_vis.stalks.phenotyping.measure.width import strip_width
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import HEIGHTS
 
 NO_CALIBRATION = "no calibration"
-Find = Callable[[np.ndarray, float | None], list[Detection]]
-"""Detector of the stalks in a left image [H, W, 3] uint8, given its pixels per metre at the row, or None if unknown."""
+Find = Callable[[np.ndarray, float | None, Band | None], list[Detection]]
+"""Detector of the stalks in a left image [H, W, 3] uint8, given its pixels per metre at the row and the rows of the band, both
+None if unknown."""
 USUAL_DISTANCE = 0.8
 """Default distance from the cameras to the row, m."""
 _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is found at the usual one
@@ -150,10 +152,14 @@ def find_with_ground(
         Detections, and the ground plane, None if not found.
     """
     if calibration is None:
-        return find(left, None), None
+        return find(left, None, None), None
     with ThreadPoolExecutor(1) as aside:
         ground = aside.submit(lambda: find_ground(grey_at(left), grey_at(right), calibration, disparity))
-        return find(left, calibration.focal / distance), ground.result()
+
+        def band(column: float) -> tuple[float, float]:  # waits for the ground, but not before a detector asks
+            return band_lines(ground.result(), calibration, distance, column)
+
+        return find(left, calibration.focal / distance, band), ground.result()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,7 +209,8 @@ def view_pair(
     if there is None and len(detections) >= _AT_DISTANCE:
         return usual
     for distance in _OTHER_DISTANCES if there is None else (there,):
-        detections = find(left, calibration.focal / distance)
+        band = functools.partial(band_lines, ground, calibration, distance)
+        detections = find(left, calibration.focal / distance, band)
         sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
         there = row_distance(sightings)
         if there is not None and abs(there / distance - 1.0) <= _SAME_DISTANCE:

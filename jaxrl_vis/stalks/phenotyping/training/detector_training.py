@@ -52,6 +52,8 @@ class Plan:
     seed: int = 0
 
 
+OUTPUTS = ("objectness", "offsets", "judge", "refine")
+"""Names of the output layers of the detector."""
 Images = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Images [N, H, W, 3] uint8, stalks [N, T, 6] float32 (or edges [N, T, R, 3] for sections), kinds [N, T] int32, and sizes
 without padding [N, 2] int32."""
@@ -190,6 +192,18 @@ def initial_networks(settings: Settings, detector_key: jax.Array, segmenter_key:
         "detector": init_detector(settings, detector_key),
         "segmenter": Segmenter(settings.segmenter).lazy_init(segmenter_key, blank),
     }
+
+
+def start_sections(params: Any, settings: Settings, seed: int) -> tuple[Any, Settings]:
+    """Turn networks that detect stalks in the band into networks that detect sections, to be trained further.
+
+    The backbone, the hidden layers of the box head and the segmentation are kept; the output layers `OUTPUTS`, whose values
+    mean something else, are initialised at random.
+    """
+    settings = settings.for_sections()
+    fresh = init_detector(settings, jax.random.key(seed))["params"]
+    detector = {**params["detector"]["params"], **{name: fresh[name] for name in OUTPUTS}}
+    return {**params, "detector": {**params["detector"], "params": detector}}, settings
 
 
 def _optimiser() -> optax.GradientTransformation:

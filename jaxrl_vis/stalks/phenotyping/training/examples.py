@@ -2,9 +2,7 @@
 
 import dataclasses
 import functools
-import math
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -12,17 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
-from jaxrl_vis.stalks.phenotyping.detector.finder import resize, resize_factor, upper_segment
+from jaxrl_vis.stalks.phenotyping.detector.finder import resize, upper_segment
 from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, STEP, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut
-from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
-from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, find_calibration, read_calibration
-from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, rgb8
-from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, outlined_mask
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE
-from jaxrl_vis.stalks.phenotyping.training.edges import Edges, annotated_edges, boxes_of, cut_edges, synthetic_edges
+from jaxrl_vis.stalks.phenotyping.training.edges import Edges, boxes_of, cut_edges, synthetic_edges
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
 from jaxrl_vis_envs.plants.field import Plot
@@ -31,7 +23,7 @@ from jaxrl_vis_envs.plants.truth import BAND, outline, stalks_in_view
 
 MIN_VISIBLE = 0.3
 """Minimum visible fraction of a stalk's part in the band to count it as a `STALK`."""
-_MaskFunction = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
+MaskFunction = Callable[[np.ndarray, np.ndarray, tuple[int, int]], np.ndarray]
 """Function that returns the masks [N, h, w] bool of the crops of stalks with indices [N], given their positions (boxes and
 axes) [N or more, 6] and the (height, width) of crops."""
 MAX_STALKS = 56
@@ -40,8 +32,8 @@ _BARELY = 0.02  # visible fraction below which a stalk is ignored
 _THIN = 4
 _AT_STALKS = 0.8  # fraction of the random image crops that are placed around a stalk
 _SCALES = (-0.5, 0.6)  # range of the log scale factor of daylight images
-# The same with sections: at the scale of the finder, stalks of photographs are 15 to 45 pixels wide, and those of daylight images
-# at the training cameras' resolution 5 to 25.
+# The same with sections: at the scale of the finder, stalks of photographs are 15 to 45 pixels wide, and those of daylight
+# images at the training cameras' resolution 5 to 25.
 _SECTION_SCALES = (-1.2, 0.4)
 _HIGHER = 0.3  # fraction of the stalks with an additional crop around the upper height
 
@@ -81,9 +73,13 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
     settled = sequence.plot.family
     pixels_per_metre = sequence.drive.true.focal / settled.rig.distance
     rng = np.random.default_rng([seed, 17])
-    by_day = settled.scene.share > 0
+    by_day, crop_scale = settled.scene.share > 0, 1.0
     if by_day:  # the scale of third-party images is not known exactly
-        pixels_per_metre *= float(np.exp(rng.uniform(*(_SECTION_SCALES if settings.section else _SCALES))))
+        factor = float(np.exp(rng.uniform(*_SCALES)))
+        if settings.section:  # stalk crops keep the scale at which stalks fit into them
+            wider = float(np.exp(rng.uniform(*_SECTION_SCALES)))
+            crop_scale, factor = factor / wider, wider
+        pixels_per_metre *= factor
     length = len(sequence)
     chosen = sorted({min(int((part + rng.random()) * length / frames), length - 1) for part in range(frames)})
     examples = []
@@ -94,7 +90,8 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         mask_function = functools.partial(_instance_masks, instance, indices)
-        example = _example(image, pixels_per_metre, stalks, kinds, mask_function, settings, rng, _HIGHER)
+        how = (mask_function, settings, rng, _HIGHER, crop_scale)
+        example = make_example(image, pixels_per_metre, stalks, kinds, *how)
         if settings.section:
             scale = image.shape[0] / example.image.shape[0], image.shape[1] / example.image.shape[1]
             pose, seen = sequence.drive.poses[frame], np.asarray(instance)
@@ -171,7 +168,7 @@ def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
 def _instance_masks(
     instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Cut the masks of stalk crops out of an instance segmentation; see `_MaskFunction`."""
+    """Cut the masks of stalk crops out of an instance segmentation; see `MaskFunction`."""
     cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is outside the image
     return cut_out == indices[parts][:, None, None] + 1
 
@@ -207,20 +204,26 @@ def true_boxes(
     return np.array(stalks, np.float32).reshape(-1, 6), np.array(kinds, np.int32), np.array(indices, np.int32)
 
 
-def _example(
+def make_example(
     image: Any,
     pixels_per_metre: float | None,
     stalks: np.ndarray,
     kinds: np.ndarray,
-    mask_function: _MaskFunction,
+    mask_function: MaskFunction,
     settings: Settings,
     rng: Any,
     higher: float = 0.0,
+    crop_scale: float = 1.0,
 ) -> Example:
-    """Build the example of an image [H, W, 3]; a fraction ``higher`` of its stalks also gets a crop around the upper height."""
+    """Build the example of an image [H, W, 3].
+
+    A fraction ``higher`` of its stalks also gets a crop around the upper height. Crops have the size of those of an image with
+    ``crop_scale`` times the ``pixels_per_metre``.
+    """
     full_image = np.asarray(image)
     reduced, scale = resize(full_image, settings, pixels_per_metre)
-    relative_scale = settings.width / settings.full_width / settings.scale_for(full_image.shape[1], pixels_per_metre)
+    for_crops = pixels_per_metre * crop_scale if pixels_per_metre else None
+    relative_scale = settings.width / settings.full_width / settings.scale_for(full_image.shape[1], for_crops)
     shape = crop_shape((settings.crop_height, settings.crop_width), relative_scale)
     clear = np.flatnonzero(kinds == STALK)
     # Jitter the positions, as detections are not exact.
@@ -244,163 +247,3 @@ def _example(
     padded, padded_kinds = np.zeros((MAX_STALKS, 6), np.float32), np.full(MAX_STALKS, NOTHING, np.int32)
     padded[:count], padded_kinds[:count] = (stalks / divisor)[:count], kinds[:count]
     return Example(np.asarray(reduced), padded, padded_kinds, crops, masks)
-
-
-def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Iterator[Example]:
-    """Yield the examples of a folder of annotated images; see `read_annotations`.
-
-    The scale of the images is taken from the calibration in the folder, if there is one.
-
-    Raises:
-        RequestError: Annotations are missing or invalid, or an image is missing or differs in size from its annotations.
-    """
-    data = read_annotations(folder, labels)
-    resolution_of = _resolutions(folder, data["images"])
-    of_image: dict[int, list[dict[str, Any]]] = {}
-    for annotation in data["annotations"]:
-        of_image.setdefault(annotation["image_id"], []).append(annotation)
-    for number, about in enumerate(data["images"]):
-        size, path = (about["height"], about["width"]), folder / about["file_name"]
-        try:
-            there = image_size(path)
-            image = rgb8(read_image(path)) if there == size else None
-        except OSError as error:
-            raise RequestError(f"the annotations in {folder} name an image that cannot be read: {error}") from error
-        if image is None or image.shape[:2] != size:
-            # In an image of another size than the annotated one, boxes would be misplaced.
-            raise RequestError(
-                f"{path} has {there[1]} x {there[0]} pixels, but {about['source']} is for "
-                f"{size[1]} x {size[0]}: save the image at the size at which it was annotated"
-            )
-        every = of_image.get(about["id"], [])
-        annotations = [annotation for annotation in every if not annotation.get("iscrowd")]
-        stalks = np.array([_annotated_stalk(annotation, size) for annotation in annotations], np.float32).reshape(-1, 6)
-        strips = _strips([annotation for annotation in every if annotation.get("iscrowd")], stalks)
-        kinds = np.array([STALK] * len(stalks) + [UNCLEAR] * len(strips), np.int32)
-        stalks = np.concatenate([stalks, strips])
-        rng = np.random.default_rng([number, 18])
-        example = _example(
-            image, resolution_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
-        )
-        if settings.section:
-            shape = example.image.shape[:2]
-            masks = [_annotated_mask(each, size) if each["segmentation"] else None for each in annotations]
-            masks += [None] * len(strips)
-            edges = annotated_edges(stalks, kinds, masks, shape, (size[0] / shape[0], size[1] / shape[1]))
-            example = dataclasses.replace(example, edges=edges)
-        yield example
-
-
-def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
-    """Cover crowd regions (stalks annotated together) with overlapping strips [N, 6] float32 as wide as the image's stalks.
-
-    Detections are ignored by their overlap with unclear stalks, and would hardly overlap the box of a whole region.
-    """
-    strips = []
-    for crowd in crowds:
-        left, top, wide, tall = crowd["bbox"]
-        typical = float(np.median(stalks[:, 2] - stalks[:, 0])) if len(stalks) else tall / 8
-        count = int(np.clip(round(2 * wide / max(typical, 1.0)) - 1, 1, MAX_STALKS // 2))
-        narrow = 2 * wide / (count + 1)  # width, as each overlaps the next by half
-        begins = left + np.arange(count) * narrow / 2
-        strips += [[begin, top, begin + narrow, top + tall, begin + narrow / 2, begin + narrow / 2] for begin in begins]
-    return np.array(strips, np.float32).reshape(-1, 6)
-
-
-def _own_masks(
-    annotations: list[dict[str, Any]],
-    size: tuple[int, int],
-    parts: np.ndarray,
-    places: np.ndarray,
-    shape: tuple[int, int],
-) -> np.ndarray:
-    """Cut the masks of stalk crops out of annotations; see `_MaskFunction`.
-
-    One at a time: masks may overlap, and all of an image together could exceed the memory.
-    """
-    crops = [
-        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[index : index + 1], shape))
-        for index, part in enumerate(parts)
-    ]
-    return np.concatenate(crops)
-
-
-def _resolutions(folder: Path, images: list[dict[str, Any]]) -> dict[int, float | None]:
-    """Return the pixels per metre at the row of each image by its id; all None if the folder has no calibration.
-
-    Raises:
-        RequestError: The calibration cannot be read, or is for images of another size.
-    """
-    path = find_calibration(folder)
-    if path is None:
-        return dict.fromkeys((image["id"] for image in images), None)
-    calibration = read_calibration(path, image=folder / images[0]["file_name"])
-    for image in images:
-        check_size(calibration, image["width"], image["height"], str(folder / image["file_name"]))
-    return dict.fromkeys((image["id"] for image in images), calibration.focal / USUAL_DISTANCE)
-
-
-_MAX_ENLARGED = 3.0
-_MAX_CROP_WIDTH = 512  # pixels
-_MAX_WIDTH = 2048  # pixels: maximum width of a resized image
-
-
-def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
-    """Return settings with anchors adapted to the boxes of a folder's annotations.
-
-    If the folder has no calibration, images are resized so that boxes are as tall as the band; detection with networks trained
-    on them uses the same resizing. Stalk crops are scaled accordingly.
-
-    Raises:
-        RequestError: The annotations or the calibration of the folder cannot be read.
-    """
-    data = read_annotations(folder, labels)
-    densities = _resolutions(folder, data["images"])
-    known = all(densities.values())
-    widths = {image["id"]: image["width"] for image in data["images"]}
-    boxes = [annotation for annotation in data["annotations"] if not annotation.get("iscrowd")]
-    if not known:
-        tall = float(np.median([annotation["bbox"][3] / widths[annotation["image_id"]] for annotation in boxes]))
-        width = round(min(settings.band_height / tall, _MAX_WIDTH, _MAX_ENLARGED * max(widths.values())))
-        ratio = settings.full_width / settings.width
-        settings = dataclasses.replace(
-            settings, pixels_per_metre=0.0, width=max(width, 32), full_width=max(round(ratio * width), 32)
-        )
-    factors = {number: resize_factor(width, settings, densities[number]) for number, width in widths.items()}
-    sizes = np.array([np.array(annotation["bbox"][2:], float) * factors[annotation["image_id"]] for annotation in boxes])
-    # A stalk crop is at least twice as wide as the median box: trunks are thicker than stalks.
-    columns = 8 * math.ceil(2.0 * settings.full_width / settings.width * float(np.median(sizes[:, 0])) / 8)
-    return dataclasses.replace(
-        settings,
-        crop_width=min(max(settings.crop_width, columns), _MAX_CROP_WIDTH),
-        band_height=round(float(np.median(sizes[:, 1])), 1),
-        anchor_widths=tuple(round(float(width), 1) for width in np.quantile(sizes[:, 0], (0.2, 0.6, 0.95))),
-    )
-
-
-def any_outlined(folder: Path, labels: tuple[str, ...] = ()) -> bool:
-    """Return whether any annotated stalk of a folder has a segmentation besides its box."""
-    annotations = read_annotations(folder, labels)["annotations"]
-    return any(annotation["segmentation"] and not annotation.get("iscrowd") for annotation in annotations)
-
-
-def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.ndarray:
-    """Return the mask [H, W] bool of one annotation; its box if it has no segmentation."""
-    segmentation = annotation["segmentation"]
-    if isinstance(segmentation, dict):
-        return decode_mask(segmentation)
-    left, top, wide, tall = annotation["bbox"]
-    right, bottom = left + wide, top + tall
-    return outlined_mask(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
-
-
-def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
-    """Return the box and axis [6] of one annotation; the axis is fitted to its mask."""
-    left, top, wide, tall = annotation["bbox"]
-    right, bottom = left + wide, top + tall
-    line, column = np.nonzero(_annotated_mask(annotation, size))
-    axis = [left + wide / 2] * 2
-    if line.size > 50 and np.ptp(line) > 8:
-        slope, offset = np.polyfit(line + 0.5, column + 0.5, 1)
-        axis = [float(np.clip(offset + slope * edge, left, right)) for edge in (top, bottom)]
-    return [left, top, right, bottom, *axis]
