@@ -1,7 +1,7 @@
 """Chains: sections linked upwards to stalks, their scores, and the part of a chain within given rows. NumPy only.
 
 Sections of adjacent bands are linked where the axis of one continues that of the other and their widths are similar, best pairs
-first and one to one; then, over a gap of one band, those that are still free.
+first and one to one; then, over gaps of one to three bands that leaves hide, those that are still free.
 
 The score of a chain is 1 - sqrt(prod(1 - s)) over the scores s of its sections: several weak sections are evidence (five of 0.5
 give 0.82), and a single one is less than it says (one of 0.9 gives 0.68). The root allows for neighbours that err together.
@@ -14,8 +14,8 @@ import numpy as np
 _MIN_SCORE = 0.1  # of sections that are linked
 _SLOPE = 0.7  # maximum shift of the axis per height: stalks that lean by 35 degrees
 _WIDTHS = 0.5  # maximum difference of the logarithms of the widths
-_BESIDE = 0.6  # maximum distance of the axes where two sections meet, of the mean width
-_REACH = 2  # bands: 1 for adjacent ones
+_BESIDE = 0.4  # maximum distance of the axes where two sections meet, of the mean width
+_REACH = 4  # bands from one section to the next: leaves hide up to three in between
 _RANGE = 4  # sections of the part of a chain that stands for it where no band of heights is known
 
 
@@ -24,7 +24,7 @@ class Chain:
     """Sections of one stalk.
 
     Attributes:
-        sections: Boxes and axes [N, 6] float32, from the top down; a band may be missing between two.
+        sections: Boxes and axes [N, 6] float32, from the top down; bands may be missing between two.
         scores: [N] float32.
     """
 
