@@ -13,7 +13,7 @@ from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
 from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered, cut_chain, link
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, init_detector
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
-from jaxrl_vis.stalks.phenotyping.detector.finder import cut_to_band
+from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, cut_to_band
 from jaxrl_vis.stalks.phenotyping.detector.sections import (
     ABSENT,
     NOTHING,
@@ -264,3 +264,9 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     )
     assert found.valid.any() and set(found.stalks[found.valid][:, 1].tolist()) <= {0.0, 32.0}
     assert set((found.stalks[found.valid][:, 3] - found.stalks[found.valid][:, 1]).tolist()) == {32.0}
+    finder = Finder(params, every)
+    image = np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)
+    anywhere, scores, _ = finder.look(image, None)
+    inside, _, _ = finder.look(image, every.pixels_per_metre, lambda column: (9.5, 49.5))
+    assert len(anywhere) == len(scores) > 0 and len(inside) > 0
+    assert set(anywhere[:, 1].tolist()) <= {0.0, 32.0} and (inside[:, [1, 3]] == [10.0, 50.0]).all()

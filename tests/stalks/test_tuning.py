@@ -17,7 +17,7 @@ from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.sections import NOTHING, STALK, UNCLEAR
 from jaxrl_vis.stalks.phenotyping.detector.weights import read_weights, write_weights
 from jaxrl_vis.stalks.phenotyping.training.annotated import annotated_examples, settings_for
-from jaxrl_vis.stalks.phenotyping.training.detector_training import beginning, image_batch, update_networks
+from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS, beginning, image_batch, update_networks
 from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, resize_crops
 from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, match_finds, score
 from jaxrl_vis.stalks.phenotyping.training.photographs import photographs_of, split
@@ -130,11 +130,15 @@ def test_first_layers_stay_and_a_report_shows_held_out_images(folder, params, tm
     assert "step 1 " in said  # at least one: compilation is not counted
     page = (tmp_path / "mine.html").read_text()
     assert page.count("<img") % 2 == 0 and page.count("<img") >= 2 and "AP50" in page
-    before, (after, _, about) = read_weights(start)[0], read_weights(out)
+    before, (after, settings, about) = read_weights(start)[0], read_weights(out)
+    assert settings.section and "sections found" in said
+    for layers in (before["detector"]["params"], after["detector"]["params"]):
+        for name in OUTPUTS:  # they start anew
+            del layers[name]
     changes = differences(before, after)
     held = {name: change for name, change in changes.items() if name.split("/")[2].startswith(FROZEN)}
     assert held and max(held.values()) < 1e-3  # they are written with 16 bits
-    assert about["steps"] == 0 or max(changes.values()) > 1e-2
+    assert about["steps"] == 0 or max(changes.values()) > 3e-3
 
 
 def test_frozen_layers_do_not_decay(folder, params):
