@@ -259,9 +259,8 @@ def test_weights_say_whether_they_detect_sections(tmp_path):
     write_weights(tmp_path / "odd.safetensors", params, dataclasses.replace(settings, section=24), {})
     with pytest.raises(RequestError, match="section"):
         read_weights(tmp_path / "odd.safetensors")
-    found = jax.device_get(
-        detect(params["detector"], np.zeros((64, 64, 3), np.uint8), dataclasses.replace(settings, min_score=0.0))
-    )
+    every = dataclasses.replace(settings, min_score=0.0)
+    found = jax.device_get(detect(params["detector"], np.zeros((64, 64, 3), np.uint8), every))
     assert found.valid.any() and set(found.stalks[found.valid][:, 1].tolist()) <= {0.0, 32.0}
     assert set((found.stalks[found.valid][:, 3] - found.stalks[found.valid][:, 1]).tolist()) == {32.0}
     finder = Finder(params, every)

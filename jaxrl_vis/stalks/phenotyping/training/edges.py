@@ -13,6 +13,7 @@ from jaxrl_vis_envs.plants.truth import outline
 MAX_EDGES = 96
 """Maximum number of stalks per training image, those of rows behind included; further ones are dropped."""
 _HEIGHTS = 160  # of the outline of a stalk
+_COLUMNS = 1600  # of the instance image that suffice to estimate visibility
 _NEAR = 0.1  # m: minimum depth of a stalk
 _FEW = 12  # minimum number of visible pixels of the resized image
 
@@ -33,24 +34,26 @@ def synthetic_edges(
         shape: Height and width of the resized image.
         scale: Vertical and horizontal factors from coordinates of the resized image to those of the original.
     """
-    thin = max(int(min(scale)), 1)
+    thin = max(int(min(scale)), instance.shape[1] // _COLUMNS, 1)
     thinned = instance[::thin, ::thin]
-    bins = ((np.arange(thinned.shape[0]) * thin + 0.5) / scale[0] / STEP).astype(int)
-    count = -(-shape[0] // STEP)
+    count, total = -(-shape[0] // STEP), len(plot.stalks)
+    bins = np.minimum(((np.arange(thinned.shape[0]) * thin + 0.5) / scale[0] / STEP).astype(int), count - 1)
+    of_stalks = bins[:, None] * total + thinned
+    seen = np.bincount(of_stalks[thinned >= 0], minlength=count * total).reshape(count, total)  # pixels
+    sampled = np.bincount(bins, minlength=count)  # rows
     lines = (np.arange(count) + 0.5) * STEP * scale[0] - 0.5
     pixel = thin * thin / (scale[0] * scale[1])  # of the resized image
     found: list[tuple[float, np.ndarray, int]] = []
-    numbers, pixels = np.unique(thinned, return_counts=True)
-    for number, amount in zip(numbers.tolist(), pixels.tolist()):
-        if number < 0 or plot.stalks[number].row < 0 or amount * pixel < _FEW:
+    for number in np.flatnonzero(seen.any(axis=0)).tolist():
+        amount = int(seen[:, number].sum())
+        if plot.stalks[number].row < 0 or amount * pixel < _FEW:
             continue
         sides = _sides(plot.stalks[number], pose, camera, lines)
         if sides is None:
             continue
         left, right, there = sides
-        seen = np.bincount(np.minimum(bins, count - 1), (thinned == number).sum(axis=1), count)
-        room = np.bincount(np.minimum(bins, count - 1), minlength=count) * np.maximum(right - left, 1.0) / thin
-        visible = np.where(there, np.minimum(seen / np.maximum(room, 1e-6), 1.0), ABSENT)
+        room = sampled * np.maximum(right - left, 1.0) / thin
+        visible = np.where(there, np.minimum(seen[:, number] / np.maximum(room, 1e-6), 1.0), ABSENT)
         row = np.stack([(left + 0.5) / scale[1], (right + 0.5) / scale[1], visible], axis=-1)
         kind = STALK if plot.stalks[number].row == 0 else UNCLEAR
         found.append((amount * (1.0 if kind == STALK else 1e-6), row.astype(np.float32), kind))
