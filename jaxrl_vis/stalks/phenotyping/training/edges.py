@@ -14,7 +14,7 @@ MAX_EDGES = 96
 """Maximum number of stalks per training image, those of rows behind included; further ones are dropped."""
 _HEIGHTS = 160  # of the outline of a stalk
 _COLUMNS = 1600  # of the instance image that suffice to estimate visibility
-_NEAR = 0.1  # m: minimum depth of a stalk
+_NEAR = 0.1  # m: minimum depth of the parts of a stalk
 _FEW = 12  # minimum number of visible pixels of the resized image
 
 Edges = tuple[np.ndarray, np.ndarray]
@@ -67,9 +67,12 @@ def _sides(
     stalk: Stalk, pose: Pose, camera: Calibration, lines: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the columns of the edges of a stalk in image rows [R], extrapolated where it is not, and where it is [R] bool."""
-    if pose.to_camera(stalk.points)[:, 2].min() < _NEAR:
+    heights = np.linspace(0.0, stalk.points[:, 2].max(), _HEIGHTS)
+    # A tall stalk that leans over the camera has no projection there.
+    heights = heights[np.interp(heights, stalk.points[:, 2], pose.to_camera(stalk.points)[:, 2]) >= _NEAR]
+    if len(heights) < 2:
         return None
-    edges = outline(stalk, pose, camera, np.linspace(0.0, stalk.points[:, 2].max(), _HEIGHTS))
+    edges = outline(stalk, pose, camera, heights)
     middle = edges[:, :, 1].mean(axis=1)
     if np.ptp(middle) < 2.0:
         return None
