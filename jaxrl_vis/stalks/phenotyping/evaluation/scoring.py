@@ -19,7 +19,7 @@ from jaxrl_vis.stalks.phenotyping.evaluation.thesis import count_by_length, mean
 from jaxrl_vis.stalks.phenotyping.measure.stalk import Method
 from jaxrl_vis.stalks.phenotyping.track.follow import follow
 from jaxrl_vis.stalks.phenotyping.track.heights import stalk_widths
-from jaxrl_vis.stalks.phenotyping.track.sightings import Find, Sighting, find_with_ground, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, Find, Sighting, find_with_ground, measure_pair
 from jaxrl_vis_envs.plants import Family, Stalk, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import HEIGHTS, StalkInView, stalks_in_view
@@ -93,6 +93,8 @@ def score_plot(
     """
     sequence = Sequence.of(draw(family, seed))
     drive, plot = sequence.drive, sequence.plot
+    # By day, each plot has its own distance, which `phenotype run` estimates by stereo.
+    distance = plot.family.rig.distance if plot.family.scene.share > 0 else USUAL_DISTANCE
     frames: list[list[Sighting]] = []
     owners: list[list[int | None]] = []
     finds: list[tuple[float, float]] = []
@@ -103,7 +105,7 @@ def score_plot(
         stalks = stalks_in_view(plot, pair.pose, drive.true, instance, np.asarray(pair.depth))
         started = time.monotonic()
         finder = find or functools.partial(_true_detections, stalks, instance)
-        detections, ground = find_with_ground(finder, left, right, drive.stated)
+        detections, ground = find_with_ground(finder, left, right, drive.stated, distance=distance)
         selected = [place for place, detection in enumerate(detections) if detection.score >= min_score]
         finds_kept = [detections[place] for place in selected]
         frames.append(measure_pair(finds_kept, left, right, drive.stated, method, ground))

@@ -33,8 +33,8 @@ _THIN = 4
 _AT_STALKS = 0.8  # fraction of the random image crops that are placed around a stalk
 _SCALES = (-0.5, 0.6)  # range of the log scale factor of daylight images
 # The same with sections: at the scale of the finder, stalks of photographs are 15 to 45 pixels wide, and those of daylight
-# images at the training cameras' resolution 5 to 25.
-_SECTION_SCALES = (-1.2, 0.4)
+# images at the resolution of the training cameras 3 to 15 (medians of images).
+_SECTION_SCALES = (-1.6, 0.2)
 _HIGHER = 0.3  # fraction of the stalks with an additional crop around the upper height
 
 
