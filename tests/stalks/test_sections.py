@@ -27,10 +27,11 @@ from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights,
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, band_lines
 from jaxrl_vis.stalks.phenotyping.training.augment import move
 from jaxrl_vis.stalks.phenotyping.training.detector_training import OUTPUTS, start_sections
-from jaxrl_vis.stalks.phenotyping.training.edges import annotated_edges, stack_edges
+from jaxrl_vis.stalks.phenotyping.training.edges import _sides, annotated_edges, stack_edges
 from jaxrl_vis.stalks.phenotyping.training.examples import Example, cut_out, synthetic_examples
 from jaxrl_vis.stalks.phenotyping.training.held_out import true_targets
-from jaxrl_vis_envs.plants import Calibration, family
+from jaxrl_vis_envs.plants import Calibration, draw, family
+from jaxrl_vis_envs.plants.cameras import drive
 
 HEIGHT, WIDTH = 128, 160
 true_sections, decode_sections, encode = jax.jit(true_sections, static_argnums=3), jax.jit(decode_sections), jax.jit(encode)
@@ -220,12 +221,27 @@ def test_the_band_is_where_the_ground_says():
 # --- synthetic stalks, networks and weights ---
 
 
+LAYOUT = family.Layout(rows_behind=1, stalks_mean=12, stalks_sd=0, tillers=0.0, plot_length=0.8)
+FEW = dataclasses.replace(family.TRAINING, layout=LAYOUT, stalks=family.Stalks(diameter_mean=0.03)).at_width(211)
+
+
 @pytest.fixture(scope="module")
 def plot() -> Example:
-    layout = family.Layout(rows_behind=1, stalks_mean=12, stalks_sd=0, tillers=0.0, plot_length=0.8)
-    few = dataclasses.replace(family.TRAINING, layout=layout, stalks=family.Stalks(diameter_mean=0.03)).at_width(211)
-    (example,) = synthetic_examples(few, Settings().for_sections(), 3, frames=1)
+    (example,) = synthetic_examples(FEW, Settings().for_sections(), 3, frames=1)
     return example
+
+
+def test_a_stalk_that_leans_over_the_camera_keeps_its_lower_part():
+    plot = draw(FEW, 3)
+    camera, pose = drive(plot.family, plot.seed).true, drive(plot.family, plot.seed).poses[0]
+    stalk, lines = plot.stalks[0], np.arange(4.0, camera.height, 8.0)
+    points = stalk.points.copy()
+    points[:, :2] += np.linspace(0.0, 1.5, len(points))[:, None] ** 2 * (pose.position - points)[:, :2]
+    upright, leaning = (_sides(each, pose, camera, lines) for each in (stalk, dataclasses.replace(stalk, points=points)))
+    assert upright is not None and leaning is not None
+    assert pose.to_camera(points)[:, 2].min() < 0.0 and leaning[2][-3:].any()
+    foot = np.flatnonzero(upright[2])[-1]
+    np.testing.assert_allclose(leaning[0][foot], upright[0][foot], atol=3.0)
 
 
 def test_chains_of_true_sections_cut_to_the_band_are_the_true_boxes(plot):
