@@ -5,5 +5,7 @@ detector_networks   backbone, proposals, heads, segmentation in Flax    anchors 
 detect              image -> stalks in the band around 12 inches        weights   parameters in a file without pickle
 stalk_crops         crops along a stalk, cut out and pasted back        losses    training losses of the networks
 doubles             removal of duplicate detections by their masks      loading   detector from a weights file
+sections            parts of stalks in bands of the image    chains    sections linked to stalks
+section_losses      training loss on sections
 gate                probability that an image is misread                finder    whole pipeline: image -> boxes and masks
 """
