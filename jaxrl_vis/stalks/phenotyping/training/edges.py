@@ -24,7 +24,10 @@ Edges = tuple[np.ndarray, np.ndarray]
 def synthetic_edges(
     plot: Plot, pose: Pose, camera: Calibration, instance: np.ndarray, shape: tuple[int, int], scale: tuple[float, float]
 ) -> Edges:
-    """Compute the edges of all visible stalks of an image; those of rows behind are ``UNCLEAR``.
+    """Compute the edges of the visible stalks of an image.
+
+    By day, stalks of rows behind look like those of the near row: they are ``UNCLEAR``. At night, they are background, as the
+    light of the flash falls off.
 
     Args:
         plot: Plot with its plants.
@@ -43,10 +46,12 @@ def synthetic_edges(
     sampled = np.bincount(bins, minlength=count)  # rows
     lines = (np.arange(count) + 0.5) * STEP * scale[0] - 0.5
     pixel = thin * thin / (scale[0] * scale[1])  # of the resized image
+    by_day = plot.family.scene.share > 0
     found: list[tuple[float, np.ndarray, int]] = []
     for number in np.flatnonzero(seen.any(axis=0)).tolist():
         amount = int(seen[:, number].sum())
-        if plot.stalks[number].row < 0 or amount * pixel < _FEW:
+        row = plot.stalks[number].row
+        if row < 0 or (row > 0 and not by_day) or amount * pixel < _FEW:
             continue
         sides = _sides(plot.stalks[number], pose, camera, lines)
         if sides is None:
@@ -54,12 +59,12 @@ def synthetic_edges(
         left, right, there = sides
         room = sampled * np.maximum(right - left, 1.0) / thin
         visible = np.where(there, np.minimum(seen[:, number] / np.maximum(room, 1e-6), 1.0), ABSENT)
-        row = np.stack([(left + 0.5) / scale[1], (right + 0.5) / scale[1], visible], axis=-1)
-        kind = STALK if plot.stalks[number].row == 0 else UNCLEAR
-        found.append((amount * (1.0 if kind == STALK else 1e-6), row.astype(np.float32), kind))
+        columns = np.stack([(left + 0.5) / scale[1], (right + 0.5) / scale[1], visible], axis=-1).astype(np.float32)
+        kind = STALK if row == 0 else UNCLEAR
+        found.append((amount * (1.0 if kind == STALK else 1e-6), columns, kind))
     found.sort(key=lambda each: -each[0])
     found = found[:MAX_EDGES]
-    edges = np.array([row for _, row, _ in found], np.float32).reshape(-1, count, 3)
+    edges = np.array([columns for _, columns, _ in found], np.float32).reshape(-1, count, 3)
     return edges, np.array([kind for _, _, kind in found], np.int32)
 
 
