@@ -10,8 +10,9 @@ from tiny_detector import TINY
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.anchors import encode, make_anchors
+from jaxrl_vis.stalks.phenotyping.detector.boxes import roi_align, strip_half_width
 from jaxrl_vis.stalks.phenotyping.detector.chains import Chain, best_rows, covered, cut_chain, link
-from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect, init_detector
+from jaxrl_vis.stalks.phenotyping.detector.detect import GRID, Settings, detect, init_detector, region_features
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import Segmenter
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, cut_to_band
 from jaxrl_vis.stalks.phenotyping.detector.sections import (
@@ -148,6 +149,18 @@ def test_annotations_say_nothing_about_the_rest_of_a_stalk():
     mask[40:80, 62:71] = True
     edges, _ = annotated_edges(box, np.array([STALK]), [mask], (64, 80), (2.0, 2.0))
     np.testing.assert_allclose(edges[0, 2:5], [[31, 35.5, 1.0]] * 3)
+
+
+def test_features_of_sections_are_those_of_roi_align():
+    features = jax.random.normal(jax.random.key(0), (HEIGHT // 8, WIDTH // 4, 3))
+    stalks, _ = sections_of(*(straight(25 * place - 10, 0.3 - 0.1 * place, 6 + 3 * place) for place in range(7)))
+    stalks = jnp.asarray(stalks.reshape(-1, 6))
+    made = jax.jit(region_features, static_argnums=2)(features, stalks, 32)
+    tall, slope = 32.0, (stalks[:, 5] - stalks[:, 4]) / 32.0
+    half, middle = 1.5 * strip_half_width(stalks) + 6.0, 0.5 * (stalks[:, 4] + stalks[:, 5])
+    boxes = jnp.stack([middle - half, stalks[:, 1] - tall, middle + half, stalks[:, 3] + tall], axis=-1)
+    wanted = roi_align(features, boxes, GRID, (1 / 8, 1 / 4), 2, True, 3.0 * tall * slope)
+    np.testing.assert_allclose(made, wanted, atol=1e-5)
 
 
 # --- chains ---

@@ -138,3 +138,63 @@ def roi_align(
     moved = (lean * horizontal)[:, None] * ((jnp.arange(size[0]) + 0.5) / size[0] - 0.5)
     columns = weights(scaled[:, :1] + moved, scaled[:, 2:3] + moved, size[1], width)
     return jnp.einsum("nijw,niwc->nijc", columns, tall)
+
+
+def roi_rows(features: jax.Array, top: jax.Array, bottom: jax.Array, cells: int, scale: float, samples: int = 2) -> jax.Array:
+    """Interpolate the rows of regions that span the whole width, the first half of `roi_align` with ``aligned``.
+
+    Args:
+        features: Feature map [H, W, C].
+        top, bottom: First and last rows [B] of the regions, in box coordinates.
+        cells: Number of rows of the grid.
+        scale: Factor from box coordinates to feature coordinates.
+        samples: Sampling points per grid cell, which are averaged.
+
+    Returns:
+        Features [B, cells, W, C] of the rows.
+    """
+    fraction = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
+    low, high = top * scale - 0.5, bottom * scale - 0.5
+    place = low[:, None] + (high - low)[:, None] * fraction
+    inside = (place >= -1.0) & (place <= features.shape[0])
+    place = jnp.clip(place, 0.0, features.shape[0] - 1.0)
+    weight = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(features.shape[0])), 0.0) * inside[..., None]
+    return jnp.einsum("bih,hwc->biwc", weight.reshape(len(top), cells, samples, -1).mean(axis=2), features)
+
+
+def roi_columns(
+    rows: jax.Array,
+    of_region: jax.Array,
+    left: jax.Array,
+    right: jax.Array,
+    lean: jax.Array,
+    cells: int,
+    scale: float,
+    samples: int = 2,
+) -> jax.Array:
+    """Pool rows of `roi_rows` to the grids of regions, the second half of `roi_align`.
+
+    Args:
+        rows: Features [B, h, W, C].
+        of_region: Index into ``rows`` of each region, [N] int32.
+        left, right: Columns [N] of the regions at half their height, in box coordinates.
+        lean: [N], horizontal shift of the bottom of a region relative to its top.
+        cells: Number of columns of the grid.
+        scale: Factor from box coordinates to feature coordinates.
+        samples: Sampling points per grid cell, which are averaged.
+
+    Returns:
+        Pooled features [N, h, cells, C].
+    """
+    _, height, width, channels = rows.shape
+    fraction = (jnp.arange(cells * samples) + 0.5) / (cells * samples)
+    moved = (lean * scale)[:, None] * ((jnp.arange(height) + 0.5) / height - 0.5)
+    place = (left * scale - 0.5)[:, None, None] + moved[..., None] + ((right - left) * scale)[:, None, None] * fraction
+    inside = (place >= -1.0) & (place <= width)
+    place = jnp.clip(place, 0.0, width - 1.0)
+    first = jnp.floor(place).astype(jnp.int32)
+    part = (place - first)[..., None]
+    line = jnp.arange(height)[None, :, None]
+    band = of_region[:, None, None]
+    values = rows[band, line, first] * (1.0 - part) + rows[band, line, jnp.minimum(first + 1, width - 1)] * part
+    return (values * inside[..., None]).reshape(-1, height, cells, samples, channels).mean(axis=3)

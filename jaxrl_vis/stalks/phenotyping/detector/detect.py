@@ -9,7 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxrl_vis.stalks.phenotyping.detector.anchors import decode, make_anchors
-from jaxrl_vis.stalks.phenotyping.detector.boxes import band_overlap, roi_align, strip_half_width, suppress
+from jaxrl_vis.stalks.phenotyping.detector.boxes import (
+    band_overlap,
+    roi_align,
+    roi_columns,
+    roi_rows,
+    strip_half_width,
+    suppress,
+)
 from jaxrl_vis.stalks.phenotyping.detector.detector_networks import ANCHOR_STRIDE, PADDING, STRIDE, Detector
 from jaxrl_vis.stalks.phenotyping.detector.sections import decode_sections, section_anchors
 
@@ -134,12 +141,17 @@ def normalise(images: jax.Array) -> jax.Array:
     return 2.0 * jnp.sqrt(images.astype(jnp.float32) / 255.0) - 1.0
 
 
-def region_features(features: jax.Array, stalks: jax.Array, section: bool = False) -> jax.Array:
+def region_features(features: jax.Array, stalks: jax.Array, section: int = 0) -> jax.Array:
     """Pool features [H, W, C] of an image along stalks [R, 6] to [R, *GRID, C].
 
     A region follows the axis, so that a leaning stalk stands upright in it: in a clump, two stalks that lean differently have
     nearly the same box. It includes some context on all sides, which the box head needs, and with sections the bands above and
     below.
+
+    Args:
+        features: Features of the image.
+        stalks: Boxes and axes.
+        section: Height of the sections that ``stalks`` are; 0 for other stalks.
     """
     tall = jnp.maximum(stalks[:, 3] - stalks[:, 1], 1e-3)
     more = (1.0 if section else 0.08) * tall
@@ -147,8 +159,14 @@ def region_features(features: jax.Array, stalks: jax.Array, section: bool = Fals
     half = 1.5 * strip_half_width(stalks) + 6.0
     top, bottom = stalks[:, 4] - more * slope, stalks[:, 5] + more * slope
     box = [0.5 * (top + bottom) - half, stalks[:, 1] - more, 0.5 * (top + bottom) + half, stalks[:, 3] + more]
-    scale = (1.0 / STRIDE[0], 1.0 / STRIDE[1])
-    return roi_align(features, jnp.stack(box, axis=-1), GRID, scale, samples=2, aligned=True, lean=bottom - top)
+    scale, boxes = (1.0 / STRIDE[0], 1.0 / STRIDE[1]), jnp.stack(box, axis=-1)
+    if section:
+        # Regions of a band have the same rows: these are interpolated once.
+        tops = section * jnp.arange(-(-features.shape[0] * STRIDE[0] // section), dtype=jnp.float32)
+        rows = roi_rows(features, tops - section, tops + 2 * section, GRID[0], scale[0])
+        bands = jnp.round(stalks[:, 1] / section).astype(jnp.int32)
+        return roi_columns(rows, bands, boxes[:, 0], boxes[:, 2], bottom - top, GRID[1], scale[1])
+    return roi_align(features, boxes, GRID, scale, samples=2, aligned=True, lean=bottom - top)
 
 
 def best_proposals(
@@ -228,7 +246,7 @@ def classify_proposals(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
     """Score and refine proposals [P, 6] of one image with features [H, W, C], and remove duplicates."""
-    regions = region_features(features, proposals, settings.section > 0)
+    regions = region_features(features, proposals, settings.section)
     logits, codes = heads(network, params, regions, "classify")
     scores = jax.nn.sigmoid(logits)
     stalks = (decode_sections if settings.section else decode)(codes, proposals)

@@ -71,7 +71,7 @@ def section_loss(
         best = jnp.zeros(kinds.shape).at[bands].max(jnp.where(kinds[bands] == STALK, alike, 0.0))
         which, shows, none = assign(alike, kinds[bands], 0.5, 0.45, best[bands])
         shows, none = shows & valid, none & valid
-        judged, refined = heads(network, params, region_features(features, proposals, True), "classify")
+        judged, refined = heads(network, params, region_features(features, proposals, settings.section), "classify")
         weight = (shows | none).astype(jnp.float32)
         right = optax.sigmoid_binary_cross_entropy(judged, shows.astype(jnp.float32))
         judgement = (right * weight).sum() / jnp.maximum(weight.sum(), 1.0)
