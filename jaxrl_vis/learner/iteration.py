@@ -36,11 +36,11 @@ _UPDATES = 0x757064
 
 
 class Learned(NamedTuple):
-    """Result of an iteration.
+    """Result of an iteration, for one learner or, after `jax.vmap`, for S learners.
 
     Attributes:
         loop: State at the start of the next iteration.
-        metrics: [S] float32 by name.
+        metrics: [] or [S] float32 by name.
     """
 
     loop: LoopState
@@ -60,7 +60,10 @@ def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: j
 
 
 def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
-    """Update the normaliser with the observations of a rollout."""
+    """Update the normalisers from the observations of a rollout, or from as many transitions sampled from it.
+
+    Which of both is set by ``normalizer_source``. Goals update their own normaliser if there is one, else the common one.
+    """
     if config.study.normalizer_source == "rollouts":
         observations, goals = episodes.observations, episodes.observations[:, -1:]
         if train.goal_normalizer is not None:

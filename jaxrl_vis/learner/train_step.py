@@ -117,7 +117,7 @@ class TrainStep:
 
     @property
     def replay_spec(self) -> ReplayState:
-        """Shapes of one seed's replay, or of one device's part of it, without allocating it."""
+        """Shapes and dtypes of one seed's replay, or of one device's part of it; nothing is allocated."""
         observation = self.env.observation_spec
         stored = self.auxiliary.stored_spec(observation, self.env.horizon)
         return self.replay.spec(observation, self.env.goal_state_size, self.env.action_size, stored)
@@ -129,7 +129,7 @@ class TrainStep:
 
     @property
     def parts_spec(self) -> list[Played]:
-        """Shapes and placement of the parts of a rollout, as `learn` takes them."""
+        """Shapes, dtypes and placement of the parts of a rollout, as `learn` takes them."""
         spec = played_spec(self.env, self.part_size, self.config.run.seeds)
         spec = self.layout.with_shardings(spec, self.layout.by_environment)
         return [spec] * math.ceil(self.config.run.num_envs / self.part_size)

@@ -22,7 +22,8 @@ def is_finished(
 ) -> bool:
     """Return True if a run is complete, with a valid last checkpoint, its evaluation, and its images.
 
-    The last checkpoint is that after ``total`` iterations, or after an early end.
+    The last checkpoint is that after ``total`` iterations, or after an early end. If it cannot be read, one line is passed to
+    ``echo``, and the run is not complete.
     """
     last = _last_saved(checkpoints)
     if last < total and not has_ended_early(folder, programs.config, programs.seeds, last):

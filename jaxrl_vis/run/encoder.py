@@ -19,7 +19,10 @@ from jaxrl_vis_envs.base import GoalEnv
 
 
 def _collect(env: GoalEnv, episodes: int) -> Callable[[jax.Array], jax.Array]:
-    """Return a function key -> images [N, C, H, W] uint8 of episodes of random actions: all observations, and the goals."""
+    """Build the function key -> images [N, C, H, W] uint8 of episodes of random actions: after every step, and of the goals.
+
+    N is ``episodes`` times T + 1.
+    """
 
     def episode(key: jax.Array) -> jax.Array:
         start_key, action_key = jax.random.split(key)

@@ -66,7 +66,7 @@ class Milestones:
             self._best = score
 
     def end_reason(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
-        """Return the reason to end the run after this evaluation; None to continue."""
+        """Call all ``callbacks`` with the report; return the reason to end the run after this evaluation, None to continue."""
         asked = False
         for callback in callbacks:  # each of them, also after one that asks to stop
             asked |= callback(report) is True

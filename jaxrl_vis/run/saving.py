@@ -38,7 +38,7 @@ def import_saving_libraries() -> None:
 
 
 class Saver:
-    """Saves the state of one run.
+    """Writer of a run's checkpoints, recent states and dumps of non-finite states.
 
     Args:
         programs: Programs of the run.
@@ -177,7 +177,7 @@ class Saver:
 
     @property
     def resume(self) -> str:
-        """Command line options that resume the run, quoted for a shell."""
+        """Hint for messages: the command-line options that resume the run, quoted for a shell."""
         return f"go on with --run-dir {shlex.quote(str(self._folder.path))} --resume"
 
     @contextlib.contextmanager
@@ -207,7 +207,15 @@ class Saver:
     def stop_nonfinite(
         self, loop: LoopState, iteration: int, place: str, values: PerSeed, broken: list[str] | None = None
     ) -> None:
-        """Dump the state and raise NonFiniteError."""
+        """Dump the state, unless it is distributed over several processes, and raise NonFiniteError.
+
+        Args:
+            loop: The state.
+            iteration: Iterations completed.
+            place: Location of the non-finite numbers, for the message.
+            values: Metrics of the failed iteration or evaluation.
+            broken: Names of the non-finite leaves of ``loop``; None to search for them.
+        """
         with contextlib.suppress(StorageError):
             self._checkpoints.wait()
         newest = self._checkpoints.newest()

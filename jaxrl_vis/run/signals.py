@@ -123,7 +123,7 @@ class Interruption(_Handlers):
 
     Attributes:
         signal: The first signal received, or None.
-        is_urgent: True if Ctrl-C, SIGTERM or SIGQUIT came twice.
+        is_urgent: True after a second signal out of Ctrl-C, SIGTERM, SIGQUIT and SIGBREAK.
     """
 
     def __init__(self) -> None:

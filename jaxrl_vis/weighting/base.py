@@ -235,12 +235,12 @@ def loss_order(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def to_vector(by_name: Mapping[str, jax.Array]) -> jax.Array:
-    """Stack the scalars of all losses: [K], float32 or wider."""
+    """Stack the scalars of all losses in the order of `loss_order`: [K], float32 or wider."""
     return jnp.stack([to_float32(jnp.asarray(by_name[name])) for name in loss_order(by_name)])
 
 
 def by_name(names: Iterable[str], vector: jax.Array) -> dict[str, jax.Array]:
-    """Split a vector [K] into scalars by the names of the losses."""
+    """Split a vector [K], in the order of `loss_order`, into scalars by the names of the losses."""
     return {name: vector[index] for index, name in enumerate(loss_order(names))}
 
 

@@ -64,8 +64,8 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: Eps
 def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: Heads = "always") -> Weighting:
     """Use an auxiliary loss in the shared parameters, with weight 1, only if its gradient does not oppose the main one's.
 
-    Weight 1 where the cosine of the two gradients is at least 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine Similarity"). Only
-    the sign matters, so no norm is needed, and logarithms do not change the weights.
+    The weight is 1 if the cosine of the two gradients is at least 0, else 0 (Du et al., 2018; thesis 5.2.3.3, "Cosine
+    Similarity"). Only the sign matters, so no norm is needed, and logarithms do not change the weights.
 
     Args:
         log: Whether to minimise the logarithms of the losses.

@@ -92,7 +92,7 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
     """Balance losses by logarithms, and their averaged gradients by norm (DB-MTL; Lin et al., 2023, "Dual-Balancing").
 
     Each gradient of log(L_i + eps) is averaged over steps, m_i <- g_i + (beta / t^sigma) (m_i - g_i), initially 0; the
-    direction is the sum of all m_i, each rescaled to the norm of the longest. Suited to losses of any units. The noise of a
+    direction is the sum of all m_i, each rescaled to the largest of their norms. Suited to losses of any units. The noise of a
     loss close to its minimum is amplified to that norm as well.
 
     Args:
@@ -101,7 +101,7 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
         eps, main_eps: See `Weighting`.
 
     Raises:
-        RequestError: ``beta`` is not between 0 and 1.
+        RequestError: ``beta`` is not between 0 and 1, or ``eps`` or ``main_eps`` is not positive.
     """
     _check_share("db_mtl", "beta", beta)
 

@@ -70,7 +70,7 @@ class Weighted(NamedTuple):
 
 
 def everything(params: Params) -> Params:
-    """Select all parameters as shared."""
+    """Return the argument: selects all parameters as shared, and reduces nothing."""
     return params
 
 
@@ -168,8 +168,9 @@ def weighted_grad(
         (params, state, *args) -> `Weighted`, with state from ``weighting.init(names, shared(params))``.
 
     Raises:
-        RequestError: The method is unknown, or does not support the weighting; from the returned function: ``losses_fn`` does
-            not return a dictionary of scalars, or the losses are not those with which the state was initialised.
+        RequestError: The method is unknown, does not support the weighting, or is latents without ``encode``; from the returned
+            function: ``losses_fn`` does not return a dictionary of scalars, or the losses are not those with which the state
+            was initialised.
     """
     if mode not in get_args(GradientMode):
         raise RequestError(f"unknown gradient mode {mode!r}{nearest(mode, get_args(GradientMode))}")
@@ -233,7 +234,7 @@ def _gradient_by_latents(
     state: WeightingState,
     *args: Any,
 ) -> Weighted:
-    """Compute the weighted gradient with one pass through the shared parameters; arguments as for `weighted_grad`."""
+    """Compute the weighted gradient from the gradients with respect to latents; arguments as for `weighted_grad`."""
     through = latents.encode(encode, shared(params), *args)
     # Trace the losses to find which latents and parameters each of them reads.
     program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)

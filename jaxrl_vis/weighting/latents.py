@@ -53,7 +53,12 @@ class Through:
         return self.latents if self.has_names else self.latents[_ALL]
 
     def backward(self, at_latents: AtLatents, coefficients: Mapping[str, jax.Array]) -> Params:
-        """Compute the gradient of a weighted sum of losses in the shared parameters, float32."""
+        """Compute the gradient of a weighted sum of losses with respect to the shared parameters, float32 or wider.
+
+        Args:
+            at_latents: Gradients of the losses with respect to the latents.
+            coefficients: [] float32 by name; losses without one are left out.
+        """
         total = jax.tree.map(
             lambda leaf: jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32)), self.encoder_params
         )
@@ -65,7 +70,12 @@ class Through:
         return total
 
     def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
-        """Compute the inner products of the losses' gradients with a direction in the shared parameters, [] float32 by name."""
+        """Compute the inner products of the losses' gradients with a direction in the shared parameters, [] float32 by name.
+
+        Args:
+            direction: Tree like the shared parameters.
+            at_latents: Gradients of the losses with respect to the latents.
+        """
         along, read = like(direction, self.encoder_params), {group for at in at_latents.values() for group in at}
         tangents = {
             group: jax.jvp(encode, (self.encoder_params,), (along,))[1]

@@ -77,6 +77,9 @@ def uncertainty(learning_rate: float = 1e-2) -> Weighting:
 
     Args:
         learning_rate: Learning rate of Adam for s. The paper uses the model's own optimiser for s.
+
+    Raises:
+        RequestError: ``learning_rate`` is not positive.
     """
     return _learned("uncertainty", learning_rate, lambda s, losses: (1.0 - jnp.exp(-s) * losses) / 2, lambda s: jnp.exp(-s) / 2)
 
@@ -89,6 +92,9 @@ def imtl_l(learning_rate: float = 1e-2) -> Weighting:
 
     Args:
         learning_rate: Learning rate of Adam for s. The paper uses the model's own optimiser for s.
+
+    Raises:
+        RequestError: ``learning_rate`` is not positive.
     """
     return _learned("imtl_l", learning_rate, lambda s, losses: jnp.exp(s) * losses - 1.0, jnp.exp)
 
@@ -124,7 +130,7 @@ def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weigh
         reference: z by name, lower bounds of the losses (the ideal point); 0 for missing names, or for all if None.
 
     Raises:
-        RequestError: mu is not positive.
+        RequestError: ``mu`` is not positive.
     """
     _check_positive("stch", "mu", mu)
 
@@ -150,7 +156,7 @@ def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
         epoch: Number of updates in an epoch.
 
     Raises:
-        RequestError: An argument is not positive.
+        RequestError: ``temperature`` or ``epoch`` is not positive.
     """
     _check_positive("dwa", "temperature", temperature)
     _check_positive("dwa", "epoch", epoch)
@@ -191,7 +197,7 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         eps: Constant added to the losses after subtracting ``reference``.
 
     Raises:
-        RequestError: An argument is negative, or eps not positive.
+        RequestError: ``eps`` is not positive.
     """
     _check_positive("famo", "eps", eps)
     rule = optax.chain(optax.add_decayed_weights(decay), optax.adam(learning_rate))

@@ -94,7 +94,7 @@ def make_rule(
     Args:
         label: Name of the weighting, for error messages.
         interval, learning_rate, beta, minimum, maximum: See `ol_aux`.
-        multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
+        multiplicative: Whether to compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Returns:
         Function of the state, mean dot products ([] float32 by name), sums of this interval and values of other fields, which

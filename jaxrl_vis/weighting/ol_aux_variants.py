@@ -54,7 +54,7 @@ def ol_aux_window(
         main_grad: main for the gradient of the main loss (thesis), or total for that of the whole weighted objective, which
             adds w_i |g_i|^2 to each dot product (release).
         window: Number of latest updates over which gradients are averaged; 4 in the release, 1 in the thesis.
-        multiplicative: Compare w_i g_i instead of g_i, as in the authors' quadratic example.
+        multiplicative: Whether to compare w_i g_i instead of g_i, as in the authors' quadratic example.
 
     Raises:
         RequestError: An argument is invalid; from ``init``: ``shared`` is not given; from ``update``: the state belongs to
@@ -112,7 +112,8 @@ def ol_aux_ablation(
         window: Must be 1; gradients are already averaged over the interval.
 
     Raises:
-        RequestError: An argument is invalid; from ``init``: ``shared`` or ``params`` is not given.
+        RequestError: An argument is invalid; from ``init``: ``shared`` or ``params`` is not given; from ``update``: the state
+            belongs to another weighting.
     """
     label = "ol_aux_ablation"
     check_count(label, "window", window)
@@ -160,10 +161,10 @@ def _check_main_grad(label: str, main_grad: str) -> None:
 
 
 def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
-    """Convert gradients of the losses to those of the learned objective."""
+    """Convert gradients of the losses to those of their logarithms, if the weighting minimises these."""
     return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
 
 
 def _direction(main_grad: MainGradient, gradients: Mapping[str, Params], weights: Weights) -> Params:
-    """Return the gradient that the others are compared with."""
+    """Return the gradient with which those of auxiliary losses are compared: the main loss's, or the weighted sum of all."""
     return gradients[MAIN] if main_grad == "main" else weighted_sum(gradients, weights)

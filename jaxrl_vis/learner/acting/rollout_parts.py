@@ -23,7 +23,7 @@ PART_SIZE = 8
 """Maximum number of environments in a part: as many float32 numbers as fit into a vector register of most CPUs."""
 
 Played = tuple[Episodes, Metrics]
-"""Episodes [S, P, ...], and ``success`` and ``goal_distance`` at their last steps, [S, P] float32."""
+"""Episodes [S, P, ...] of one part, and their metrics (`GoalEnv.metric_names`) at the last step, [S, P] float32 by name."""
 
 
 def part_size(num_envs: int) -> int:

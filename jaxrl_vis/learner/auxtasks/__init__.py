@@ -40,7 +40,8 @@ def make(names: Sequence[str], spec: Spec, folder: str | None = None) -> dict[st
         folder: Folder from which modules are imported first.
 
     Raises:
-        RequestError: A name is unknown or occurs twice, or observations are not images.
+        RequestError: A name is unknown or occurs twice, a function does not return an `AuxTask`, two tasks have the same
+            `AuxTask.name`, or observations are not images.
     """
     makers = [find("auxiliary task", name, _MAKERS, folder) for name in names]
     for name in names:

@@ -47,7 +47,10 @@ class Auxiliary:
 
     @property
     def encoded(self) -> tuple[str, ...]:
-        """Observations encoded with gradient, in addition to those before the action and goals: ``after``, names of views."""
+        """Names of the observations to encode with gradient besides ``before`` and ``goal``, as in `Inputs.pieces`.
+
+        ``after`` if a task reads ``latent_tp1``, then the name of each task that has images of its own (`AuxTask.view`).
+        """
         after = ("after",) if any("latent_tp1" in task.needs for task in self.tasks.values()) else ()
         return (*after, *(name for name, task in self.tasks.items() if task.view is not None))
 
@@ -68,12 +71,16 @@ class Auxiliary:
         return state if state.key is None else state.replace(key=jax.random.fold_in(key, _DRAWS))
 
     def start(self, critic: Params) -> WeightingState:
-        """Return the weighting's state before the first update."""
+        """Return the weighting's own initial state, with the same key for every learner, if it has one.
+
+        Args:
+            critic: All parameters of the critic.
+        """
         held = (critic,) if self.weighting.hold is not None else ()
         return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *held)
 
     def with_stored(self, episodes: Episodes) -> Episodes:
-        """Add the arrays that tasks compute once per episode to a rollout's episodes."""
+        """Return the E episodes of a rollout with the arrays that tasks compute once per episode (`AuxTask.episode`)."""
         images, stored = episodes.observations[:, :-1], {}
         for name, task in self.tasks.items():
             if task.episode is not None:
@@ -196,7 +203,8 @@ def make_auxiliary(
         dtype: Compute dtype of the networks.
 
     Raises:
-        RequestError: Tasks and weighting are incompatible with each other or with the rest of the configuration.
+        RequestError: A task or the weighting is unknown, or they are incompatible with each other or with the rest of the
+            configuration.
     """
     if config.auxiliary.weighting in WEIGHTINGS:
         weighting = _bound_strength(config, make_weighting(config.auxiliary.weighting, **_options(config)))
@@ -232,7 +240,7 @@ def make_auxiliary(
 
 
 def _bound_strength(config: Config, weighting: Weighting) -> Weighting:
-    """Bound and scale the weights as configured. OL-AUX applies the maximum weight in its own rule."""
+    """Limit the weights, or fix their sum, as configured. OL-AUX applies the maximum weight in its own rule."""
     maximum, total = config.study.weighting_maximum, config.study.weighting_total
     if config.auxiliary.weighting == "ol_aux":
         maximum = None
@@ -240,7 +248,7 @@ def _bound_strength(config: Config, weighting: Weighting) -> Weighting:
 
 
 def _options(config: Config) -> dict[str, Any]:
-    """Return the arguments for the constructor of the configuration's weighting.
+    """Return the keyword arguments for the constructor of the configuration's weighting.
 
     Raises:
         RequestError: The number of values of eps differs from the number of tasks.

@@ -14,7 +14,7 @@ MAX_ANGLE = math.radians(30.0)
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task. With ``spec.options.max_shift``, it predicts the shift as well as the angle."""
+    """Build the egomotion task. With ``spec.options.max_shift``, it predicts the shift as well as the angle."""
     options = spec.options
 
     def predict(params: Params, view: View) -> jax.Array:

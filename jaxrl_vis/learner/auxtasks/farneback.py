@@ -13,8 +13,8 @@ products with small constant matrices, L @ image @ R, into which successive step
 smoothed, resized and expanded at once. Images are small, so multiplying the zeros of these matrices is cheaper than convolving.
 
 Details that the paper leaves open follow OpenCV's ``calcOpticalFlowFarneback``, with whose flow this agrees: borders are
-reflected for smoothing and replicated for the fit, pixels near a border get lower weights, no level of the pyramid is smaller
-than 32 pixels, and the determinant of the equations is regularised by 0.001. The effect of this depends on the unit of the grey
+reflected for smoothing and replicated for the fit, pixels near a border get lower weights, pyramid levels below 32 pixels are
+omitted, and the determinant of the equations is regularised by 0.001. The effect of this depends on the unit of the grey
 levels: negligible for 0 to 255; for 0 to 1, less than 0.001 pixels of the flow remain in our images.
 """
 

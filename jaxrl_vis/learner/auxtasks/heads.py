@@ -23,7 +23,10 @@ _CHANNELS, _FINEST_CHANNELS = 64, 16
 
 
 def init_linear(key: jax.Array, inputs: int, outputs: int) -> Params:
-    """Initialise `linear`; the name ``output``, as for all last layers, keeps it in float32 (`Networks.compute_copy`)."""
+    """Initialise the parameters of `linear`: a kernel [inputs, outputs] (Glorot) and a bias of zeros, float32.
+
+    They are called ``output``, like all last layers, which keeps them in float32 (`Networks.compute_copy`).
+    """
     return {"output": {"kernel": _glorot(key, (inputs, outputs)), "bias": jnp.zeros((outputs,))}}
 
 
@@ -34,7 +37,7 @@ def linear(params: Params, *inputs: jax.Array) -> jax.Array:
 
 
 def init_decoder(key: jax.Array, inputs: int, shape: tuple[int, int, int], levels: int) -> Params:
-    """Initialise `decode`.
+    """Initialise the parameters of `decode`: Glorot kernels and biases of zeros, float32, by layer.
 
     Args:
         key: [] typed key.

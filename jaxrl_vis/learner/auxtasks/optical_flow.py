@@ -12,7 +12,11 @@ from jaxrl_vis.types import Params
 
 
 def make(spec: Spec) -> AuxTask:
-    """Build the task. The flow is computed once per episode, as it takes longer than the rest of a gradient step."""
+    """Build the optical-flow task.
+
+    The flow is computed once per episode, as it takes longer than the rest of a gradient step. With ``spec.options.stretch``,
+    as in the authors' release, each flow image is stretched to [0, 1] (`flow_strength`).
+    """
     stretch = spec.options.stretch
     _, height, width = spec.observation.shape
     size = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
@@ -46,7 +50,7 @@ _BYTES_PER_PIXEL, _MAX_BYTE = 16.0, 255.0
 
 
 def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
-    """Quantize strengths [...] for the replay: uint8, in steps of 1/16 pixel up to 15.9; stretched masks in 255 steps."""
+    """Quantize flow magnitudes [...] for the replay: uint8, in steps of 1/16 pixel up to 15.9; stretched ones in 255 steps."""
     return jnp.clip(jnp.round(strength * _scale(stretch)), 0.0, _MAX_BYTE).astype(jnp.uint8)
 
 
@@ -66,9 +70,10 @@ def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int =
         images_t: [B, C, H, W] uint8, observations before the action.
         images_tp1: [B, C, H, W] uint8, observations after the action.
         frame_stack: Number of images that an observation stacks; the newest ones are used.
-        stretch: Whether to stretch each mask to [0, 1], as in the authors' release, whose grey levels also lie in [0, 1]. This
-            discards speeds, and amplifies rounding errors if nothing moves. At such grey levels, Farneback's regularisation
-            dominates (`farneback`), so that the sharpness of edges matters more than their speed.
+        stretch: Whether to stretch each flow image linearly to [0, 1], instead of pixels, as in the authors' release, whose
+            grey levels also lie in [0, 1]. This discards speeds, and amplifies rounding errors if nothing moves. At such grey
+            levels, Farneback's regularisation dominates (`farneback`), so that the sharpness of edges matters more than their
+            speed.
     """
     unit = _unit(stretch)
     return _strength(farneback.flow(grey(images_t, frame_stack) / unit, grey(images_tp1, frame_stack) / unit), stretch)

@@ -184,7 +184,10 @@ def _begin(networks: Networks, agent: Agent, statistics: Statistics) -> Working:
 
 
 def _apply(state: Agent, counts: jax.Array, gradients: Gradients, config: Config) -> Agent:
-    """Step both optimisers, and update the target networks; ``counts`` include this step."""
+    """Step the optimisers (the actor's only if it has a gradient), and update the target networks.
+
+    ``counts`` are `Working.counts` including this step; those in the returned agent are stale.
+    """
     corrections = adam.corrections(counts[:2])
     critic, critic_moments = adam.step(
         state.critic, gradients.critic, state.critic_optimizer, config.ddpg.critic_learning_rate, corrections[0]
@@ -371,7 +374,7 @@ def build(setup: Setup, critic_heads: int = 1, draw_noise: DrawNoise | None = No
 
     Args:
         setup: Configuration and sizes.
-        critic_heads: Number of critic heads, which share one target, the minimum of theirs (`Networks.critic_heads`).
+        critic_heads: Number of critic heads; all share one target, from the minimum of their values (`Networks.critic_heads`).
         draw_noise: Sampler of the noise on actions in targets; None for no noise.
     """
     config, resolved = setup.config, setup.resolved

@@ -1,7 +1,7 @@
 """Diagnostics of a batch's rewards against the ground truth, which is known only in simulation.
 
 The ratio of two fractions, each averaged over many batches, estimates the fraction over all of these batches: precision of the
-filter = ``filtered_false_share`` / ``filtered_share`` (see `run.metrics`).
+filter = ``filtered_false_share`` / ``filtered_share``.
 """
 
 import jax
@@ -18,7 +18,10 @@ def count_rewards(
     success: jax.Array | None = None,
     graded: bool = False,
 ) -> Metrics:
-    """Count positives, negatives and errors among B transitions, [] float32 by name; `fractions` converts them to fractions.
+    """Count negatives, filtered transitions and errors among B transitions, [] float32 by name, for `fractions`.
+
+    ``positive_share`` is a fraction already.
+
 
     If a batch is divided among devices, average the counts over the devices before calling `fractions`.
 

@@ -2,8 +2,9 @@
 
     autoencoder   cosine of the latents of achieved observation and goal (thesis, section 5.1.5, Auto Encoder); trained to
                   reconstruct achieved observations
-    classifier    probability that the achieved observation is the goal (after VICE: Fu et al., 2018, arXiv 1805.11686);
-                  trained to discriminate goals paired with themselves from achieved observations paired with their goals
+    classifier    probability that the achieved observation is the goal, doubled and at most 1 (after VICE: Fu et al., 2018,
+                  arXiv 1805.11686); trained to discriminate goals paired with themselves from achieved observations paired
+                  with their goals
 
 Rewards lie between R- and R+, and are recomputed for every batch with the current model, without gradient.
 """
@@ -111,13 +112,13 @@ class LearnedReward:
         return Rewarded(jax.lax.stop_gradient(reward), loss, gradient)
 
     def apply(self, state: ModelState, gradient: Params) -> ModelState:
-        """Take one step of the optimiser."""
+        """Take one step of the optimiser; return the new state."""
         change, moments = self.optimizer.update(gradient, state.optimizer)
         return ModelState(params=optax.apply_updates(state.params, change), optimizer=moments)
 
 
 def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
-    """Build the autoencoder in whose latent space observations are compared."""
+    """Build the reward model that compares observations in the latent space of an autoencoder."""
     shape = networks.observation_spec, networks.action_size, config.network.latent_size
     spec = auxtasks.Spec(*shape, levels=len(config.network.encoder_filters), dtype=networks.dtype)
     task = auxtasks.make(("autoencoder",), spec)["autoencoder"]
@@ -137,7 +138,7 @@ def make_autoencoder(networks: Networks, config: Config, resolved: Resolved) -> 
 
 
 def make_classifier(networks: Networks, config: Config, resolved: Resolved) -> LearnedReward:
-    """Build the classifier of pairs of achieved observation and goal.
+    """Build the reward model that classifies pairs of achieved observation and goal.
 
     All achieved observations are negatives, as in VICE, even if they equal the goal: both classes are then equally likely.
     """

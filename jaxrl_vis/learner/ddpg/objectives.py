@@ -129,7 +129,15 @@ def _minimum(values: jax.Array) -> jax.Array:
 
 @dataclasses.dataclass(frozen=True)
 class Objectives:
-    """Losses of both networks and their weighted gradients, for one configuration."""
+    """Losses of both networks and their weighted gradients, for one configuration.
+
+    Attributes:
+        networks: Architecture of the networks.
+        config: Configuration of the run.
+        resolved: Rewards, discount, filter threshold and bounds of the targets.
+        auxiliary: Auxiliary tasks and their weighting.
+        shards: Shards of the learner; batches are those of one shard.
+    """
 
     networks: Networks
     config: Config
@@ -179,7 +187,7 @@ class Objectives:
         return weighted_grad(critic_losses, weighting, lambda critic: critic.get("encoder"), mode, **options)
 
     def _kept_mean(self, keep: jax.Array) -> jax.Array | None:
-        """Return the mean number of unfiltered transitions per shard, the divisor for all shards; None for each its own."""
+        """Return the mean number of unfiltered transitions per shard, the divisor for all; None if each divides by its own."""
         if self.shards.count == 1 or math.isinf(self.resolved.filter_threshold):
             return None
         return jnp.maximum(self.shards.mean(jnp.sum(keep)), 1.0 / self.shards.count)
@@ -208,7 +216,10 @@ class Objectives:
         batch: Batch,
         weights: dict[str, jax.Array],
     ) -> tuple[jax.Array, jax.Array]:
-        """Compute the actor's loss, including its auxiliary losses with the critic's weights, and its actions [B, A]."""
+        """Compute the actor's loss [] and its actions [B, A].
+
+        An actor with an encoder of its own also has auxiliary losses, with the critic's ``weights``, [] float32 by name.
+        """
         has_encoder = self.config.network.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:

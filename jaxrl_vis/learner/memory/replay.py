@@ -47,7 +47,7 @@ def unpack(observations: jax.Array) -> jax.Array:
 
 
 def _pack_steps(array: jax.Array) -> jax.Array:
-    """Apply `pack` to each step of an array [episodes, steps, ...]."""
+    """Apply `pack` to each step of an array [episodes, steps, ...]; one number per step stays unchanged."""
     return pack(array) if array.ndim > 2 else array
 
 
@@ -121,7 +121,7 @@ class Replay(NamedTuple):
         return jax.eval_shape(lambda: self.init(*args))
 
     def _stored(self, rollout: Episodes) -> Episodes:
-        """Convert episodes to their stored form."""
+        """Convert a rollout's episodes to their stored form: only the newest image of each observation, packed."""
         newest = rollout.observations[:, :, : rollout.observations.shape[2] // self.frame_stack]
         stored = {name: _pack_steps(array) for name, array in rollout.stored.items()}
         return rollout.replace(observations=pack(newest), stored=stored)
@@ -151,7 +151,7 @@ class Replay(NamedTuple):
         return (iteration % self.num_rollouts + 1) * self.num_envs - 1
 
     def is_stored(self, state: ReplayState, iteration: jax.Array) -> jax.Array:
-        """Return the mask [N] of occupied positions. A resumed run may begin anywhere in the ring.
+        """Return the mask [N] bool of occupied positions. A resumed run may begin anywhere in the ring.
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
@@ -165,7 +165,7 @@ class Replay(NamedTuple):
 
         Args:
             state: The replay, with the rollout of ``iteration`` inserted.
-            key: [] a typed key.
+            key: [] typed key.
             iteration: [] int32.
             batch_size: B.
         """
@@ -190,13 +190,14 @@ class Replay(NamedTuple):
 
         Args:
             state: The replay.
-            indices: Places of the transitions, [B] each.
+            indices: Positions of the transitions, [B] each.
             goal_slot: [B] int32 in [1, T+1].
             steps: Number of steps from the first to the last observation of a transition; fewer at the end of an episode.
             goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
 
         Returns:
-            Transitions without rewards. Stacked images of goals are at rest: copies of the newest one.
+            Transitions without rewards; ``state_tp1`` is that after one step, whatever ``steps``. Stacked images of goals are
+            at rest: copies of the newest one.
         """
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices

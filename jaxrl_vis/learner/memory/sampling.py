@@ -39,7 +39,7 @@ class Choice(NamedTuple):
         goal_slot: [B] int32 in [t + 1, T + 1]; for goals from another episode, in [1, T].
         goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
         shift: [B, 2] int32, see `Batch`; or None.
-        target_key: [] a typed key, for targets of auxiliary tasks; or None.
+        target_key: [] typed key, for targets of auxiliary tasks; or None.
         clutter_end: [] float32, see `reward_errors`; or None.
         is_replaceable: [B] bool, mask of relabelled goals to be replaced by another transition's if they are already reached;
             None if none is, or if true states have decided that (``goal_episode``).
@@ -121,7 +121,10 @@ class Sampler:
         return choose_goal_slots(key, time, self.replay.horizon, *probabilities, discount)
 
     def _replace_trivial_goals(self, state: ReplayState, choice: Choice, key: jax.Array) -> Choice:
-        """Replace most of the relabelled goals that are already reached by goals from another episode.
+        """Substitute goals of another episode for the relabelled goals that the transition has reached before its action.
+
+        A fraction ``trivial_goals`` of these goals is kept. Rewards that compare observations cannot tell yet which goals are
+        reached: then only ``is_replaceable`` is set, for `_replace_reached_goals`.
 
         They are not replaced by original goals. If these look different from observations in episodes (VisualFingerTurn's
         finger always hangs down in them), rarely reached goals would all share that look, and the critic could infer rewards
@@ -138,7 +141,7 @@ class Sampler:
         return choice._replace(goal_episode=jnp.where(is_replaceable, jnp.roll(episode, 1), episode))
 
     def _replace_reached_goals(self, batch: Batch, is_replaceable: jax.Array) -> Batch:
-        """Replace those goals in ``is_replaceable`` [B] that are reached before the action by the next transition's."""
+        """Substitute the next transition's goal for those in ``is_replaceable`` [B] that are reached before the action."""
         before = batch.observation_t if self.as_goal is None else jax.vmap(self.as_goal)(batch.observation_t)
         is_replaceable = is_replaceable & (self._reward(batch, before, 1.0, 0.0) > 0.0)
 

@@ -1,6 +1,6 @@
 """Forward-mode differentiation through operations with custom reverse-mode rules.
 
-`jax.custom_vjp` defines reverse-mode differentiation only. While traced, such functions call `are_wanted`; inside
+`jax.custom_vjp` defines reverse-mode differentiation only. While traced, such functions call `are_wanted`: inside
 `with_tangents` they use plain JAX, which supports both modes.
 """
 

@@ -85,13 +85,10 @@ class Networks:
     """Pure functions of parameters, for one task and one configuration.
 
     Attributes:
-        init_actor, init_critic: key -> {"encoder": ..., "head": ...}.
-        prepare: (scaling, observations [B, ...], optional shift) -> inputs of the encoders, computed once for all four
-            networks.
-        encode: (actor or critic parameters, inputs [B, ...]) -> latent [B, latent].
-        act: (actor, latents [2, B, latent] of observations and goals) -> [B, A] float32 in (-1, 1).
-        values: (critic, latents [2, B, latent], action [B, A]) -> values of all heads [K, B] float32.
-        value: The same for the first head only: [B] float32.
+        config: Configuration of the run.
+        observation_spec: Shape and dtype of an observation: [C, H, W] uint8 or [S] float32.
+        action_size: A.
+        critic_output_bias: Initial bias of the critic's output.
         critic_heads: K, number of heads of the critic on one encoder. With several, their parameters have a leading axis [K].
     """
 
@@ -177,12 +174,12 @@ class Networks:
         return self._encoder.init(key, blocks)["params"]
 
     def init_actor(self, key: jax.Array) -> Params:
-        """Initialise the actor: without an encoder if it shares the critic's."""
+        """Initialise the actor, {"encoder": ..., "head": ...}: without an encoder for states, or if it shares the critic's."""
         has_encoder = self.config.network.encoders == "separate"
         return self._init(key, self.head(self.action_size, 0.0), 2 * self.latent_size, has_encoder=has_encoder)
 
     def init_critic(self, key: jax.Array) -> Params:
-        """Initialise the critic."""
+        """Initialise the critic, {"encoder": ..., "head": ...}: without an encoder for states; heads are stacked [K, ...]."""
         head, width = self.head(1, self.critic_output_bias), 2 * self.latent_size + self.action_size
         critic = self._init(key, head, width)
         if self.critic_heads == 1:
@@ -243,7 +240,9 @@ class Networks:
         return Inputs(jnp.concatenate(pieces), views)
 
     def prepare(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
-        """Normalise and reorder observations [B, ...] for the encoders: [B, blocks, block size], or [B, S] for states.
+        """Normalise and reorder observations [B, ...] for the encoders, once for all networks, in the compute dtype.
+
+        The result is [B, blocks, block size], or [B, patches, patch size] for the kernel, or [B, S] for states.
 
         Images are shifted by ``shift`` [B, 2] int32 (see `Batch`) after normalisation, so they are padded with the mean.
         """
@@ -284,7 +283,7 @@ class Networks:
         return self._encoder.apply({"params": params["encoder"]}, *blocks, first_layer=encoder_kernel.LEVELS)
 
     def act(self, actor: Params, latents: jax.Array) -> jax.Array:
-        """Compute actions [B, A] float32 in (-1, 1) from latents [2, B, latent] of observations and goals."""
+        """Compute actions [B, A] float32 in [-1, 1] from latents [2, B, latent] of observations and goals."""
         return jnp.tanh(self.head(self.action_size, 0.0).apply({"params": actor["head"]}, latents))
 
     def values(self, critic: Params, latents: jax.Array, action: jax.Array) -> jax.Array:

@@ -27,7 +27,7 @@ from jaxrl_vis.learner.parallel.shards import DATA, ONE, Shards
 from jaxrl_vis.types import LoopState, ReplayState
 
 SEED = "seed"
-"""Name of the other axis of the mesh."""
+"""Name of the mesh axis along which seeds are placed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,6 +202,8 @@ def make_layout(config: Config) -> Layout:
 
     Raises:
         RequestError: There are too few devices, or a run of several processes would leave some of them unused.
+
+    For several devices, this may change JAX's global configuration (`_avoid_shardy`).
     """
     if config.run.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE

@@ -1,7 +1,7 @@
 """Shards of one learner, seen from within one of them: averages over the shards, and each shard's part of an array.
 
-Every function here is called within a mapped axis `DATA` (of `jax.shard_map` or `jax.vmap`), unless there is only one shard:
-then each returns its argument, and adds nothing to the program.
+Every method here is called within a mapped axis `DATA` (of `jax.shard_map` or `jax.vmap`), unless there is only one shard: then
+nothing is communicated, and averages, sums and parts are the arguments themselves.
 """
 
 import dataclasses

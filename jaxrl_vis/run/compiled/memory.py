@@ -38,7 +38,13 @@ def tree_bytes(shapes: Any) -> int:
 
 
 def available_bytes(device: Any = None) -> int | None:
-    """Return the free memory of a device (by default the first) or, for a CPU, of the host, in bytes; None if unknown."""
+    """Return the free memory of a device or, for a CPU, of the host and its container, in bytes; None if unknown.
+
+    On hosts without ``/proc/meminfo``, all of the host's memory counts as free.
+
+    Args:
+        device: JAX device; None for the first of this process.
+    """
     device = jax.local_devices()[0] if device is None else device
     if device.platform != "cpu":
         statistics = device.memory_stats() or {}
@@ -77,7 +83,9 @@ def show_bytes(count: float) -> str:
 
 
 def _available_bytes(layout: Layout) -> int | None:
-    """Return the minimum free memory of the run's devices, in bytes; None if one is unknown."""
+    """Return the free memory of each of the run's devices, in bytes: the minimum of all, or an equal share of the host's for
+    CPUs; None if unknown.
+    """
     if layout.mesh is None:
         return available_bytes()
     if layout.devices[0].platform == "cpu":  # all of them share the host's memory
@@ -164,6 +172,9 @@ def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout 
 def fit_together(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> bool:
     """Return True if all programs fit into memory at once, so that one may be launched while another still runs.
 
+    Also if the free memory is unknown.
+
+
     Args:
         programs, is_allocated, layout: As in `check_compiled`.
     """
@@ -173,7 +184,10 @@ def fit_together(programs: dict[str, Any], is_allocated: bool, layout: Layout = 
 
 
 def _sizes(programs: dict[str, Any]) -> tuple[int, dict[str, int]]:
-    """Return the compiler's figures for one device, in bytes: the trained state, and each program's scratch memory."""
+    """Return the compiler's figures for one device, in bytes: the arguments of ``learn`` (0 without it), scratch by program.
+
+    Scratch memory includes results that do not reuse an argument's memory; that of ``init`` is left out.
+    """
     analyses = {name: program.memory_analysis() for name, program in programs.items()}
     training = analyses.get("learn")
     scratch = {

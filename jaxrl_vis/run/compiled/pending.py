@@ -36,7 +36,7 @@ class Pending:
             self._rows.copy_to_host_async()
 
     def read(self) -> dict[str, np.ndarray]:
-        """Wait for the metrics; return them by name, [S] float32 each."""
+        """Wait for the metrics; return them by name, [S] or [] float32 each."""
         return dict(zip(self._names, np.asarray(self._rows), strict=True))
 
     def read_per_seed(self, seeds: int) -> PerSeed:

@@ -60,8 +60,8 @@ class Programs:
     Args:
         config: The run.
         program: From `jaxrl_vis.learner.train_step.make_train_step`, or anything with the same attributes.
-        keep: Cache traced programs on disk, if permitted (see `trace_cache`); ignored on several devices.
-        cache: Cache compiled programs on disk; without, traced ones are not cached either.
+        keep: Whether to cache traced programs on disk, if permitted (see `trace_cache`); ignored on several devices.
+        cache: Whether to cache compiled programs on disk; without, traced ones are not cached either.
 
     Attributes:
         config: The run.
@@ -107,7 +107,7 @@ class Programs:
 
     @property
     def image_seconds(self) -> float:
-        """Duration of a video frame, s: the control period, but at least 0.04 s."""
+        """Duration of a video frame in seconds: the control period, but at least 0.04 s."""
         return max(0.04, float(self.env.control_period))
 
     @property

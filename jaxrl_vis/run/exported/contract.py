@@ -144,7 +144,7 @@ def _channels(pixels: str) -> list[str]:
 
 
 def _plain(config: Any) -> Any:
-    """Return an environment's configuration as a JSON value, without other types; None if it is not a dataclass."""
+    """Return an environment's configuration as a JSON value, without fields of other types; None if it is not a dataclass."""
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         return None
     simple = (str, int, float, bool, list, tuple, dict, type(None))

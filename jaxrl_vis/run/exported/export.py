@@ -24,10 +24,10 @@ _EPISODES = 8
 
 
 class Check(NamedTuple):
-    """Result of a check.
+    """Result of a check of an exported policy.
 
     Attributes:
-        file: The policy.
+        file: Path of the policy.
         difference: Maximum absolute difference from our own actions on the golden frames.
         count: Number of frames.
     """
@@ -60,7 +60,7 @@ def export_run(
         kind: ``onnx``, ``stablehlo`` or ``safetensors``.
         out: The folder; None for export/KIND in the run folder.
         seed, checkpoint, trust: As in `load_policy`.
-        overwrite: Replace an exported policy in ``out``.
+        overwrite: Whether to replace an exported policy in ``out``.
 
     Raises:
         RequestError: The run cannot be used, the policy does not support the format, a library is missing, or ``out`` is not

@@ -32,7 +32,9 @@ class Golden(NamedTuple):
 
 
 def record(trainer: Trainer, train: TrainState, policy: Policy) -> Golden:
-    """Record frames of the first episodes of an evaluation of a policy; they are the same at every call.
+    """Record 32 frames, evenly spaced over the recorded episodes of an evaluation, with their goals and the policy's actions.
+
+    They are the same at every call.
 
     Args:
         trainer: From `open_run`, with few episodes per evaluation.

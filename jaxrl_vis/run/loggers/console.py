@@ -50,7 +50,7 @@ class RunConsole:
     """Progress display of a run. A bar appears only if stdout is a terminal; lines are printed above it.
 
     Args:
-        quiet: Suppress all output.
+        quiet: Whether to suppress all output.
     """
 
     def __init__(self, quiet: bool = False):
@@ -82,12 +82,18 @@ class RunConsole:
         self._task = self._bar.add_task("training", total=total, completed=done, success="-", distance="-", speed="-")
 
     def advance(self, done: int, steps_per_second: float) -> None:
-        """Advance the progress bar."""
+        """Advance the progress bar to ``done`` iterations of the whole run, and show the environment steps per second."""
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, speed=f"{steps_per_second:,.0f}")
 
     def evaluated(self, success: Sequence[float], distance: Sequence[float], unit: str) -> None:
-        """Show the latest evaluation beside the bar."""
+        """Show the medians over seeds of the latest evaluation beside the bar.
+
+        Args:
+            success: Success rate of each seed.
+            distance: Distance to the goal of each seed, in ``unit``.
+            unit: Unit of the distances.
+        """
         if self._bar is not None and self._task is not None:
             shown = f"{statistics.median(distance):.3f} {unit}"
             self._bar.update(self._task, success=f"{statistics.median(success):.2f}", distance=shown)

@@ -30,8 +30,8 @@ def to_host(tree: Any, copy: bool) -> Arrays:
 
     Args:
         tree: Arrays on a device.
-        copy: False: on a CPU, return views of the device's memory. A view is valid only until the arrays are donated, and while
-            one exists, the next donation makes a copy.
+        copy: Whether to copy. If not, arrays on a CPU are views of the device's memory: a view is valid only until the arrays
+            are donated, and while one exists, the next donation makes a copy.
     """
 
     def convert(leaf: jax.Array) -> np.ndarray:
@@ -108,7 +108,7 @@ def _row_checksum(array: np.ndarray, axes: int, start: Sequence[int] = ()) -> in
 
 
 def is_intact(array: np.ndarray, described: list) -> bool:
-    """Return True if an array matches its description in the manifest."""
+    """Return True if an array has the checksum of its description in the manifest (`describe`)."""
     _, _, checksum, *axes = described
     return checksum == (_row_checksum(array, axes[0]) if axes else _checksum(array))
 
@@ -144,7 +144,7 @@ def host_specs(tree: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def rebuild(template: Any, arrays: dict[str, jax.Array]) -> Any:
-    """Invert `to_host`: builds a tree like ``template``, which also defines where its arrays are placed."""
+    """Invert `to_host`: build a tree like ``template``, which also defines where its arrays are placed."""
 
     def convert(path: Any, leaf: Any) -> jax.Array:
         array, sharding = arrays[jax.tree_util.keystr(path, simple=True, separator=".")], getattr(leaf, "sharding", None)

@@ -49,6 +49,8 @@ _CELLS, _TILES, _PARAMS = 64, 32, plgpu.CompilerParams(num_warps=4, num_stages=1
 class Weights(NamedTuple):
     """Weights of the layers in the layout that the kernel multiplies, float32.
 
+    F is the number of features of a cell, G that of a quarter of it, and C' that of channels padded to a power of two.
+
     Attributes:
         bias_in: [F], added to cells before their rectifier.
         kernel_1: [F, 4 G].
@@ -65,7 +67,13 @@ class Weights(NamedTuple):
 
 
 def supports(channels: int, cell_features: int, quarter_features: int) -> bool:
-    """Return True if the kernel supports decoders of images with these channels, and layers of these sizes."""
+    """Return True if the kernel supports decoders of images with ``channels`` channels and these feature counts.
+
+    Args:
+        channels: C, of the images.
+        cell_features: F, features of a cell of 4x4 pixels.
+        quarter_features: G, features of a quarter of a cell.
+    """
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in (cell_features, 4 * quarter_features))
     return channels <= _MAX_CHANNELS and powers
 
@@ -216,7 +224,7 @@ def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: 
         target: [at least M, 16 C'], of which the first M rows are used; padding must be 0.
         weights: From `make_weights`.
         scale: Python number, so that the kernel writes the scaled gradient directly.
-        interpret: Run the kernel without a GPU, slowly.
+        interpret: Whether to interpret the kernel without a GPU, which is slow.
 
     Raises:
         ValueError: M is not a multiple of 16.

@@ -37,7 +37,7 @@ _MAX_CHANNELS = 16
 
 
 def supports(filters: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Return True if the kernel supports encoders with these output channels, and images [C, H, W] of this shape."""
+    """Return True if the kernel supports encoders with these output channels by layer, and images of this shape [C, H, W]."""
     powers = all(16 <= size <= 64 and size & (size - 1) == 0 for size in filters[:LEVELS])
     return len(filters) >= LEVELS and powers and shape[0] <= _MAX_CHANNELS
 
@@ -81,7 +81,7 @@ def prepare(
         dtype: Dtype of the result.
         shift: [B, 2] int32, pixels by which to shift normalised images down and to the right, filling with 0; None for no
             shift.
-        interpret: Run the kernel without a GPU, slowly.
+        interpret: Whether to interpret the kernel without a GPU, which is slow.
     """
     settings = {"levels": levels, "limit": limit, "dtype": dtype}
     on_gpu = functools.partial(prepare_on_gpu, **settings, interpret=interpret)

@@ -1,4 +1,4 @@
-"""Forward and backward GPU kernels of the encoder's first layers, see `kernels.encoder`; the third kernel is in `kernels.jvp`.
+"""Forward and backward GPU kernels of the encoder's first layers, see `kernels.encoder`; that of tangents is in `kernels.jvp`.
 
 Each has an equivalent in plain JAX, as a reference and for processes without a GPU that runs the kernels.
 """
@@ -20,7 +20,7 @@ from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 MIN_ROWS = 16
 """Minimum number of rows of a product in a kernel."""
 TILE = 16
-"""Patches in a tile."""
+"""Number of patches in a tile."""
 # Tuned on an H200: number of tiles per program (a maximum in the backward pass), and compiler parameters.
 FORWARD_TILES, FORWARD = 8, plgpu.CompilerParams(num_warps=4, num_stages=3)
 _BACKWARD_TILES, _BACKWARD = 64, plgpu.CompilerParams(num_warps=4, num_stages=1)
@@ -54,12 +54,15 @@ def is_available() -> bool:
 
 
 def probe() -> None:
-    """Compile small instances of all three kernels for the default device; raise any error of the compilation."""
+    """Compile small instances of three kernels for the default device: preparation, forward and backward pass.
+
+    Any error of the compilation is raised.
+    """
     probe_program().lower().compile()
 
 
 def probe_program() -> Any:
-    """Trace small instances of all three kernels in one program (`jax.stages.Traced`)."""
+    """Trace small instances of the three kernels of `probe` in one program (`jax.stages.Traced`)."""
     shape, levels = (4, 16, 16), LEVELS + 1
     images, of_pixels = jnp.zeros((MIN_ROWS, *shape), jnp.uint8), jnp.zeros(shape)
     sizes = (64, 64), (64, 16), (64, 16)
@@ -115,7 +118,7 @@ def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
 
 
 def joined(values: jax.Array, level: int) -> jax.Array:
-    """Return the rows that a layer multiplies: four quarters side by side for the third layer, else the previous output."""
+    """Return the rows that layer ``level`` multiplies: four quarters side by side for the last of them, else unchanged."""
     return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
@@ -214,7 +217,7 @@ def apply(patches: jax.Array, weights: Weights, first: int, count: int, interpre
         patches: [M, 64 C'] from `prepare`.
         weights: From `make_weights`.
         first, count: Index of the first patch, and number of patches; both multiples of `TILE`.
-        interpret: Run the kernel without a GPU, slowly.
+        interpret: Whether to interpret the kernel without a GPU, which is slow.
     """
     place = {"first": first, "count": count}
     on_gpu = functools.partial(_apply_on_gpu, **place, interpret=interpret)

@@ -24,12 +24,12 @@ _PREPARE_NUMBERS, _PREPARE_IMAGES, _PREPARE = 4096, 16, plgpu.CompilerParams(num
 
 
 def padded_channels(channels: int) -> int:
-    """Return C', the next power of two."""
+    """Return C', the smallest power of two that is not less than ``channels``."""
     return pl.next_power_of_2(channels)
 
 
 def divisor(number: int, limit: int) -> int:
-    """Return the largest power of two that divides ``number``, at most ``limit``."""
+    """Return the largest power of two up to ``limit`` that divides ``number``; ``limit`` must be a power of two."""
     return math.gcd(number, limit)
 
 
@@ -85,7 +85,7 @@ def prepare_on_gpu(
     dtype: Any,
     interpret: bool = False,
 ) -> jax.Array:
-    """Compute `kernels.encoder.prepare` with the GPU kernel; ``interpret`` runs it without a GPU, slowly."""
+    """Compute `kernels.encoder.prepare` with the GPU kernel; ``interpret`` interprets it without a GPU, which is slow."""
     batch, *shape = images.shape
     channels, height, width = shape
     rows, columns, of_block = height >> levels, width >> levels, 4 ** (levels - LEVELS)
