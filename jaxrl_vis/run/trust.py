@@ -46,7 +46,7 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        was_trained_here: Also permit later changes of the files by the user, except of files in the run folder.
+        was_trained_here: Whether to permit later changes of the files by the user, too, except of files in the run folder.
     """
     changing, as_it_is = _names(run_dir, config)
     is_inside = any(_is_inside(run_dir, file) for file in _files(config).values())
@@ -67,7 +67,7 @@ def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        may: Permission by the user.
+        may: Whether the user gives the permission.
         hint: Hint on how to give the permission, for the message.
 
     Raises:
@@ -81,7 +81,7 @@ def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True
 
 
 def question(run_dir: Path, config: Config) -> str:
-    """Return the question about trust, for messages."""
+    """Return the clause of messages that lists the custom code of a run, and the files that it is imported from."""
     files = _files(config)
     parts = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]
     return f"the run in {run_dir} runs code that is not of this project: {', '.join(parts)}"

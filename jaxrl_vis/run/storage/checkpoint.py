@@ -57,7 +57,7 @@ class Checkpoints:
     Args:
         folder: Folder of the tiers; created by the first save.
         echo: Called with one line about each unusable checkpoint.
-        read_only: Never save: nothing is created or cleaned up.
+        read_only: Whether to only read: nothing is saved, created or cleaned up.
 
     Attributes:
         run_id: Id of the run: other runs' checkpoints are ignored, except by
@@ -265,7 +265,7 @@ class Checkpoints:
         Recent states that are no longer kept up to date are also deleted.
 
         Args:
-            has_ended: Also delete equally new ones: the run is complete.
+            has_ended: Whether to delete equally new ones, too, because the run is complete.
         """
         newest = max(self.iterations(LIGHT), default=-1)
         if distributed.is_first():
@@ -280,7 +280,7 @@ class Checkpoints:
         """Move checkpoints after ``iteration``, which are unusable, to checkpoints/damaged/.
 
         Returns:
-            Where they are now.
+            Their new paths.
         """
         tiers = {tier: self.iterations(tier) for tier in (LIGHT, FULL, RECENT)}
         later = {tier: [number for number in iterations if number > iteration] for tier, iterations in tiers.items()}
@@ -290,7 +290,7 @@ class Checkpoints:
         """Move checkpoints of other runs to checkpoints/foreign/, where they do not count towards the number that is kept.
 
         Returns:
-            Where they are now.
+            Their new paths.
         """
         foreign = {tier: [number for number, is_ours in self._list(tier) if not is_ours] for tier in (LIGHT, FULL, BEST)}
         moved = self._move(foreign, FOREIGN)

@@ -53,7 +53,7 @@ def default_folder(config: Config) -> Path:
 
 
 def check_there(path: Path, resume: bool) -> None:
-    """Raise a `RequestError` if a run is to be resumed in a missing folder."""
+    """Raise a `RequestError` if ``path`` cannot be a run folder, or if a run is to be resumed in a missing folder."""
     _check_run_path(path)
     if resume and not path.exists():
         raise RequestError(f"nothing to resume: there is no folder {path}; leave out --resume to start a run there")
@@ -211,6 +211,11 @@ class RunFolder:
 
         Call it last, after all other checks of the request.
 
+        Args:
+            config: Configuration to record in config.json.
+            resume, overwrite: Whether to resume an earlier run, or to delete it.
+            log: Names of the loggers to record.
+
         Returns:
             True if an earlier run is to be resumed.
 
@@ -325,7 +330,11 @@ def read_run_id(path: Path) -> str:
 
 
 def read_log(path: Path) -> tuple[str, ...]:
-    """Read the loggers of the run in ``path``; none if there is no run."""
+    """Read the names of the loggers of the run in ``path``; empty if there is no run.
+
+    Raises:
+        RequestError: config.json cannot be read, or its list of loggers is invalid.
+    """
     check_path(path)
     log = read_record(path).get("log", []) if RunFolder(path).config.exists() else []
     if not isinstance(log, list) or not all(isinstance(name, str) for name in log):

@@ -51,7 +51,7 @@ _SHOWN = 8  # line numbers in a message
 
 
 def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed:
-    """Average metrics over the iterations in ``history``, seed by seed.
+    """Average metrics over the iterations in ``history``, seed by seed, with nine significant digits.
 
     The order of summation is fixed, so that a resumed run writes the same digits as an uninterrupted one.
     """
@@ -91,7 +91,7 @@ def make_rows(seeds: Iterable[int], counts: Mapping[str, int], values: Mapping[s
 
 
 def scalars(row: Row) -> dict[str, float]:
-    """Return the figures of a row by name, without those that were not finite."""
+    """Return the metrics of a row and its ``updates`` by name, without those that were not finite."""
     return {name: float(value) for name, value in row.items() if name not in _NO_FIGURES and value is not None}
 
 
@@ -101,7 +101,7 @@ class Contents:
 
     Attributes:
         rows: The rows, in the order of their iterations.
-        damaged: Number and bytes of every line that is not a valid row, or repeats an earlier row.
+        damaged: Line number, from 1, and bytes of every line that is not a valid row, or repeats an earlier row.
         torn: Incomplete last line without a line break. After a kill, that row was never complete.
     """
 
@@ -111,7 +111,11 @@ class Contents:
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Append rows to the file and sync them to the disk."""
+    """Append rows to the file and sync them to the disk.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     _append(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
@@ -191,7 +195,7 @@ def cut_back(
         run_id: Id of the run.
         aside: File to which damaged lines are moved; nothing is discarded.
         others: File to which other runs' rows are moved.
-        keeps_later: Also move rows after ``iteration`` to ``aside``.
+        keeps_later: Whether to move rows after ``iteration`` to ``aside``, instead of discarding them.
         evaluated: Last iteration known to have had a row of each seed, or 0: if one is missing, a torn line is that row.
 
     Returns:

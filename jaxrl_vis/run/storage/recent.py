@@ -68,7 +68,7 @@ class Recent:
         """Return True if enough time has passed since the last save for saving to take only a small fraction of it.
 
         Args:
-            in_any_case: Ignore the time since the last save.
+            in_any_case: Whether to ignore the time since the last save.
         """
         return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _FRACTION)
 
@@ -217,7 +217,7 @@ class Recent:
                 array[:, start : start + num_envs], offset = _array(contents, offset, shape, array.dtype)
 
     def resume_from(self, iteration: int | None) -> None:
-        """Prepare for resuming from the state of an iteration, and delete later rollouts; None: from no state; delete all."""
+        """Prepare for resuming from the state of an iteration, and delete later rollouts; if it is None, delete all files."""
         if iteration is None:
             self.clear()
             return
@@ -249,7 +249,7 @@ class Recent:
             self._folder.rmdir()
 
     def set_aside(self, iteration: int, to: Path) -> None:
-        """Move the state of an iteration."""
+        """Move the state file of an iteration to the path ``to``."""
         self._path(iteration, "state").replace(to)
 
     def _header(self, iteration: int) -> dict[str, Any]:
@@ -304,7 +304,7 @@ def _bytes(array: np.ndarray) -> memoryview:
 
 
 def _array(contents: bytes, offset: int, shape: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, int]:
-    """Return the array of the given shape and dtype at an offset, and the offset of its end."""
+    """Return the array of the given shape and dtype at an offset, and the offset of its end; raise `Unusable` if cut off."""
     count = int(np.prod(shape))
     end = offset + count * np.dtype(dtype).itemsize
     if end > len(contents):

@@ -28,7 +28,7 @@ class Restored:
         tier: `LIGHT`, `FULL`, `RECENT` or `BEST`.
         iteration: Iterations completed.
         train: The learner, [S, ...].
-        loop: The complete state; None from the light tier.
+        loop: The complete state; None if only the learner was restored, as from the light tier.
         progress: Progress that was saved with it.
     """
 
@@ -86,7 +86,7 @@ def restore_items(
         where: Folder of the checkpoint.
         manifest: Its manifest.
         template: Shapes and dtypes of the loop state.
-        with_replay: Also restore all that is not the learner; otherwise the second result is None.
+        with_replay: Whether to restore the replay, keys and iteration, too; otherwise the second result is None.
 
     Raises:
         Unusable: It is damaged.

@@ -116,7 +116,8 @@ def load_policy(run_dir: Path | str, seed: int | None = None, checkpoint: Choice
         run_dir: The run folder, a folder of `jaxrl-vis push`, or the name of a policy that comes with the package.
         seed: Seed, for a run with several; None for the first.
         checkpoint: Iteration of a checkpoint, ``best`` for the best one by ``best_by``, or None for the newest valid one.
-        trust: Allow execution of the run's custom code (``module:Name``); not needed for runs that were trained here.
+        trust: Whether to allow execution of the run's custom code (``module:Name``); not needed for runs that were trained
+            here.
 
     Raises:
         RequestError: There is no run, no such seed or checkpoint, or no usable one; or its task is not available here, or is
@@ -144,7 +145,7 @@ def choose_seed(trainer: Trainer, run_dir: Path | str, seed: int | None) -> int:
 
 
 def make_policy(trainer: Trainer, restored: Restored, seed: int) -> Policy:
-    """Make the policy of one seed.
+    """Build the policy of one seed, and enable JAX's compilation cache.
 
     Args:
         trainer: From `restored_run.open_run`.

@@ -83,7 +83,7 @@ def read_file(path: Path, expected: Expected, is_written: bool, findings: Findin
     Args:
         path: metrics.jsonl.
         expected: Conditions on every row.
-        is_written: Another process may be writing, so that the last line may be incomplete.
+        is_written: Whether another process may be writing, so that the last line may be incomplete.
         findings: Findings, to which this adds.
     """
     *lines, rest = path.read_bytes().split(b"\n") if path.exists() else [b""]
@@ -149,7 +149,7 @@ def missing_rows(
         last_written: Last iteration whose rows were written, according to checkpoints, or 0.
         total: Iterations of the run; the last one is always evaluated.
         without: Scheduled iterations without an evaluation.
-        is_written: Another process may be writing rows of the last iteration.
+        is_written: Whether another process may be writing rows of the last iteration.
     """
     seeds_at: dict[int, set[int]] = {}
     for row in rows:
@@ -204,8 +204,8 @@ def check_files(folder: RunFolder, is_finished: bool, shows_images: bool, findin
 
     Args:
         folder: The run folder.
-        is_finished: The run is complete.
-        shows_images: A complete run has a video.
+        is_finished: Whether the run is complete.
+        shows_images: Whether the task has images, so that a complete run has a video.
         findings: Findings, to which this adds.
     """
     files = (folder.config, folder.metrics, folder.processes, folder.curve, folder.video)

@@ -30,7 +30,7 @@ class Verification(Findings):
     """Findings about a run folder, and results of repeating its iterations.
 
     Attributes:
-        rows, numbers: Rows and numbers that were repeated, equal or not.
+        rows, numbers: Counts of the rows that were repeated and of their numbers, equal or not.
         checkpoints: Names of the checkpoints that were compared with a repetition.
         differences: Lines about rows and checkpoints that differ from the repetition; also among the problems.
         largest: The largest relative difference of a number.
@@ -53,7 +53,7 @@ class Verification(Findings):
 
 
 class Repeater:
-    """Repeats parts of one run.
+    """Repetition of iterations of one run, and comparison with its rows and checkpoints.
 
     Args:
         programs: Programs of the run.
@@ -239,7 +239,7 @@ def _comparable_values(row: Mapping[str, Any]) -> Row:
 
 
 def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the names of values that differ as JSON text, with both values."""
+    """Yield the name, the value of ``row`` and that of ``made``, for values that differ as JSON text."""
     compared = _comparable_values(row)
     for name in dict.fromkeys([*compared, *made]):
         value, again = compared.get(name, "nothing"), made.get(name, "nothing")
