@@ -288,7 +288,7 @@ class StudyOptions:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """One training run. The defaults are those of the preset ``fast``; `preset` also applies its task-specific values."""
+    """Configuration of one training run. The defaults are the general values of the preset ``fast`` (`presets.preset`)."""
 
     run: RunOptions = RunOptions()
     environment: EnvironmentOptions = EnvironmentOptions()

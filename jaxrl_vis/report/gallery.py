@@ -142,7 +142,8 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
         The environments to be drawn.
 
     Raises:
-        RequestError: The file cannot be written, its suffix is not an image format, or an environment has no images.
+        RequestError: The file cannot be written, its suffix is not an image format, or an environment has no images or cannot
+            be drawn.
     """
     try:  # Pillow registers suffixes of formats that it only reads, or that have no colours
         Image.new("RGB", (1, 1)).save(io.BytesIO(), Image.registered_extensions()[path.suffix.lower()])

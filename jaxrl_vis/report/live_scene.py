@@ -48,7 +48,7 @@ def colour(mj_model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def visible_geoms(mj_model: mujoco.MjModel, body: int) -> list[int]:
-    """List the visible geoms of a body."""
+    """List the ids of the visible geoms of a body: not of a collision group, and not fully transparent."""
     first, count = mj_model.body_geomadr[body], mj_model.body_geomnum[body]
     return [
         geom
@@ -58,7 +58,7 @@ def visible_geoms(mj_model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def moving_bodies(mj_model: mujoco.MjModel) -> list[int]:
-    """List the movable bodies with visible geoms."""
+    """List the ids of the movable bodies, mocap bodies excluded, that have visible geoms."""
     moved = (mj_model.body_weldid != 0) & (mj_model.body_mocapid < 0)
     return [body for body in range(mj_model.nbody) if moved[body] and visible_geoms(mj_model, body)]
 

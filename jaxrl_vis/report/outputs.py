@@ -16,8 +16,8 @@ def check_writable(path: Path, option: str = "", folder: bool = False) -> None:
 
     Args:
         path: The file or the folder.
-        option: The command line option, for the message.
-        folder: ``path`` is a folder.
+        option: The command-line option, for the message.
+        folder: Whether ``path`` is a folder.
 
     Raises:
         RequestError: The path cannot be written.

@@ -44,7 +44,7 @@ def draw_median(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, 
     """Draw the median over seeds as a thick line, and the middle half of the seeds as a band.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
         colour: The colour of both.
@@ -69,7 +69,7 @@ def draw_curves(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str) 
     """Draw the median and its band, every seed as a thin line, and a dot at the end.
 
     Args:
-        axes: Where to draw.
+        axes: Axes to draw on.
         steps: [P] env_steps.
         values: [S, P], NaN for gaps.
         colour: The colour of all of these.

@@ -62,7 +62,7 @@ def verify_run(
         iterations: Number of iterations to repeat from each start; None: up to the second evaluation.
         cache_programs: As in `jaxrl_vis.run.trainer.make_trainer`.
         echo: Called with a line about each step.
-        trust: Allow the run's own code, if its task is module:Name and was trained by another user.
+        trust: Whether to allow execution of the run's custom code (`jaxrl_vis.run.trust`).
 
     Raises:
         RequestError: There is no run, or it is not trusted, cannot be created any more, or needs more memory than is available.
@@ -93,7 +93,10 @@ def verify(
     report: Verification,
     echo: Callable[[str], None],
 ) -> Verification:
-    """Verify a run with an existing trainer of its configuration and the contents of its config.json."""
+    """Verify a run with an existing trainer of its configuration and the contents of its config.json.
+
+    Findings are added to ``report``, which is returned; other arguments as for `verify_run`.
+    """
     return _Verifier(trainer, RunFolder(path), record, report, echo).verify(iterations)
 
 

@@ -1,8 +1,8 @@
 """Images, goal images and true distances of a task, without a trained policy.
 
-hindsight   episodes of slowly changing random actions; the last image of each is its goal, so that all of them succeed
-pairs       images of episodes paired with goals: their own last image, that of another episode, and the goal that was given
-search      for each of several goals, the random sequence of actions with the highest reward: can the reward be exploited?
+play         episodes of slowly changing random actions
+make_pairs   images of episodes paired with goals: their own last image, that of another episode, and the goal that was given
+search       for each of several goals, the random sequence of actions with the highest reward: can the reward be exploited?
 """
 
 from collections.abc import Callable
@@ -77,7 +77,7 @@ def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:
 
 
 def play(env: GoalEnv, count: int, seed: int) -> Episodes:
-    """Roll out ``count`` episodes of random actions."""
+    """Roll out E = ``count`` episodes of slowly changing random actions; return NumPy arrays."""
 
     def episode(key: jax.Array) -> Episodes:
         start_key, action_key = jax.random.split(key)
@@ -110,7 +110,10 @@ def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
 
 
 def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
-    """Pair every image but the first with the last image of its episode, that of another episode, and the given goal."""
+    """Pair every image but the first with the last image of its episode, that of another episode, and the given goal.
+
+    The 3 E T pairs are in this order of goals; for each of them, episode by episode. ``seed`` determines the other episodes.
+    """
     count, length = episodes.images.shape[0], env.horizon
     draw = np.random.default_rng(seed)
     others = (np.arange(count) + draw.integers(1, max(2, count), count)) % count

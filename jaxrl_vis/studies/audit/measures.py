@@ -39,6 +39,10 @@ def error_shares(reward: np.ndarray, is_reached: np.ndarray) -> tuple[float, flo
 def calibration(reward: np.ndarray, is_reached: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare rewards, interpreted as probabilities, with the fraction of reached pairs, in uniform bins of the reward.
 
+    Args:
+        reward: [N] float.
+        is_reached: [N] bool, ground truth.
+
     Returns:
         Mean reward, fraction reached (both NaN in empty bins), and number of pairs: [BINS] each.
     """
@@ -50,6 +54,9 @@ def calibration(reward: np.ndarray, is_reached: np.ndarray) -> tuple[np.ndarray,
 
 
 def calibration_error(reward: np.ndarray, is_reached: np.ndarray) -> float:
-    """Compute the expected calibration error: the mean over pairs of |mean reward - fraction reached| of their bin."""
+    """Compute the expected calibration error: the mean over pairs of |mean reward - fraction reached| of their bin.
+
+    Arguments as for `calibration`.
+    """
     mean, frequency, count = calibration(reward, is_reached)
     return float(np.nansum(count * np.abs(mean - frequency)) / np.sum(count))

@@ -152,7 +152,7 @@ def describe_progress(cell: Cell, runs: Path) -> str:
 
 
 def latest_rows(folder: Path) -> Sequence[dict[str, Any]]:
-    """Return the rows of a run's last evaluation, one per seed; none before the first."""
+    """Return the rows of a run's last evaluation, one per seed; empty before the first."""
     rows = RunFolder(folder).rows()
     last = max((row["env_steps"] for row in rows), default=0)
     return [row for row in rows if row["env_steps"] == last]

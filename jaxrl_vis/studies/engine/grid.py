@@ -90,7 +90,7 @@ def run_cells(
         start: Function that starts a command.
 
     Returns:
-        One line for each failed cell.
+        One line for each cell that failed, or whose folder holds a run with other settings.
 
     Raises:
         RequestError: No device was found, or the folder cannot be written to.
