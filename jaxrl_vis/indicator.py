@@ -142,7 +142,7 @@ class Learner:
                 ``state_size``.
 
         Raises:
-            RequestError: A shape or dtype is wrong, or a value is not finite.
+            RequestError: A shape or dtype is wrong, a value is not finite, or ``states`` are missing or superfluous.
         """
         if (states is None) != (self._state_size == 0):
             raise RequestError("states are needed where a learner has a state_size, and only there")

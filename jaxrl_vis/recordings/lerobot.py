@@ -21,7 +21,11 @@ _SECOND = 1.0  # default control period of episodes without one, s
 
 
 def check_packages(with_video: bool = True) -> None:
-    """Raise a `RequestError` unless the packages for writing and reading datasets are installed."""
+    """Raise a `RequestError` unless the packages for writing and reading datasets are installed.
+
+    Args:
+        with_video: Whether PyAV must be installed, too, and able to write H.264.
+    """
     try:
         import pandas  # noqa: F401
         import pyarrow.parquet  # noqa: F401
@@ -139,7 +143,7 @@ class _Writer:
         pq.write_table(pa.table(columns), self._path(form.DATA))
 
     def _encode_video(self, name: str, episode: int) -> list[bytes]:
-        """Encode the images of an episode before each action; the goal's image is encoded only once."""
+        """Encode the images of an episode before each action as PNG; the goal's image is encoded only once."""
         shown = self._images(name, episode)[:-1]
         if name == form.GOAL_DEPTH:
             return [images.encode_png(shown[0])] * len(shown)

@@ -49,7 +49,7 @@ def losses(point: jax.Array) -> dict[str, jax.Array]:
 
 
 def authors_rule() -> Weighting:
-    """Return the weighting of the example."""
+    """Build the authors' weighting for this example: OL-AUX-1 on the losses themselves, multiplicative and unbounded."""
     return make_weighting("ol_aux", interval=1, learning_rate=1.0, beta=STEP_SIZE, log=False, minimum=None, multiplicative=True)
 
 

@@ -106,7 +106,7 @@ class Request:
         trials: Number of trials, including those of earlier calls.
         runs: Folder of the run folders and the journal.
         seed: Seed of the proposals.
-        seconds: Time after which training stops.
+        seconds: Time in seconds after which training stops; None if unlimited.
     """
 
     config: Config
@@ -129,7 +129,8 @@ def run_search(
         True if all trials have ended.
 
     Raises:
-        RequestError: Optuna is missing, the folder holds another search, or see `run_cells`.
+        RequestError: No option varies or one does twice, Optuna is missing, the folder holds another search, or see
+            `run_cells`.
         KeyboardInterrupt, Terminated: A signal arrived; raised after all runs have saved.
     """
     if not request.ranges:

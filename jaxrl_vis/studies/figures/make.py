@@ -33,7 +33,7 @@ _SHOW: dict[str, Callable[..., FigureContent]] = {
 
 
 def make_figure(request: Request, echo: Callable[[str], None] = streams.echo) -> bool:
-    """Train missing cells and draw finished ones.
+    """Train missing cells, unless ``draw_only`` is set, and draw finished ones; the paths written are passed to ``echo``.
 
     Returns:
         True if all cells are finished and thus plotted.
