@@ -176,7 +176,7 @@ def unwrap(hint: Any) -> tuple[Any, bool, bool]:
     return hint, optional, several
 
 
-def is_name_or_parts(hint: Any) -> bool:
+def names_components(hint: Any) -> bool:
     """Return True if a field with this annotation names one or several components."""
     return _names(unwrap(hint)[0]) is not None
 

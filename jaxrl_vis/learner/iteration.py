@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
-from jaxrl_vis.learner.acting.rollout_parts import Played, join_parts
+from jaxrl_vis.learner.acting.rollout_parts import PartResult, join_parts
 from jaxrl_vis.learner.algorithm import Algorithm, Batches
 from jaxrl_vis.learner.auxtasks.auxiliary import Auxiliary
 from jaxrl_vis.learner.memory.sampling import Sampler
@@ -111,7 +111,7 @@ def make_update(config: Config, sampler: Sampler, algorithm: Algorithm) -> Updat
 
 def make_learn(
     config: Config, insert: Insert, algorithm: Algorithm, sampler: Sampler, layout: Layout
-) -> Callable[[LoopState, Sequence[Played]], Learned]:
+) -> Callable[[LoopState, Sequence[PartResult]], Learned]:
     """Build the second half of an iteration.
 
     Returns:
@@ -120,7 +120,7 @@ def make_learn(
     """
     shards, num_envs = sampler.shards, sampler.replay.num_envs
 
-    def learn(loop: LoopState, parts: Sequence[Played]) -> Learned:
+    def learn(loop: LoopState, parts: Sequence[PartResult]) -> Learned:
         episodes, outcome = jax.tree.map(lambda *leaves: join_parts(leaves, num_envs), *parts)
         key = split_key(loop.key, loop.iteration)[1]
         train, replay_state = insert(loop.train, layout.unfold_replay(loop.replay), episodes, key, loop.iteration)

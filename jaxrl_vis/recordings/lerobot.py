@@ -111,13 +111,13 @@ class _Writer:
         if not recordings.are_images:
             columns[form.STATE] = recordings.observations[:, :-1]
             if recordings.goals is not None:
-                columns[form.GOAL] = self._each_step(recordings.goals)
+                columns[form.GOAL] = self._repeat_per_step(recordings.goals)
         if recordings.states is not None and recordings.goal_states is not None:
             columns[form.TRUE_STATE] = recordings.states[:, :-1]
-            columns[form.TRUE_GOAL] = self._each_step(recordings.goal_states)
+            columns[form.TRUE_GOAL] = self._repeat_per_step(recordings.goal_states)
         return columns
 
-    def _each_step(self, goals: np.ndarray) -> np.ndarray:
+    def _repeat_per_step(self, goals: np.ndarray) -> np.ndarray:
         return np.broadcast_to(goals[:, None], (len(goals), self._recordings.horizon, goals.shape[-1]))
 
     def _write_data(self) -> None:
@@ -130,7 +130,7 @@ class _Writer:
                 encoded = [
                     {"bytes": data, "path": None}
                     for episode in range(self._recordings.count)
-                    for data in self._encode_video(name, episode)
+                    for data in self._encode_pngs(name, episode)
                 ]
                 columns[name] = pa.array(encoded, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
             elif feature["dtype"] != "video":
@@ -142,7 +142,7 @@ class _Writer:
                 )
         pq.write_table(pa.table(columns), self._path(form.DATA))
 
-    def _encode_video(self, name: str, episode: int) -> list[bytes]:
+    def _encode_pngs(self, name: str, episode: int) -> list[bytes]:
         """Encode the images of an episode before each action as PNG; the goal's image is encoded only once."""
         shown = self._images(name, episode)[:-1]
         if name == form.GOAL_DEPTH:

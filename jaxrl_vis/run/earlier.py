@@ -62,7 +62,7 @@ def without_replay(programs: Programs, restored: Restored) -> LoopState:
     interrupted one.
     """
     fresh, layout = programs.init(programs.run_keys), programs.layout
-    iteration = layout.put(jnp.asarray(restored.iteration, fresh.iteration.dtype), layout.everywhere)
+    iteration = layout.put(jnp.asarray(restored.iteration, fresh.iteration.dtype), layout.replicated)
     return fresh.replace(train=restored.train, iteration=iteration)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jaxrl_vis_envs
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.learner.ddpg.learned_reward import Compared, make_autoencoder
+from jaxrl_vis.learner.ddpg.learned_reward import RewardInputs, make_autoencoder
 from jaxrl_vis.learner.networks import frozen_encoder, normalizer
 from jaxrl_vis.learner.networks.networks import Networks
 from jaxrl_vis.learner.resolved import resolve
@@ -76,7 +76,7 @@ def train_encoder(env: GoalEnv, config: Config, episodes: int, updates: int, pat
         nothing = jnp.zeros((len(chosen), env.action_size))
         batch = Batch(jnp.stack([chosen] * 3), nothing, nothing, nothing)
         pieces = [(networks.prepare(scaling, chosen), slice(None))]
-        compared = Compared(pieces, pieces, networks.normalize(scaling, chosen), batch)
+        compared = RewardInputs(pieces, pieces, networks.normalize(scaling, chosen), batch)
         loss, gradient = jax.value_and_grad(lambda params: model.loss_and_reward(params, compared)[0])(state.params)
         return model.apply(state, gradient), loss
 

@@ -29,10 +29,10 @@ from jaxrl_vis.host import distributed
 from jaxrl_vis.host.streams import reserve_standard_files, safe_streams
 from jaxrl_vis.run import earlier, trust
 from jaxrl_vis.run.compiled.memory import check_compiled, check_memory, fit_together
-from jaxrl_vis.run.compiled.pending import Pending
+from jaxrl_vis.run.compiled.pending import PendingMetrics
 from jaxrl_vis.run.compiled.programs import Programs
 from jaxrl_vis.run.goodput import Goodput
-from jaxrl_vis.run.loggers.console import RunConsole, show_seconds, show_shares
+from jaxrl_vis.run.loggers.console import RunConsole, format_fractions, format_seconds
 from jaxrl_vis.run.loggers.group import Loggers
 from jaxrl_vis.run.milestones import Milestones
 from jaxrl_vis.run.pace import Pace
@@ -42,7 +42,7 @@ from jaxrl_vis.run.signals import Interruption
 from jaxrl_vis.run.storage import metrics
 from jaxrl_vis.run.storage.checkpoint import FULL, LIGHT, RECENT, Checkpoints
 from jaxrl_vis.run.storage.folder import RunFolder, read_record, read_run_id
-from jaxrl_vis.run.storage.lock import FolderGoneError, Held, run_lock
+from jaxrl_vis.run.storage.lock import FolderGoneError, HeldLock, run_lock
 from jaxrl_vis.run.storage.metrics import PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.storage.restoring import Restored
@@ -80,7 +80,7 @@ class RunLoop:
         self._console = RunConsole(quiet=not self._writes)
         self._echo = self._console.echo
         self._checkpoints = Checkpoints(folder.checkpoints, self._echo)
-        self._held: Held | None = None  # by the first process
+        self._held: HeldLock | None = None  # by the first process
         self._saver = Saver(programs, folder, self._checkpoints, self._echo, self._check_ours)
         self._milestones = Milestones(self._config, self._checkpoints, self._saver, self._echo)
         self._log, self._loggers = log, Loggers(log if self._writes else (), folder.path, self._echo)
@@ -92,7 +92,7 @@ class RunLoop:
         self._recent_at: int | None = None  # iteration of the recent state from which this process resumed
         self._replay_lost = False  # True if this process resumed from a light checkpoint
         self._loop: LoopState | None = None
-        self._unread: list[tuple[int, Pending]] = []  # iterations whose metrics the device may still be working on
+        self._unread: list[tuple[int, PendingMetrics]] = []  # iterations whose metrics the device may still be working on
         self._recorded: dict[str, jax.Array] = {}
         self._started, self._compile_s = time.monotonic(), 0.0
         self._pace = Pace(self._program.steps_per_iteration * self._config.run.seeds)
@@ -211,7 +211,7 @@ class RunLoop:
 
     def _begin(self, compiled: dict[str, Any], is_resumed: bool, overwrite: bool) -> None:
         """Check the memory again, the last check that can refuse the run; then prepare folder and state."""
-        self._echo(f"compiled in {show_seconds(self._compile_s)}")
+        self._echo(f"compiled in {format_seconds(self._compile_s)}")
         is_there, layout = self._loop is not None, self._programs.layout
         check_compiled(compiled, is_there, layout)
         has_room = not distributed.any_process(not fit_together(compiled, is_there, layout))  # and all have come here
@@ -367,14 +367,14 @@ class RunLoop:
         self._console.advance(iteration, self._pace.speed(iteration))
         return self._report(iteration, values)
 
-    def _begin_evaluation(self) -> Pending:
+    def _begin_evaluation(self) -> PendingMetrics:
         """Dispatch an evaluation of the learner; `_evaluate` waits for the outcome."""
         assert self._loop is not None
         self._progress.evaluation_due = True  # until its rows are on the disk, whatever happens in between
         outcome, self._recorded = self._programs.evaluate(self._loop.train)
         return self._programs.pending(outcome)
 
-    def _evaluate(self, report: Report, outcome: Pending) -> Report:
+    def _evaluate(self, report: Report, outcome: PendingMetrics) -> Report:
         """Read the results of an evaluation, write a line per seed, and add the figures to the report."""
         progress, speed = self._progress, self._pace.speed(self._done)
         values = outcome.read_per_seed(self._config.run.seeds)
@@ -407,20 +407,20 @@ class RunLoop:
             progress.since_evaluation = []
         self._show(values, speed)
         assert self._loop is not None
-        self._milestones.evaluated(self._loop, self._done, values, self._progress_now())
+        self._milestones.save_if_best(self._loop, self._done, values, self._progress_now())
         self._pace.mark(self._done)
         return dataclasses.replace(report, metrics=report.metrics | values)
 
     def _show(self, values: PerSeed, speed: float) -> None:
         success, distance, unit = values["eval/success"], values["eval/goal_distance"], self._programs.env.distance_unit
-        self._console.evaluated(success, distance, unit)
+        self._console.show_evaluation(success, distance, unit)
         env_steps = self._done * self._program.steps_per_iteration
-        words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {show_shares(success)}"]
+        words = [f"iteration {self._done}/{self._total}", f"{env_steps:,} steps", f"success {format_fractions(success)}"]
         words.append(f"distance {np.median(distance):.3f} {unit}")
         if self._done > self._pace.begun:  # the speed is unknown if only a missed evaluation was made up for
             words.append(f"{speed:,.0f} steps/s")
             if self._done < self._total:
-                words.append(f"about {show_seconds(self._pace.seconds_left(self._done, self._total))} left")
+                words.append(f"about {format_seconds(self._pace.seconds_left(self._done, self._total))} left")
         self._echo("  ".join(words))
 
     def _warn_if_filtered(self, values: PerSeed) -> None:

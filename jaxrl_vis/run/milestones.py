@@ -48,7 +48,7 @@ class Milestones:
                 self._best = score
                 return
 
-    def evaluated(self, loop: LoopState, iteration: int, values: PerSeed, progress: Progress) -> None:
+    def save_if_best(self, loop: LoopState, iteration: int, values: PerSeed, progress: Progress) -> None:
         """Save the learner if its evaluation is the best.
 
         Args:

@@ -197,17 +197,17 @@ def check_names(losses: Losses, state: WeightingState) -> None:
         raise RequestError(f"losses are {known}, but the weighting began with {expected}; give init the names of all losses")
 
 
-def dot(one: Params, other: Params) -> jax.Array:
+def dot(left: Params, right: Params) -> jax.Array:
     """Compute the scalar inner product of two trees in float32 or wider, regardless of their dtypes.
 
     Elementwise products are summed instead of using a matrix unit, which on accelerators would round factors to 10 bits.
     """
 
-    def products(left: jax.Array, right: jax.Array) -> jax.Array:
-        dtype = jnp.promote_types(jnp.promote_types(left.dtype, right.dtype), jnp.float32)
-        return jnp.sum(left.astype(dtype) * right.astype(dtype))
+    def products(first: jax.Array, second: jax.Array) -> jax.Array:
+        dtype = jnp.promote_types(jnp.promote_types(first.dtype, second.dtype), jnp.float32)
+        return jnp.sum(first.astype(dtype) * second.astype(dtype))
 
-    return sum(jax.tree.leaves(jax.tree.map(products, one, other)), jnp.zeros(()))
+    return sum(jax.tree.leaves(jax.tree.map(products, left, right)), jnp.zeros(()))
 
 
 def scaled(tree: Params, factor: jax.Array | float) -> Params:
@@ -292,7 +292,7 @@ def auxiliary_names(weighting: str, names: Iterable[str], needed: bool = True) -
     return tuple(name for name in names if name != MAIN)
 
 
-def checked(weighting: Weighting) -> Weighting:
+def check_eps(weighting: Weighting) -> Weighting:
     """Check the ``eps`` and ``main_eps`` of a weighting, and return it.
 
     Raises:
@@ -318,7 +318,7 @@ def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> We
     return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **more)
 
 
-def start_alike(label: str, names: Iterable[str], **more: Any) -> WeightingState:
+def start_equal(label: str, names: Iterable[str], **more: Any) -> WeightingState:
     """Return the initial state of a weighting without a main loss: equal weights that sum to 1.
 
     Args:

@@ -17,10 +17,10 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     auxiliary_names,
-    checked,
+    check_eps,
     report,
     start,
-    start_alike,
+    start_equal,
 )
 
 
@@ -85,14 +85,14 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
         weights = {MAIN: one} | {name: jnp.where(statistics[name] >= 0.0, one, 0.0 * one) for name in dots}
         return weights, state.replace(weights=weights, updates=state.updates + 1), report(weights, dots)
 
-    weighting = checked(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads))
+    weighting = check_eps(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads))
     return weighting
 
 
 def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool = True, **more: Any) -> Weighting:
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         if not more.get("main", True):
-            ones = start_alike(name, names)
+            ones = start_equal(name, names)
             return ones.replace(weights={loss: jnp.ones_like(weight) for loss, weight in ones.weights.items()})
         others = auxiliary_names(name, names, needed=auxiliary)
         if not isinstance(weights, Mapping):
@@ -107,4 +107,4 @@ def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool =
         return state.weights, state.replace(updates=state.updates + 1), report(state.weights) if auxiliary else {}
 
     reads_losses = more.get("log", False)
-    return checked(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **more))
+    return check_eps(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **more))

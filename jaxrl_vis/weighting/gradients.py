@@ -69,7 +69,7 @@ class Weighted(NamedTuple):
     extra: Any = None
 
 
-def everything(params: Params) -> Params:
+def identity(params: Params) -> Params:
     """Return the argument: selects all parameters as shared, and reduces nothing."""
     return params
 
@@ -138,10 +138,10 @@ def gramian(gradients: Mapping[str, Params]) -> jax.Array:
 def weighted_grad(
     losses_fn: LossesFunction,
     weighting: Weighting,
-    shared: Selector = everything,
+    shared: Selector = identity,
     mode: GradientMode = "per_loss",
     has_aux: bool = False,
-    reduce: Callable[[Any], Any] = everything,
+    reduce: Callable[[Any], Any] = identity,
     forwards: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext,
     encode: Encode | None = None,
 ) -> Callable[..., Weighted]:
@@ -235,22 +235,22 @@ def _gradient_by_latents(
     *args: Any,
 ) -> Weighted:
     """Compute the weighted gradient from the gradients with respect to latents; arguments as for `weighted_grad`."""
-    through = latents.encode(encode, shared(params), *args)
+    encoding = latents.encode(encode, shared(params), *args)
     # Trace the losses to find which latents and parameters each of them reads.
-    program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, through.read, *args)
-    differentiated = latents.differentiate(losses_fn, has_aux, through, (program, results), params, *args)
+    program, results = jax.make_jaxpr(losses_fn, return_shape=True)(params, encoding.argument, *args)
+    differentiated = latents.differentiate(losses_fn, has_aux, encoding, (program, results), params, *args)
     check_names(differentiated.losses, state)
     losses = reduce(differentiated.losses)
     statistics = of_main = None
     if weighting.needs == "dots":
-        of_main = through.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
+        of_main = encoding.backward(differentiated.at_latents, {MAIN: jnp.ones(())})
         others = {name: at for name, at in differentiated.at_latents.items() if name != MAIN}
         with forwards():
-            dots = through.dots(reduce(of_main), others)
+            dots = encoding.dots(reduce(of_main), others)
         statistics = reduce(dots)
     elif weighting.needs == "gramian":
         with forwards():
-            statistics = reduce(through.gramian(differentiated.at_latents, reduce))
+            statistics = reduce(encoding.gramian(differentiated.at_latents, reduce))
     step, state, metrics = weighting.update(losses, statistics, state)
     assert not isinstance(step, Direction)  # only weightings that need whole gradients return one
     weights = step
@@ -258,7 +258,7 @@ def _gradient_by_latents(
     rest = coefficients
     if of_main is not None:
         rest = {name: coefficient for name, coefficient in coefficients.items() if name != MAIN}
-    added = through.backward(differentiated.at_latents, rest)
+    added = encoding.backward(differentiated.at_latents, rest)
     if of_main is not None:  # add the main loss's gradient, which is known already
         added = jax.tree.map(lambda main, other: coefficients[MAIN] * main + other, of_main, added)
     in_heads = differentiated.combine_heads(params, weighting.coefficients(weighting.head_weights(weights), losses))

@@ -23,9 +23,9 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     by_name,
-    checked,
+    check_eps,
     next_state,
-    start_alike,
+    start_equal,
     to_vector,
 )
 
@@ -69,7 +69,7 @@ def of_gramian(
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike(label, names, key=None if seed is None else jax.random.key(seed))
+        state = start_equal(label, names, key=None if seed is None else jax.random.key(seed))
         if memory is None:
             return state
         return state.replace(memory=memory(len(state.weights), next(iter(state.weights.values())).dtype))
@@ -80,7 +80,7 @@ def of_gramian(
         weights = by_name(losses, vector)
         return weights, *next_state(state, weights, memory=remembered)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting(
             label,
             init,

@@ -24,13 +24,13 @@ AtLatents = Mapping[str, Mapping[str, Any]]
 """Gradients with respect to latents, by loss and by group of latents that it reads."""
 
 
-def like(tree: Params, other: Params) -> Params:
+def cast_like(tree: Params, other: Params) -> Params:
     """Cast the leaves of a tree to the dtypes of another."""
     return jax.tree.map(lambda leaf, model: leaf.astype(model.dtype), tree, other)
 
 
 @dataclasses.dataclass(frozen=True)
-class Through:
+class Encoding:
     """Latents, and their linearisations with respect to the shared parameters.
 
     Attributes:
@@ -48,7 +48,7 @@ class Through:
     has_names: bool
 
     @property
-    def read(self) -> Any:
+    def argument(self) -> Any:
         """Latents in the form that losses take."""
         return self.latents if self.has_names else self.latents[_ALL]
 
@@ -65,7 +65,7 @@ class Through:
         for group, pullback in self.pullbacks.items():
             readers = {name: at[group] for name, at in at_latents.items() if name in coefficients and group in at}
             if readers:
-                (part,) = pullback(like(weighted_sum(readers, coefficients), self.latents[group]))
+                (part,) = pullback(cast_like(weighted_sum(readers, coefficients), self.latents[group]))
                 total = jax.tree.map(lambda before, more: before + more.astype(before.dtype), total, part)
         return total
 
@@ -76,7 +76,7 @@ class Through:
             direction: Tree like the shared parameters.
             at_latents: Gradients of the losses with respect to the latents.
         """
-        along, read = like(direction, self.encoder_params), {group for at in at_latents.values() for group in at}
+        along, read = cast_like(direction, self.encoder_params), {group for at in at_latents.values() for group in at}
         tangents = {
             group: jax.jvp(encode, (self.encoder_params,), (along,))[1]
             for group, encode in self.functions.items()
@@ -110,7 +110,7 @@ class Through:
         return 0.5 * (matrix + matrix.T)
 
 
-def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], encoder_params: Params, *args: Any) -> Through:
+def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], encoder_params: Params, *args: Any) -> Encoding:
     """Compute latents and their pullbacks to the shared parameters.
 
     Args:
@@ -125,11 +125,11 @@ def encode(functions: Callable[..., Any] | Mapping[str, Callable[..., Any]], enc
     }
     passes = {group: jax.vjp(function, encoder_params) for group, function in of_picked.items()}
     latents = {group: values for group, (values, _) in passes.items()}
-    return Through(latents, {group: back for group, (_, back) in passes.items()}, of_picked, encoder_params, has_names)
+    return Encoding(latents, {group: back for group, (_, back) in passes.items()}, of_picked, encoder_params, has_names)
 
 
 @dataclasses.dataclass(frozen=True)
-class Differentiated:
+class LossDerivatives:
     """Losses, and the gradient of each with respect to its inputs.
 
     Attributes:
@@ -157,14 +157,14 @@ class Differentiated:
 
 
 def differentiate(
-    losses_fn: Callable[..., Any], has_aux: bool, through: Through, traced: tuple[Any, Any], params: Params, *args: Any
-) -> Differentiated:
+    losses_fn: Callable[..., Any], has_aux: bool, encoding: Encoding, traced: tuple[Any, Any], params: Params, *args: Any
+) -> LossDerivatives:
     """Compute each loss, and its gradients with respect to the parameters and latents that it reads.
 
     Args:
         losses_fn: (params, latents, *args) -> [] floats by name; with ``has_aux``, followed by any auxiliary output.
         has_aux: See ``losses_fn``.
-        through: Result of `encode`.
+        encoding: Result of `encode`.
         traced: Result of `jax.make_jaxpr` for ``losses_fn``, with the shapes that it returns.
         params: All parameters.
         args: Further arguments of ``losses_fn``.
@@ -172,25 +172,25 @@ def differentiate(
     leaves, structure = jax.tree.flatten(params)
     program, results = traced
     losses, of_params, at_latents, extra = {}, {}, {}, None
-    reads = _find_reads(program, split_result(results, has_aux)[0], len(leaves), through)
+    reads = _find_reads(program, split_result(results, has_aux)[0], len(leaves), encoding)
     for name, (places, groups) in reads.items():
 
         def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
             now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
-            inputs = through.latents | latents
-            read = inputs if through.has_names else inputs[_ALL]
+            inputs = encoding.latents | latents
+            read = inputs if encoding.has_names else inputs[_ALL]
             by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
             return to_float32(jnp.asarray(by_name[name])), extra
 
         # Differentiate each loss separately, so that the compiler can remove the computation of all others as dead code.
-        chosen, read = {place: leaves[place] for place in places}, {group: through.latents[group] for group in groups}
+        chosen, read = {place: leaves[place] for place in places}, {group: encoding.latents[group] for group in groups}
         losses[name], pullback, aux = jax.vjp(one, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
         extra = aux if name == MAIN or MAIN not in reads else extra
-    return Differentiated(losses, of_params, at_latents, extra)
+    return LossDerivatives(losses, of_params, at_latents, extra)
 
 
-def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, through: Through) -> dict[str, Any]:
+def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, encoding: Encoding) -> dict[str, Any]:
     """Find where each loss can have a nonzero gradient: indices of the parameters' leaves, and groups of latents.
 
     Within a nested program, every result is assumed to depend on every argument, so the result may include too many places,
@@ -199,7 +199,7 @@ def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, throug
     variables = program.jaxpr.invars
     of_leaf, rest = variables[:num_leaves], iter(variables[num_leaves:])
     # Leaves of a dictionary come in the order of its sorted keys.
-    of_group = {group: [next(rest) for _ in jax.tree.leaves(through.latents[group])] for group in sorted(through.latents)}
+    of_group = {group: [next(rest) for _ in jax.tree.leaves(encoding.latents[group])] for group in sorted(encoding.latents)}
     reads = {}
     for name, result in zip(sorted(losses), program.jaxpr.outvars):  # followed by the auxiliary outputs
         needed = set() if isinstance(result, Literal) else {result}

@@ -21,7 +21,7 @@ from jaxrl_vis.weighting.base import (
     Weights,
     by_name,
     next_state,
-    start_alike,
+    start_equal,
     to_vector,
 )
 
@@ -53,7 +53,7 @@ def random(seed: int = 0) -> Weighting:
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        return start_alike("random", names, key=jax.random.key(seed))
+        return start_equal("random", names, key=jax.random.key(seed))
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         drawn = jax.random.normal(jax.random.fold_in(state.key, state.updates), (len(losses),))
@@ -162,7 +162,7 @@ def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
     _check_positive("dwa", "epoch", epoch)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike("dwa", names)
+        state = start_equal("dwa", names)
         weights = {name: jnp.ones_like(weight) for name, weight in state.weights.items()}
         zeros = jnp.zeros(len(weights), weights[next(iter(weights))].dtype)
         return state.replace(weights=weights, memory={"sum": zeros, "last": jnp.zeros_like(zeros)})
@@ -203,7 +203,7 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
     rule = optax.chain(optax.add_decayed_weights(decay), optax.adam(learning_rate))
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike("famo", names)
+        state = start_equal("famo", names)
         logits = jnp.zeros(len(state.weights), state.weights[next(iter(state.weights))].dtype)
         return state.replace(memory={"logits": logits, "rule": rule.init(logits), "logs": jnp.zeros_like(logits)})
 
@@ -226,7 +226,7 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
 
 def _begin(label: str) -> Callable[..., WeightingState]:
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        return start_alike(label, names)
+        return start_equal(label, names)
 
     return init
 
@@ -249,7 +249,7 @@ def _learned(
     rule = optax.adam(learning_rate)
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        state = start_alike(label, names)
+        state = start_equal(label, names)
         scales = jnp.zeros(len(state.weights), state.weights[next(iter(state.weights))].dtype)
         weights = by_name(state.weights, to_weights(scales))
         return state.replace(weights=weights, memory={"scales": scales, "rule": rule.init(scales)})

@@ -27,7 +27,7 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     auxiliary_names,
-    checked,
+    check_eps,
     report,
     scaled,
     start,
@@ -74,7 +74,7 @@ def ol_aux(
         after = move(state, scaled(sums, 1.0 / interval), sums)
         return state.weights, after, report(state.weights, dots)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting("ol_aux", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)
     )
     return weighting

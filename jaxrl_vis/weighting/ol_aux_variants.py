@@ -20,7 +20,7 @@ from jaxrl_vis.weighting.base import (
     WeightingState,
     Weights,
     auxiliary_names,
-    checked,
+    check_eps,
     dot,
     report,
     scaled,
@@ -82,7 +82,7 @@ def ol_aux_window(
         after = move(state, scaled(sums, 1.0 / interval), sums, window=gradients)
         return state.weights, after, report(state.weights, dots)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)
     )
     return weighting
@@ -147,7 +147,7 @@ def ol_aux_ablation(
         dots = {name: dot(direction, gradient) for name, gradient in gradients.items() if name != MAIN}
         return state.weights, move(state, dots, sums, params=state.params), report(state.weights, dots)
 
-    weighting = checked(
+    weighting = check_eps(
         Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, interval=interval, hold=hold)
     )
     return weighting

@@ -22,7 +22,7 @@ from jaxrl_vis_envs.base import GoalEnv
 PART_SIZE = 8
 """Maximum number of environments in a part: as many float32 numbers as fit into a vector register of most CPUs."""
 
-Played = tuple[Episodes, Metrics]
+PartResult = tuple[Episodes, Metrics]
 """Episodes [S, P, ...] of one part, and their metrics (`GoalEnv.metric_names`) at the last step, [S, P] float32 by name."""
 
 
@@ -75,7 +75,7 @@ class RolloutPart:
         return jax.vmap(jax.random.fold_in, (None, 0))(key, self.first + jnp.arange(count))
 
 
-def played_spec(env: GoalEnv, size: int, seeds: int) -> Played:
+def part_result_spec(env: GoalEnv, size: int, seeds: int) -> PartResult:
     """Return shapes and dtypes of the result of one part, without tracing its program.
 
     Args:

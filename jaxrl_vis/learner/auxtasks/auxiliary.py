@@ -207,7 +207,7 @@ def make_auxiliary(
             configuration.
     """
     if config.auxiliary.weighting in WEIGHTINGS:
-        weighting = _bound_strength(config, make_weighting(config.auxiliary.weighting, **_options(config)))
+        weighting = _limit_weights(config, make_weighting(config.auxiliary.weighting, **_options(config)))
     else:
         maker = find("weighting", config.auxiliary.weighting, WEIGHTINGS, config.environment.env_folder)
         weighting = call("weighting", config.auxiliary.weighting, maker, of=Weighting)
@@ -239,7 +239,7 @@ def make_auxiliary(
     return Auxiliary(auxtasks.make(config.auxiliary.aux_tasks, spec, config.environment.env_folder), weighting, gradient_mode)
 
 
-def _bound_strength(config: Config, weighting: Weighting) -> Weighting:
+def _limit_weights(config: Config, weighting: Weighting) -> Weighting:
     """Limit the weights, or fix their sum, as configured. OL-AUX applies the maximum weight in its own rule."""
     maximum, total = config.study.weighting_maximum, config.study.weighting_total
     if config.auxiliary.weighting == "ol_aux":

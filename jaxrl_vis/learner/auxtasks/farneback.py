@@ -67,17 +67,18 @@ def flow(images_t: jax.Array, images_tp1: jax.Array, settings: Settings = Settin
         settings: Window, pyramid, iterations.
     """
     expand = jax.vmap(functools.partial(_expansions, settings=settings))
-    return _interpolate_planes(expand(images_t), expand(images_tp1), settings)
+    return _displacements_between(expand(images_t), expand(images_tp1), settings)
 
 
 def flow_along(images: jax.Array, settings: Settings = Settings()) -> jax.Array:
     """Compute `flow` between successive images, [T + 1, H, W] -> [T, H, W, 2], expanding each image only once."""
     expansions = jax.vmap(functools.partial(_expansions, settings=settings))(images)
     before, after = (jax.tree.map(lambda plane, part=part: plane[part], expansions) for part in (slice(-1), slice(1, None)))
-    return _interpolate_planes(before, after, settings)
+    return _displacements_between(before, after, settings)
 
 
-def _interpolate_planes(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
+def _displacements_between(before: list[Planes], after: list[Planes], settings: Settings) -> jax.Array:
+    """Compute displacements [B, H, W, 2] (right, down) between images with expansions ``before`` and ``after`` [B, ...]."""
     displace = functools.partial(_displacements, settings=settings)
     return jnp.stack(jax.vmap(displace)(before, after), axis=-1)
 

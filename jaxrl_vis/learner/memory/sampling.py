@@ -177,13 +177,13 @@ class Sampler:
         if choice.is_replaceable is not None:
             batch = self._replace_reached_goals(batch, choice.is_replaceable)
         if self.config.study.n_step > 1:
-            return self._rewarded_over_steps(state, choice, batch)
+            return self._with_n_step_rewards(state, choice, batch)
         batch = batch.replace(success=goals.success(batch.state_tp1, batch.goal_state, self.threshold))
         if self.resolved.method.is_learned:
             return batch  # the learner computes rewards with its current model (`learned_reward`)
         return batch.replace(reward=self.reward(batch, reached, choice.clutter_end))
 
-    def _rewarded_over_steps(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
+    def _with_n_step_rewards(self, state: ReplayState, choice: Choice, batch: Batch) -> Batch:
         """Replace rewards by discounted sums of the oracle's over up to ``n_step`` steps, and adapt the discounts."""
         episode, time = choice.indices
         after = time[:, None] + 1 + jnp.arange(self.config.study.n_step)  # slots that the steps lead to, [B, n]

@@ -80,7 +80,7 @@ class Layout:
         return Spec() if jax.process_count() > 1 else Spec(SEED)
 
     @property
-    def everywhere(self) -> Spec:
+    def replicated(self) -> Spec:
         """Spec of replicated arrays."""
         return Spec()
 

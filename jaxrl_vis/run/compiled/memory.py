@@ -76,7 +76,7 @@ def _container_bytes() -> int:
         return 2**62
 
 
-def show_bytes(count: float) -> str:
+def format_bytes(count: float) -> str:
     """Format a size as ``1.5 GiB``: always in GiB, so that any two sizes can be compared at a glance."""
     gib = count / 2**30
     return f"{gib:.1f} GiB" if gib >= 0.1 else f"{gib:.3f} GiB" if gib >= 0.001 else "under 0.001 GiB"
@@ -130,7 +130,7 @@ def check_memory(
     other = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
     available, suffix = _available_bytes(layout), "" if layout.num_devices == 1 else " a device"
     if available is None:
-        return f"replay {show_bytes(replay)}{suffix}"
+        return f"replay {format_bytes(replay)}{suffix}"
     if replay + other > available:
         fitting = int((available - other) // bytes_per_rollout) * steps_per_iteration
         if fitting > 0:
@@ -140,10 +140,10 @@ def check_memory(
         seeds = "1 seed" if config.run.seeds == 1 else f"{config.run.seeds} seeds"
         raise RequestError(
             f"a replay of {config.run.replay_transitions} transitions for {seeds} needs "
-            f"{show_bytes(replay)}{suffix}, and networks and rollouts {show_bytes(other)} more; there are "
-            f"{show_bytes(available)}{suffix}: {hint}"
+            f"{format_bytes(replay)}{suffix}, and networks and rollouts {format_bytes(other)} more; there are "
+            f"{format_bytes(available)}{suffix}: {hint}"
         )
-    return f"replay {show_bytes(replay)} of {show_bytes(available)}{suffix}"
+    return f"replay {format_bytes(replay)} of {format_bytes(available)}{suffix}"
 
 
 def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> None:
@@ -164,8 +164,8 @@ def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout 
     for name, size in scratch.items():
         if size + (0 if is_allocated else state) > available:
             raise RequestError(
-                f"{name} needs {show_bytes(size)} of scratch memory beside a state of {show_bytes(state)}; there are "
-                f"{show_bytes(available)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
+                f"{name} needs {format_bytes(size)} of scratch memory beside a state of {format_bytes(state)}; there are "
+                f"{format_bytes(available)}: lower --num-envs, --eval-episodes, --batch-size or --replay-transitions"
             )
 
 

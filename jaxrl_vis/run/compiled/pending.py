@@ -15,20 +15,20 @@ from jaxrl_vis.types import Metrics
 
 
 @jax.jit
-def stacked(metrics: Metrics) -> jax.Array:
+def stack_metrics(metrics: Metrics) -> jax.Array:
     """Stack metrics, [S] or [] each, in the order of their names: [K, S]."""
     return jnp.stack(jnp.broadcast_arrays(*(metrics[name] for name in sorted(metrics))))
 
 
-class Pending:
+class PendingMetrics:
     """Metrics that a device may still be computing.
 
     Args:
         metrics: [S] or [] float32 each, by name. NumPy arrays are kept as they are.
-        stack: `stacked`, or its compiled program.
+        stack: `stack_metrics`, or its compiled program.
     """
 
-    def __init__(self, metrics: Metrics, stack: Callable[[Metrics], jax.Array] = stacked):
+    def __init__(self, metrics: Metrics, stack: Callable[[Metrics], jax.Array] = stack_metrics):
         self._names = sorted(metrics)
         self._rows: Any = [metrics[name] for name in self._names]
         if any(isinstance(value, jax.Array) for value in self._rows):

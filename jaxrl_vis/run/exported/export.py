@@ -18,7 +18,7 @@ from jaxrl_vis.run.exported.layers import COMPUTATION, INPUTS, Layers, forward, 
 from jaxrl_vis.run.storage.folder import EXPORT_FOLDER
 from jaxrl_vis.run.trained.policy import Policy, choose_seed, make_policy
 from jaxrl_vis.run.trained.restored_run import Choice, load, open_run
-from jaxrl_vis.run.trained.shipped import find, workplace
+from jaxrl_vis.run.trained.shipped import find, output_folder
 
 _EPISODES = 8
 
@@ -72,7 +72,7 @@ def export_run(
     if kind == "onnx":
         onnx_file.require()
     run_dir = find(run_dir)
-    folder = workplace(run_dir) / EXPORT_FOLDER / kind if out is None else Path(out)
+    folder = output_folder(run_dir) / EXPORT_FOLDER / kind if out is None else Path(out)
     _check_folder(folder, overwrite)
     # No other library would reproduce the rounding of networks in bfloat16 or TF32.
     trainer = open_run(run_dir, True, trust, eval_episodes=num_recorded(_EPISODES), compute_dtype="float32")

@@ -119,7 +119,7 @@ def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
     return len(fold_replay) >= 2 and start == folded_start and rest == [fold_replay[0] * fold_replay[1], *fold_replay[2:]]
 
 
-def as_saved(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
+def restore_target(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:
     """Return orbax's restore target for an array that was saved with ``shape``.
 
     This is ``expected`` if it has that shape and lies on a single device, else a NumPy array of the saved shape, which is

@@ -25,7 +25,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import check_path, is_temporary, read_json, write_atomically
 from jaxrl_vis.run.storage.lock import FILE_NAME as LOCK_NAME
-from jaxrl_vis.run.storage.lock import FolderGoneError, Held
+from jaxrl_vis.run.storage.lock import FolderGoneError, HeldLock
 from jaxrl_vis.run.storage.metrics import RUN_ID, read_rows
 
 SCHEMA = 2
@@ -52,7 +52,7 @@ def default_folder(config: Config) -> Path:
     return Path("runs") / f"{config.environment.env.replace(':', '-')}-{config.reward.method}-{config.run.preset}-{seeds}"
 
 
-def check_there(path: Path, resume: bool) -> None:
+def check_resumable(path: Path, resume: bool) -> None:
     """Raise a `RequestError` if ``path`` cannot be a run folder, or if a run is to be resumed in a missing folder."""
     _check_run_path(path)
     if resume and not path.exists():
@@ -131,7 +131,7 @@ class RunFolder:
             return rows
         return [row for row in rows if row.get(RUN_ID) == run_id]
 
-    def check_place(self, lock: Held) -> None:
+    def check_place(self, lock: HeldLock) -> None:
         """Check that the folder is still in place since it was locked, before the run starts.
 
         Args:
@@ -144,7 +144,7 @@ class RunFolder:
         if not lock.is_in_place():
             raise FolderGoneError(_where_gone(self.path, lock.current_path(), "before the run began"))
 
-    def check_ours(self, run_id: str, lock: Held) -> None:
+    def check_ours(self, run_id: str, lock: HeldLock) -> None:
         """Check that the folder still belongs to a run, before writing into it.
 
         Args:
@@ -188,7 +188,7 @@ class RunFolder:
         """
         if resume and overwrite:
             raise RequestError("--resume and --overwrite contradict each other: give one of them")
-        check_there(self.path, resume)
+        check_resumable(self.path, resume)
         if self.path.exists() and not self.path.is_dir():
             raise RequestError(f"{self.path} is a file: choose another --run-dir")
         try:

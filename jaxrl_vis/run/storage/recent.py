@@ -64,13 +64,13 @@ class Recent:
         self._rollouts: dict[int, int] = {}  # rollouts known to exist, and their checksums
         self._cost, self._saved_at, self._is_off = 0.0, -np.inf, False
 
-    def is_due(self, in_any_case: bool) -> bool:
+    def is_due(self, ignore_time: bool) -> bool:
         """Return True if enough time has passed since the last save for saving to take only a small fraction of it.
 
         Args:
-            in_any_case: Whether to ignore the time since the last save.
+            ignore_time: Whether to ignore the time since the last save.
         """
-        return not self._is_off and (in_any_case or time.monotonic() - self._saved_at >= self._cost / _FRACTION)
+        return not self._is_off and (ignore_time or time.monotonic() - self._saved_at >= self._cost / _FRACTION)
 
     def iterations(self) -> list[int]:
         """Return the iterations of this run's states, ascending, including damaged ones."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.run.storage import sums
-from jaxrl_vis.run.storage.arrays import as_saved, check_structure, host_specs, is_intact, rebuild, to_host
+from jaxrl_vis.run.storage.arrays import check_structure, host_specs, is_intact, rebuild, restore_target, to_host
 from jaxrl_vis.run.storage.manifest import SCHEMA, is_manifest
 from jaxrl_vis.run.storage.recent import Unusable
 from jaxrl_vis.types import LoopState, TrainState
@@ -99,7 +99,7 @@ def restore_items(
     for name, spec in specs.items():
         with _damage_first(where):
             check_structure(where, manifest["items"].get(name, {}), spec)
-        specs[name] = {leaf: as_saved(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
+        specs[name] = {leaf: restore_target(manifest["items"][name][leaf][0], expected) for leaf, expected in spec.items()}
     items = read({name: ocp.args.StandardRestore(spec) for name, spec in specs.items()})
     trees = {}
     for name, tree in templates.items():

@@ -115,7 +115,7 @@ def evaluate_run(
     """
     trainer = open_run(run_dir, cache_programs, trust, **({} if episodes is None else {"eval_episodes": episodes}))
     restored = load(trainer, run_dir, checkpoint)
-    check_compiled(trainer.programs.of_evaluation(), is_allocated=True)
+    check_compiled(trainer.programs.evaluation_programs(), is_allocated=True)
     values = jax.device_get(trainer.evaluate(restored.train))
     return {name: [float(number) for number in value] for name, value in values.items()}
 

@@ -51,7 +51,7 @@ class Pairs(NamedTuple):
     distance: Any
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Result of a search over sequences of actions, for each of E goals.
 
     Attributes:
@@ -127,7 +127,7 @@ def make_pairs(env: GoalEnv, episodes: Episodes, seed: int) -> Pairs:
     return Pairs(np.concatenate([flat[0]] * 3), np.concatenate(repeated), np.concatenate(distance))
 
 
-def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) -> Found:
+def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) -> SearchResult:
     """Search for actions that maximise a reward at the end of an episode, ``sequences`` random ones for each of ``goals``."""
 
     def of_goal(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -146,4 +146,4 @@ def search(env: GoalEnv, reward: Reward, goals: int, sequences: int, seed: int) 
         return rewards[best], is_reached[best], jnp.any(is_reached)
 
     episodes = jaxrl_vis_envs.jit(lambda keys: jax.lax.map(of_goal, keys))(jax.random.split(jax.random.key(seed), goals))
-    return Found(*map(np.asarray, episodes))
+    return SearchResult(*map(np.asarray, episodes))

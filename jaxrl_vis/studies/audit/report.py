@@ -155,6 +155,6 @@ def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit:
     figure.savefig(out, dpi=120)
 
 
-def devices() -> str:
+def device_kind() -> str:
     """Return the kind of device on which audits run, for records."""
     return jax.devices()[0].device_kind

@@ -24,10 +24,10 @@ from jaxrl_vis.host import streams
 from jaxrl_vis.host.devices import Device
 from jaxrl_vis.host.provenance import child_environment
 from jaxrl_vis.run.command import training_options
-from jaxrl_vis.run.loggers.console import show_seconds
+from jaxrl_vis.run.loggers.console import format_seconds
 from jaxrl_vis.run.signals import SIGNALS, Interruption
 from jaxrl_vis.run.storage.folder import RunFolder
-from jaxrl_vis.studies.engine.cells import Cell, contradiction, is_finished, latest_rows, show_budget
+from jaxrl_vis.studies.engine.cells import Cell, contradiction, format_budget, is_finished, latest_rows
 from jaxrl_vis.studies.engine.cluster import Job
 
 _POLL_S = 0.2
@@ -176,7 +176,7 @@ class _Grid:
     def _end(self, done: _Running) -> None:
         self._running.remove(done)
         self._free.append(done.device)
-        status, took = done.process.wait(), show_seconds(time.monotonic() - done.started)
+        status, took = done.process.wait(), format_seconds(time.monotonic() - done.started)
         if status == 0 and is_finished(done.cell, self._runs):
             self._echo(f"{done.cell.name}: done in {took}{_success(self._runs / done.cell.name)}")
         elif self._is_stopping and (-status in SIGNALS or status - 128 in SIGNALS):
@@ -191,8 +191,8 @@ class _Grid:
 
     def _describe(self, running: _Running) -> str:
         latest = latest_rows(self._runs / running.cell.name)
-        steps = show_budget(latest[0]["env_steps"]) if latest else "0"
-        budget = show_budget(running.cell.config.run.env_steps)
+        steps = format_budget(latest[0]["env_steps"]) if latest else "0"
+        budget = format_budget(running.cell.config.run.env_steps)
         return f"{running.cell.name}: {steps} of {budget} steps{_success(self._runs / running.cell.name)}"
 
     def _stop(self, reason: str) -> None:

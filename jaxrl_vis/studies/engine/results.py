@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.report.plots import gather, show_steps
+from jaxrl_vis.report.plots import format_steps, gather
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.studies.engine.cells import Cell, describe_progress, differences, find_folder, finished_rows
 
@@ -104,7 +104,7 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Reached:
+class StepsToLevel:
     """Environment steps at which a level of success was reached, as defined in `jaxrl_vis.report.learning`.
 
     Attributes:
@@ -120,7 +120,7 @@ class Reached:
     high: float | None
     budget: int
 
-    def ratio(self, other: "Reached") -> str:
+    def ratio(self, other: "StepsToLevel") -> str:
         """Format the ratio of the other's steps to these: ``2.0``, or a bound if one of them did not reach the level."""
         if self.steps and other.steps:
             return f"{other.steps / self.steps:.1f}"
@@ -131,23 +131,23 @@ class Reached:
     def __str__(self) -> str:
         """Format the steps as ``120 k (100 k to 140 k)``, or ``> 250 k`` if the level was not reached."""
         if self.steps is None:
-            return f"> {show_steps(self.budget)}"
+            return f"> {format_steps(self.budget)}"
         if self.low is None:
-            return show_steps(self.steps)
-        high = "> " + show_steps(self.budget) if self.high is None else show_steps(self.high)
-        return f"{show_steps(self.steps)} ({show_steps(self.low)} to {high})"
+            return format_steps(self.steps)
+        high = "> " + format_steps(self.budget) if self.high is None else format_steps(self.high)
+        return f"{format_steps(self.steps)} ({format_steps(self.low)} to {high})"
 
 
-def reached(line: Line, level: float) -> Reached:
+def find_steps(line: Line, level: float) -> StepsToLevel:
     """Find the steps at which a line reached a level."""
     median = steps_to(line.points, level)
     if len(line.seeds) == 1:
-        return Reached(level, median, None, None, line.end)
+        return StepsToLevel(level, median, None, None, line.end)
     per_seed = [steps_to(curve([row for row in line.rows if row["seed"] == seed], SUCCESS), level) for seed in line.seeds]
     # Some values are only known to exceed the budget, so use quartiles without interpolation.
     quartiles = np.percentile([np.inf if steps is None else steps for steps in per_seed], [25, 75], method="inverted_cdf")
     low, high = (float(value) if np.isfinite(value) else None for value in quartiles)
-    return Reached(level, median, low, high, line.end)
+    return StepsToLevel(level, median, low, high, line.end)
 
 
 def mean_success(line: Line, up_to: int) -> float:

@@ -29,7 +29,9 @@ _ORACLE_WORKS: dict[str, tuple[str, float]] = {
 }
 
 
-def show(_: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
+def make_content(
+    _: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]
+) -> FigureContent:
     """Create the content of a figure from its lines."""
 
     def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:

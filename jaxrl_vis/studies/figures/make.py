@@ -25,10 +25,10 @@ from jaxrl_vis.studies.figures.show import FigureContent, Request
 STUDIES: dict[str, Study] = {**indicator.STUDIES, **goals.STUDIES, **ol_aux.STUDIES}
 """Studies by figure."""
 
-_SHOW: dict[str, Callable[..., FigureContent]] = {
-    goals.FAMILY.name: goals_figure.show,
-    indicator.FAMILY.name: indicator_figures.show,
-    ol_aux.FAMILY.name: ol_aux_figures.show,
+_MAKE_CONTENT: dict[str, Callable[..., FigureContent]] = {
+    goals.FAMILY.name: goals_figure.make_content,
+    indicator.FAMILY.name: indicator_figures.make_content,
+    ol_aux.FAMILY.name: ol_aux_figures.make_content,
 }
 
 
@@ -70,7 +70,7 @@ def _write(
     """Write the images and both tables; return their paths."""
     study = request.study
     tasks = [task for task in request.tasks or study.steps if any((task, variant) in lines for variant in variants)]
-    content = _SHOW[study.family.name](request, lines, tasks, variants)
+    content = _MAKE_CONTENT[study.family.name](request, lines, tasks, variants)
     about, title, pictures = _about(request, list(lines.values())), content.title or study.title, []
     for picture in content.pictures:
         pictures.append(request.out.with_stem(request.out.stem + picture.suffix))

@@ -29,11 +29,11 @@ from jax.experimental.pallas import triton as plgpu
 from jaxrl_vis.learner.networks import forward_mode
 from jaxrl_vis.learner.networks.kernels.passes import (
     MIN_ROWS,
-    before,
     dispatch,
     dot,
     layer,
-    rectified,
+    rectifier_gradient,
+    relu,
     rows,
     tiles_of_program,
     whole_block,
@@ -112,7 +112,7 @@ def _cast(weights: Weights, dtype: Any) -> Weights:
 def _forward(cells: jax.Array, weights: Weights) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Compute the rectified cells and the layer above them, in the dtype of ``cells``, and the pixels in float32."""
     dtype = cells.dtype
-    hidden = rectified(cells.astype(jnp.float32) + weights.bias_in[None, :]).astype(dtype)
+    hidden = relu(cells.astype(jnp.float32) + weights.bias_in[None, :]).astype(dtype)
     finer = layer(hidden, weights.kernel_1, weights.bias_1)
     return hidden, finer, dot(finer, weights.kernel_2) + weights.bias_2[None, :]
 
@@ -131,8 +131,8 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
         error = pixels - target_ref[here, :].astype(jnp.float32)
         squares += jnp.sum(error * error, axis=0)
         before_2 = (2.0 * scale * error).astype(hidden.dtype)
-        before_1 = before(finer, dot(before_2, weights.kernel_2, (1, 1)))
-        before_in = before(hidden, dot(before_1, weights.kernel_1, (1, 1)))
+        before_1 = rectifier_gradient(finer, dot(before_2, weights.kernel_2, (1, 1)))
+        before_in = rectifier_gradient(hidden, dot(before_1, weights.kernel_1, (1, 1)))
         gradient_ref[here, :] = before_in
         sums = Weights(
             sums.bias_in + add_rows(before_in),
@@ -231,6 +231,6 @@ def squared_error(cells: jax.Array, target: jax.Array, weights: Weights, scale: 
     """
     if cells.shape[0] % MIN_ROWS:
         raise ValueError(f"{cells.shape[0]} cells are not a multiple of {MIN_ROWS}")
-    if forward_mode.are_wanted():
+    if forward_mode.is_active():
         return _plain_squared_error(cells, target, weights, scale)
     return _squared_error(cells, target, weights, scale, interpret)

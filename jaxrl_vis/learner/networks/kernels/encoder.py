@@ -103,6 +103,6 @@ def encode(patches: jax.Array, weights: Weights, which: slice = slice(None), int
     if math.gcd(first, count) % TILE:  # a few small images
         patches = jnp.pad(patches[which], ((0, -len(images) % TILE), (0, 0), (0, 0)))
         first, rows = 0, patches.shape[0] * of_image
-    chosen = apply_forwards if forward_mode.are_wanted() else apply
+    chosen = apply_forwards if forward_mode.is_active() else apply
     out: jax.Array = chosen(patches.reshape(-1, size), weights, first, rows, interpret)  # type: ignore[assignment]
     return out[:count].reshape(-1, of_image, out.shape[-1])

@@ -18,13 +18,13 @@ from jaxrl_vis.learner.networks.kernels.passes import (
     apply,
     apply_plain,
     as_quarters,
-    before,
     cast_kernels,
     dispatch,
     dot,
-    joined,
     layer,
-    read,
+    layer_inputs,
+    load_weights,
+    rectifier_gradient,
     rows,
     tile_quarters,
     tile_rows,
@@ -36,13 +36,13 @@ from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 def _tangent_kernel(x_ref, *refs):
     inputs, (out_ref, tangent_ref) = refs[:-2], refs[-2:]
-    weights, tangent_weights = read(inputs[: len(inputs) // 2]), read(inputs[len(inputs) // 2 :])
+    weights, tangent_weights = load_weights(inputs[: len(inputs) // 2]), load_weights(inputs[len(inputs) // 2 :])
 
     def one_tile(tile, _):
         values, tangents = x_ref[tile_quarters(tile), :], None
         for level, parameters in enumerate(zip(*weights, *tangent_weights, strict=True)):
-            tangents = None if tangents is None else joined(tangents, level)
-            values, tangents = _layer_jvp(joined(values, level), tangents, *parameters)
+            tangents = None if tangents is None else layer_inputs(tangents, level)
+            values, tangents = _layer_jvp(layer_inputs(values, level), tangents, *parameters)
         assert tangents is not None  # there is a layer
         out_ref[tile_rows(tile), :], tangent_ref[tile_rows(tile), :] = values, tangents
 
@@ -61,7 +61,7 @@ def _layer_jvp(
     out, change = layer(values, kernel, bias), dot(values, kernel_along) + bias_along[None, :]
     if tangents is not None:
         change += dot(tangents, kernel)
-    return out, before(out, change)
+    return out, rectifier_gradient(out, change)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))

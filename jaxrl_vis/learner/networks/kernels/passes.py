@@ -95,41 +95,41 @@ def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -
 
 def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
     """Apply a dense layer with rectifier, in the dtype of ``values``."""
-    return rectified(dot(values, kernel) + bias[None, :]).astype(values.dtype)
+    return relu(dot(values, kernel) + bias[None, :]).astype(values.dtype)
 
 
-def rectified(values: jax.Array) -> jax.Array:
-    """Rectify, with gradient 0 at 0 like `jax.nn.relu` and unlike `jnp.maximum`, because blank image regions are exactly 0."""
+def relu(values: jax.Array) -> jax.Array:
+    """Apply a ReLU, with gradient 0 at 0 like `jax.nn.relu` and unlike `jnp.maximum`: blank image regions are exactly 0."""
     return jnp.where(values > 0.0, values, 0.0)
 
 
-def before(after: jax.Array, gradient: jax.Array) -> jax.Array:
-    """Propagate a gradient back through a rectifier with output ``after``, in its dtype."""
-    return jnp.where(after > 0.0, gradient, 0.0).astype(after.dtype)
+def rectifier_gradient(output: jax.Array, gradient: jax.Array) -> jax.Array:
+    """Multiply a gradient, or a tangent, by the derivative of a rectifier with output ``output``, in its dtype."""
+    return jnp.where(output > 0.0, gradient, 0.0).astype(output.dtype)
 
 
 def _layers(quarters: jax.Array, weights: Weights) -> list[jax.Array]:
-    """Return the output of each layer for quarters of patches [4 R, 16 C']; see `joined` for their rows."""
+    """Return the output of each layer for quarters of patches [4 R, 16 C']; see `layer_inputs` for their rows."""
     outputs, values = [], quarters
     for level, (kernel, bias) in enumerate(zip(*weights, strict=True)):
-        values = layer(joined(values, level), kernel, bias)
+        values = layer(layer_inputs(values, level), kernel, bias)
         outputs.append(values)
     return outputs
 
 
-def joined(values: jax.Array, level: int) -> jax.Array:
+def layer_inputs(values: jax.Array, level: int) -> jax.Array:
     """Return the rows that layer ``level`` multiplies: four quarters side by side for the last of them, else unchanged."""
     return values.reshape(values.shape[0] // 4, -1) if level == LEVELS - 1 else values
 
 
-def read(refs: Any) -> Weights:
+def load_weights(refs: Any) -> Weights:
     """Load the weights from a kernel's arguments: kernels, then biases."""
     values = tuple(ref[...] for ref in refs)
     return Weights(values[: len(values) // 2], values[len(values) // 2 :])
 
 
 def _forward_kernel(x_ref, *refs):
-    weights, out_ref = read(refs[:-1]), refs[-1]
+    weights, out_ref = load_weights(refs[:-1]), refs[-1]
 
     def one_tile(tile, _):
         *_, out_ref[tile_rows(tile), :] = _layers(x_ref[tile_quarters(tile), :], weights)
@@ -148,7 +148,7 @@ def tile_quarters(tile: Any) -> Any:
 
 
 def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
-    weights, sums_ref = read(refs[:-1]), refs[-1]
+    weights, sums_ref = load_weights(refs[:-1]), refs[-1]
     hidden_layers = Weights(weights.kernels[:-1], weights.biases[:-1])
 
     def add_rows(values):
@@ -160,8 +160,8 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         values += [*_layers(values[0], hidden_layers), out_ref[tile_rows(tile), :]]
         gradient, of_kernels, of_biases = gradient_ref[tile_rows(tile), :], list(sums.kernels), list(sums.biases)
         for level in reversed(range(LEVELS)):
-            gradient = before(values[level + 1], gradient)
-            of_kernels[level] += dot(joined(values[level], level), gradient, (0, 0))
+            gradient = rectifier_gradient(values[level + 1], gradient)
+            of_kernels[level] += dot(layer_inputs(values[level], level), gradient, (0, 0))
             of_biases[level] += add_rows(gradient)
             if level:
                 gradient = dot(gradient, weights.kernels[level], (1, 1)).reshape(values[level].shape)
