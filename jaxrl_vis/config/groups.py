@@ -333,13 +333,13 @@ def marked(mark: Mark) -> tuple[str, ...]:
     return tuple(name for name, field in OPTIONS.items() if mark in field.extras)
 
 
-def of_weightings() -> dict[str, tuple[str, ...]]:
+def weighting_options() -> dict[str, tuple[str, ...]]:
     """Map each field that is read only if losses are weighted to its weightings; an empty tuple stands for any weighting."""
     marks = {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, OfWeighting)}
     return {name: mark.names for name, mark in marks.items()}
 
 
-def read_by(kind: type[T]) -> dict[str, T]:
+def options_read_by(kind: type[T]) -> dict[str, T]:
     """Map each field annotated with an instance of ``kind``, `OfAlgorithm` or `OfMethod`, to that instance."""
     return {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, kind)}
 

@@ -16,8 +16,8 @@ from jaxrl_vis.config.groups import (
     OfMethod,
     data_devices,
     marked,
-    of_weightings,
-    read_by,
+    options_read_by,
+    weighting_options,
 )
 from jaxrl_vis.config.methods import ALGORITHMS, METHODS
 from jaxrl_vis.errors import RequestError
@@ -47,11 +47,11 @@ def validate(config: Config) -> Config:
         raise RequestError(
             f"n_step {study.n_step} with method {config.reward.method}: the filter's valid range assumes one step"
         )
-    for name, algorithms in read_by(OfAlgorithm).items():
+    for name, algorithms in options_read_by(OfAlgorithm).items():
         if _is_changed(config, name) and run.algorithm in ALGORITHMS and run.algorithm not in algorithms.names:
             wanted = " or ".join(algorithms.names)
             raise RequestError(f"{name} is an option of --algorithm {wanted}, and this is {run.algorithm}: leave it out")
-    for name, reader in read_by(OfMethod).items():
+    for name, reader in options_read_by(OfMethod).items():
         if _is_changed(config, name) and config.reward.method in METHODS and config.reward.method != reader.name:
             raise RequestError(
                 f"{name} is an option of --method {reader.name}, and this is {config.reward.method}: leave it out"
@@ -79,7 +79,7 @@ def _is_changed(config: Config, name: str) -> bool:
 def _validate_auxiliary(config: Config) -> None:
     """Raise a RequestError for an option of another weighting, or for one of auxiliary tasks if there are none."""
     weighting = config.auxiliary.weighting
-    for name, weightings in of_weightings().items():
+    for name, weightings in weighting_options().items():
         if weightings and _is_changed(config, name) and weighting not in weightings:
             raise RequestError(
                 f"{name} is an option of weighting {' and '.join(weightings)}, which {weighting} does not use: "

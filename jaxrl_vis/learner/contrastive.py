@@ -134,21 +134,23 @@ def build(setup: Setup, loss: Callable[[jax.Array], jax.Array], stabilised: bool
         def encode(params: Params) -> jax.Array:
             return networks.encode_pieces(params, inputs.pieces("before", "goal")).reshape(2, inputs.size, -1)
 
-        def of_critic(critic: Params) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        def critic_objective(critic: Params) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             latents = encode(critic)
             of_pairs, of_goals = represent(critic, latents, batch.action)
             logits = of_pairs @ of_goals.T
             return loss(logits), (logits, latents)
 
-        def of_actor(actor: Params, critic_latents: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def actor_objective(actor: Params, critic_latents: jax.Array) -> tuple[jax.Array, jax.Array]:
             latents = encode(actor) if "encoder" in actor else critic_latents
             action = networks.act(actor, _with_other_goals(latents))
             of_pairs, of_goals = represent(agent.critic, _with_other_goals(critic_latents), action)
             size = jnp.mean(jnp.square(action))
             return config.ddpg.action_penalty * size - jnp.mean(jnp.sum(of_pairs * of_goals, axis=-1)), size
 
-        (critic_loss, (logits, latents)), of_critic_parameters = jax.value_and_grad(of_critic, has_aux=True)(agent.critic)
-        (actor_loss, size), of_actor_parameters = jax.value_and_grad(of_actor, has_aux=True)(
+        (critic_loss, (logits, latents)), of_critic_parameters = jax.value_and_grad(critic_objective, has_aux=True)(
+            agent.critic
+        )
+        (actor_loss, size), of_actor_parameters = jax.value_and_grad(actor_objective, has_aux=True)(
             agent.actor, jax.lax.stop_gradient(latents)
         )
         critic, critic_optimizer = _step(

@@ -161,7 +161,7 @@ def check_gallery(path: Path, names: Sequence[str] | None = None) -> Sequence[st
     return names
 
 
-def draw(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
+def write_gallery(path: Path, names: Sequence[str] | None = None, image_size: int = 128, goals: int = 4) -> None:
     """Write the gallery.
 
     Args:

@@ -174,7 +174,7 @@ def _gif_bytes(images: list[Image.Image], seconds: list[float]) -> bytes:
     return file.getvalue()
 
 
-def _strip(episodes: EpisodeImages) -> Image.Image:
+def _draw_strip(episodes: EpisodeImages) -> Image.Image:
     """Draw six steps of up to four episodes, one episode per row, with the goal at the right."""
     num_frames = episodes.frames.shape[1]
     depth_range = range_of_depth(episodes)
@@ -239,7 +239,7 @@ def write_video(episodes: EpisodeImages, path: Path, frame_seconds: float = 0.04
         raise RequestError(f"nothing to show: observations are vectors of {episodes.frames.shape[-1]} numbers, not images")
     if path.suffix.lower() == ".png":
         path.parent.mkdir(parents=True, exist_ok=True)
-        _strip(episodes).save(path)
+        _draw_strip(episodes).save(path)
         return
     write_images(*draw_frames(episodes, frame_seconds, max_episodes), path, frame_seconds)
 

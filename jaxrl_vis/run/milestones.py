@@ -44,7 +44,7 @@ class Milestones:
                 self._echo(f"{error}: the next evaluation is the best")
                 continue
             score = progress.get(SCORE)
-            if progress.get(SCORED) == scores.metric(self._config) and isinstance(score, float):
+            if progress.get(SCORED) == scores.metric_name(self._config) and isinstance(score, float):
                 self._best = score
                 return
 
@@ -61,8 +61,8 @@ class Milestones:
             return
         score = scores.score(self._config, values)
         if scores.is_better(self._config, score, self._best):
-            about = {SCORE: score, SCORED: scores.metric(self._config)}
-            self._saver.best(loop, iteration, progress, about)
+            about = {SCORE: score, SCORED: scores.metric_name(self._config)}
+            self._saver.save_best(loop, iteration, progress, about)
             self._best = score
 
     def end_reason(self, report: Report, callbacks: Sequence[Callback]) -> str | None:
@@ -72,5 +72,5 @@ class Milestones:
             asked |= callback(report) is True
         score = scores.score(self._config, report.metrics)
         if distributed.any_process(scores.is_enough(self._config, score)):
-            return f"{scores.metric(self._config)} {score:.3f} has reached --stop-at {self._config.run.stop_at:g}"
+            return f"{scores.metric_name(self._config)} {score:.3f} has reached --stop-at {self._config.run.stop_at:g}"
         return "a callback asked to stop" if distributed.any_process(asked) else None

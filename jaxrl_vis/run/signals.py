@@ -151,7 +151,7 @@ class Interruption(_Handlers):
         return signal_name(self.signal or signal.SIGTERM)
 
     @property
-    def hurry(self) -> str:
+    def quit_hint(self) -> str:
         """Hint for messages: the input that ends the process without waiting."""
         return "once more quits" if self.signal in _DELIBERATE else "Ctrl-C or SIGTERM, twice, quits"
 

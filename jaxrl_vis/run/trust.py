@@ -61,13 +61,13 @@ def trust(run_dir: Path, config: Config, was_trained_here: bool = False) -> None
             path.unlink(missing_ok=True)
 
 
-def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True") -> None:
-    """Check that the code of a run may be imported; the permission ``may`` is stored.
+def check(run_dir: Path, config: Config, is_permitted: bool, hint: str = "pass trust=True") -> None:
+    """Check that the code of a run may be imported; the permission ``is_permitted`` is stored.
 
     Args:
         run_dir: The run folder.
         config: Its configuration.
-        may: Whether the user gives the permission.
+        is_permitted: Whether the user gives the permission.
         hint: Hint on how to give the permission, for the message.
 
     Raises:
@@ -75,12 +75,12 @@ def check(run_dir: Path, config: Config, may: bool, hint: str = "pass trust=True
     """
     if not is_own(config) or is_trusted(run_dir, config):
         return
-    if not may:
-        raise RequestError(f"{question(run_dir, config)}: look at it, and if you trust it, {hint}")
+    if not is_permitted:
+        raise RequestError(f"{describe_code(run_dir, config)}: look at it, and if you trust it, {hint}")
     trust(run_dir, config)
 
 
-def question(run_dir: Path, config: Config) -> str:
+def describe_code(run_dir: Path, config: Config) -> str:
     """Return the clause of messages that lists the custom code of a run, and the files that it is imported from."""
     files = _files(config)
     parts = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]

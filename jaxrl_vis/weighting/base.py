@@ -210,7 +210,7 @@ def dot(left: Params, right: Params) -> jax.Array:
     return sum(jax.tree.leaves(jax.tree.map(products, left, right)), jnp.zeros(()))
 
 
-def scaled(tree: Params, factor: jax.Array | float) -> Params:
+def scale_tree(tree: Params, factor: jax.Array | float) -> Params:
     """Multiply all leaves of a tree by a scalar."""
     return jax.tree.map(lambda leaf: factor * leaf, tree)
 
@@ -364,7 +364,7 @@ def zeros_for(label: str, names: Iterable[str], shared: Params, *leading: int) -
     return {name: jax.tree.map(zeros, shared) for name in names}
 
 
-def report(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
+def weight_metrics(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
     """Return the metrics ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if ``dots`` is given."""
     shown = {f"weight/{name}": weight for name, weight in weights.items() if name != MAIN}
     return shown | {f"dot/{name}": value for name, value in (dots or {}).items()}

@@ -18,9 +18,9 @@ from jaxrl_vis.weighting.base import (
     Weights,
     auxiliary_names,
     check_eps,
-    report,
     start,
     start_equal,
+    weight_metrics,
 )
 
 
@@ -83,7 +83,7 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
         one = state.weights[MAIN]
         # Use the sign of the dot product itself: slopes are positive, but a small product might underflow.
         weights = {MAIN: one} | {name: jnp.where(statistics[name] >= 0.0, one, 0.0 * one) for name in dots}
-        return weights, state.replace(weights=weights, updates=state.updates + 1), report(weights, dots)
+        return weights, state.replace(weights=weights, updates=state.updates + 1), weight_metrics(weights, dots)
 
     weighting = check_eps(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads))
     return weighting
@@ -104,7 +104,7 @@ def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool =
         return start(others, weights)
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
-        return state.weights, state.replace(updates=state.updates + 1), report(state.weights) if auxiliary else {}
+        return state.weights, state.replace(updates=state.updates + 1), weight_metrics(state.weights) if auxiliary else {}
 
     reads_losses = more.get("log", False)
     return check_eps(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **more))

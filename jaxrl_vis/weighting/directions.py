@@ -25,7 +25,7 @@ from jaxrl_vis.weighting.base import (
     check_eps,
     dot,
     next_state,
-    scaled,
+    scale_tree,
     start_equal,
     to_float32,
     to_vector,
@@ -113,7 +113,9 @@ def db_mtl(beta: float = 0.9, sigma: float = 0.0, eps: Eps = 1e-8, main_eps: flo
         slopes = weighting.slopes(losses)
         past = beta / (state.updates + 1.0) ** sigma
         averages = {
-            name: jax.tree.map(lambda new, old: new + past * (old - new), scaled(statistics[name], slope), state.memory[name])
+            name: jax.tree.map(
+                lambda new, old: new + past * (old - new), scale_tree(statistics[name], slope), state.memory[name]
+            )
             for name, slope in slopes.items()
         }
         lengths = {name: jnp.sqrt(dot(average, average)) for name, average in averages.items()}

@@ -175,7 +175,7 @@ def differentiate(
     reads = _find_reads(program, split_result(results, has_aux)[0], len(leaves), encoding)
     for name, (places, groups) in reads.items():
 
-        def one(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
+        def compute_loss(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
             now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
             inputs = encoding.latents | latents
             read = inputs if encoding.has_names else inputs[_ALL]
@@ -184,7 +184,7 @@ def differentiate(
 
         # Differentiate each loss separately, so that the compiler can remove the computation of all others as dead code.
         chosen, read = {place: leaves[place] for place in places}, {group: encoding.latents[group] for group in groups}
-        losses[name], pullback, aux = jax.vjp(one, chosen, read, has_aux=True)
+        losses[name], pullback, aux = jax.vjp(compute_loss, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
         extra = aux if name == MAIN or MAIN not in reads else extra
     return LossDerivatives(losses, of_params, at_latents, extra)

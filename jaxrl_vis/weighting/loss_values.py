@@ -39,7 +39,7 @@ def uniform() -> Weighting:
     def update(losses: Losses, statistics: Any, state: WeightingState) -> Result:
         return state.weights, *next_state(state, state.weights)
 
-    return Weighting("uniform", _begin("uniform"), update, main=False, reads_losses=False)
+    return Weighting("uniform", _make_init("uniform"), update, main=False, reads_losses=False)
 
 
 def random(seed: int = 0) -> Weighting:
@@ -81,7 +81,9 @@ def uncertainty(learning_rate: float = 1e-2) -> Weighting:
     Raises:
         RequestError: ``learning_rate`` is not positive.
     """
-    return _learned("uncertainty", learning_rate, lambda s, losses: (1.0 - jnp.exp(-s) * losses) / 2, lambda s: jnp.exp(-s) / 2)
+    return _make_learned(
+        "uncertainty", learning_rate, lambda s, losses: (1.0 - jnp.exp(-s) * losses) / 2, lambda s: jnp.exp(-s) / 2
+    )
 
 
 def imtl_l(learning_rate: float = 1e-2) -> Weighting:
@@ -96,7 +98,7 @@ def imtl_l(learning_rate: float = 1e-2) -> Weighting:
     Raises:
         RequestError: ``learning_rate`` is not positive.
     """
-    return _learned("imtl_l", learning_rate, lambda s, losses: jnp.exp(s) * losses - 1.0, jnp.exp)
+    return _make_learned("imtl_l", learning_rate, lambda s, losses: jnp.exp(s) * losses - 1.0, jnp.exp)
 
 
 def geometric_mean(eps: float = 1e-8) -> Weighting:
@@ -116,7 +118,7 @@ def geometric_mean(eps: float = 1e-8) -> Weighting:
         weights = by_name(losses, mean / (len(losses) * values))
         return weights, *next_state(state, weights)
 
-    return Weighting("geometric_mean", _begin("geometric_mean"), update, main=False)
+    return Weighting("geometric_mean", _make_init("geometric_mean"), update, main=False)
 
 
 def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weighting:
@@ -141,7 +143,7 @@ def stch(mu: float = 0.1, reference: Mapping[str, float] | None = None) -> Weigh
         weights = by_name(losses, jax.nn.softmax((values - jnp.max(values)) / (count * mu)) / count)
         return weights, *next_state(state, weights)
 
-    return Weighting("stch", _begin("stch"), update, main=False)
+    return Weighting("stch", _make_init("stch"), update, main=False)
 
 
 def dwa(temperature: float = 2.0, epoch: int = 100) -> Weighting:
@@ -224,14 +226,14 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
     return Weighting("famo", init, update, main=False)
 
 
-def _begin(label: str) -> Callable[..., WeightingState]:
+def _make_init(label: str) -> Callable[..., WeightingState]:
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
         return start_equal(label, names)
 
     return init
 
 
-def _learned(
+def _make_learned(
     label: str,
     learning_rate: float,
     slope: Callable[[jax.Array, jax.Array], jax.Array],

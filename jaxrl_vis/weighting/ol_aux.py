@@ -28,9 +28,9 @@ from jaxrl_vis.weighting.base import (
     Weights,
     auxiliary_names,
     check_eps,
-    report,
-    scaled,
+    scale_tree,
     start,
+    weight_metrics,
 )
 
 
@@ -71,8 +71,8 @@ def ol_aux(
         slopes = weighting.slopes(losses)
         dots = {name: slopes[MAIN] * slopes[name] * statistics[name] for name in state.sums}
         sums = jax.tree.map(jnp.add, state.sums, dots)
-        after = move(state, scaled(sums, 1.0 / interval), sums)
-        return state.weights, after, report(state.weights, dots)
+        after = move(state, scale_tree(sums, 1.0 / interval), sums)
+        return state.weights, after, weight_metrics(state.weights, dots)
 
     weighting = check_eps(
         Weighting("ol_aux", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)

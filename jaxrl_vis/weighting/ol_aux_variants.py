@@ -22,9 +22,9 @@ from jaxrl_vis.weighting.base import (
     auxiliary_names,
     check_eps,
     dot,
-    report,
-    scaled,
+    scale_tree,
     start,
+    weight_metrics,
     weighted_sum,
     zeros_for,
 )
@@ -72,15 +72,15 @@ def ol_aux_window(
 
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         check_state(label, state)
-        latest = _learned(weighting, losses, statistics)
+        latest = _log_gradients(weighting, losses, statistics)
         latest[MAIN] = _direction(main_grad, latest, state.weights)
         gradients = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), state.window, latest)
         count = jnp.minimum(state.updates + 1, window)  # the window begins with zeros
         mean = jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0) / count, gradients)
         dots = {name: dot(mean[MAIN], mean[name]) for name in state.sums}
         sums = jax.tree.map(jnp.add, state.sums, dots)
-        after = move(state, scaled(sums, 1.0 / interval), sums, window=gradients)
-        return state.weights, after, report(state.weights, dots)
+        after = move(state, scale_tree(sums, 1.0 / interval), sums, window=gradients)
+        return state.weights, after, weight_metrics(state.weights, dots)
 
     weighting = check_eps(
         Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, heads=heads, interval=interval)
@@ -141,11 +141,11 @@ def ol_aux_ablation(
         check_state(label, state)
         sums = jax.tree.map(jnp.add, state.sums, {"losses": dict(losses), "gradients": dict(statistics)})
         # Means, as those of one large minibatch.
-        mean = scaled(sums, 1.0 / (state.updates % interval + 1))
-        gradients = _learned(weighting, mean["losses"], mean["gradients"])
+        mean = scale_tree(sums, 1.0 / (state.updates % interval + 1))
+        gradients = _log_gradients(weighting, mean["losses"], mean["gradients"])
         direction = _direction(main_grad, gradients, state.weights)
         dots = {name: dot(direction, gradient) for name, gradient in gradients.items() if name != MAIN}
-        return state.weights, move(state, dots, sums, params=state.params), report(state.weights, dots)
+        return state.weights, move(state, dots, sums, params=state.params), weight_metrics(state.weights, dots)
 
     weighting = check_eps(
         Weighting(label, init, update, needs="gradients", log=log, eps=eps, main_eps=main_eps, interval=interval, hold=hold)
@@ -160,9 +160,9 @@ def _check_main_grad(label: str, main_grad: str) -> None:
         )
 
 
-def _learned(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
+def _log_gradients(weighting: Weighting, losses: Losses, gradients: Mapping[str, Params]) -> dict[str, Params]:
     """Convert gradients of the losses to those of their logarithms, if the weighting minimises these."""
-    return {name: scaled(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
+    return {name: scale_tree(gradients[name], slope) for name, slope in weighting.slopes(losses).items()}
 
 
 def _direction(main_grad: MainGradient, gradients: Mapping[str, Params], weights: Weights) -> Params:

@@ -66,7 +66,7 @@ def decode(params: Params, values: jax.Array, dtype: Any) -> jax.Array:
         dtype: Dtype of the computation.
     """
     layers = _layers(params)
-    pixels = _through(layers, values, dtype) + layers[-1]["bias"].astype(dtype)
+    pixels = _apply_layers(layers, values, dtype) + layers[-1]["bias"].astype(dtype)
     size = 4 ** (len(layers) - 1) * pixels.shape[-1]
     return pixels.reshape(values.shape[0], -1, size).astype(jnp.float32)
 
@@ -81,7 +81,7 @@ def decoding_error(params: Params, values: jax.Array, patches: jax.Array, dtype:
         dtype: Dtype of the computation.
     """
     *coarser, before, finer, finest = _layers(params)
-    cells = _through([*coarser, before], values, dtype)
+    cells = _apply_layers([*coarser, before], values, dtype)
     weights = decoder_kernel.make_weights(before["bias"], finer, finest)
     pixels = cells.shape[0] * 16 * finest["bias"].shape[0]
     return decoder_kernel.squared_error(cells, patches.reshape(-1, patches.shape[-1] // 4), weights, 1.0 / pixels)
@@ -100,7 +100,7 @@ def _layers(params: Params) -> list[Params]:
     return [params["dense"], *(params[f"up_{level}"] for level in range(len(params) - 1))]
 
 
-def _through(layers: list[Params], values: jax.Array, dtype: Any) -> jax.Array:
+def _apply_layers(layers: list[Params], values: jax.Array, dtype: Any) -> jax.Array:
     """Return the output of the last layer before its bias is added: [.., outputs of a pixel], in ``dtype``."""
     for number, layer in enumerate(layers):
         if number > 0:

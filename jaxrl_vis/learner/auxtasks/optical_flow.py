@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxrl_vis.learner.auxtasks import farneback, heads
 from jaxrl_vis.learner.auxtasks.images import grey
 from jaxrl_vis.learner.auxtasks.task import AuxTask, Spec, View, mean_squared_error, read
-from jaxrl_vis.learner.networks.blocks import from_blocks, shifted, to_blocks
+from jaxrl_vis.learner.networks.blocks import from_blocks, shift_images, to_blocks
 from jaxrl_vis.learner.networks.kernels.patches import to_patches
 from jaxrl_vis.types import Params
 
@@ -21,16 +21,16 @@ def make(spec: Spec) -> AuxTask:
     _, height, width = spec.observation.shape
     size = (height >> spec.levels << spec.levels, width >> spec.levels << spec.levels)
 
-    def both(view: View) -> jax.Array:
+    def both_latents(view: View) -> jax.Array:
         return jnp.concatenate([view.latent_t, read(view, "latent_tp1")], axis=-1)
 
     def decode(params: Params, view: View) -> jax.Array:
-        return heads.decode(params, both(view), spec.dtype)
+        return heads.decode(params, both_latents(view), spec.dtype)
 
     def loss(params: Params, view: View) -> jax.Array:
         if view.patches is not None and heads.has_kernel(view.latent_t.shape[0], (1, height, width), spec.levels):
             patches = to_patches(read(view, "target")[:, None].astype(spec.dtype), spec.levels)
-            return heads.decoding_error(params, both(view), patches, spec.dtype)
+            return heads.decoding_error(params, both_latents(view), patches, spec.dtype)
         return mean_squared_error(decode(params, view), to_blocks(read(view, "target")[:, None], spec.levels))
 
     return AuxTask(
@@ -41,7 +41,7 @@ def make(spec: Spec) -> AuxTask:
         loss=loss,
         episode=lambda images: to_bytes(flow_strength_along(images, spec.frame_stack, stretch), stretch),
         target=lambda batch: from_bytes(batch.stored, stretch),
-        shift=lambda flow, pixels: shifted(flow[:, None], pixels)[:, 0],
+        shift=lambda flow, pixels: shift_images(flow[:, None], pixels)[:, 0],
         number=4,
     )
 

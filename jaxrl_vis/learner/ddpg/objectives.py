@@ -60,14 +60,14 @@ class Latents(NamedTuple):
     views: dict[str, jax.Array]
 
 
-def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, apart: bool) -> Latents:
+def _encode_online(networks: Networks, auxiliary: Auxiliary, params: Params, inputs: Inputs, separately: bool) -> Latents:
     """Encode all observations that losses read, with gradient.
 
-    Most auxiliary losses read only one or two of them. If encoded ``apart``, the gradient of each loss passes through these
-    alone.
+    Most auxiliary losses read only one or two of them. If encoded ``separately``, the gradient of each loss passes through
+    these alone.
     """
     names = ("before", "goal", *auxiliary.encoded)
-    if apart:
+    if separately:
         latents = [_encode(networks, params, inputs, name)[0] for name in names]
         pair = jnp.stack(latents[:2])
     else:
@@ -165,7 +165,7 @@ class Objectives:
         networks, weighting, mode = self.networks, self.auxiliary.weighting, self.auxiliary.gradient_mode
 
         def encode(encoder: Params) -> Latents:
-            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, apart=mode == "per_loss")
+            return _encode_online(networks, self.auxiliary, {"encoder": encoder}, inputs, separately=mode == "per_loss")
 
         def critic_losses(critic: Params, encoded: Latents | dict[str, jax.Array]):
             assert batch.reward is not None
@@ -206,7 +206,7 @@ class Objectives:
         discount = resolved.discount if batch.discount is None else batch.discount
         return losses.td_target(batch.reward, value_tp1, discount, resolved.target_minimum, resolved.target_maximum)
 
-    def of_actor(
+    def actor_loss(
         self,
         actor: Params,
         critic: Params,
@@ -223,7 +223,7 @@ class Objectives:
         has_encoder = self.config.network.encoders == "separate"
         latents, others = critic_latents, {}
         if has_encoder:
-            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, apart=False)
+            latents = _encode_online(self.networks, self.auxiliary, actor, inputs, separately=False)
             others = self._auxiliary(actor, latents, inputs, image, batch, weights)
         if self.auxiliary.weighting.log:
             others = {name: self.shards.global_mean(loss) for name, loss in others.items()}

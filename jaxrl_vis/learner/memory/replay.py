@@ -120,7 +120,7 @@ class Replay(NamedTuple):
         """Return shapes and dtypes of the storage, without allocating it; arguments as for `init`."""
         return jax.eval_shape(lambda: self.init(*args))
 
-    def _stored(self, rollout: Episodes) -> Episodes:
+    def _to_storage(self, rollout: Episodes) -> Episodes:
         """Convert a rollout's episodes to their stored form: only the newest image of each observation, packed."""
         newest = rollout.observations[:, :, : rollout.observations.shape[2] // self.frame_stack]
         stored = {name: _pack_steps(array) for name, array in rollout.stored.items()}
@@ -128,7 +128,7 @@ class Replay(NamedTuple):
 
     def of_rollout(self, rollout: Episodes) -> ReplayState:
         """Create a replay that holds just the E episodes of one rollout."""
-        return ReplayState(episodes=self._stored(rollout), size=jnp.full((), self.num_envs, jnp.int32))
+        return ReplayState(episodes=self._to_storage(rollout), size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
         """Write the E episodes of a rollout; once the ring is full, they overwrite the oldest ones.
@@ -142,7 +142,7 @@ class Replay(NamedTuple):
         episodes = jax.tree.map(
             lambda storage, new: jax.lax.dynamic_update_slice_in_dim(storage, new, start, axis=0),
             state.episodes,
-            self._stored(rollout),
+            self._to_storage(rollout),
         )
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
@@ -211,11 +211,11 @@ class Replay(NamedTuple):
             goal_state=states[goal_episode, goal_slot],
         )
 
-    def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, stands_still: jax.Array) -> jax.Array:
+    def _read(self, stored: jax.Array, episodes: jax.Array, slots: jax.Array, is_static: jax.Array) -> jax.Array:
         """Read observations [..., C, H, W] from slots [...] of episodes [...]; at rest, all stacked images are the newest."""
         if self.frame_stack == 1:
             return unpack(stored[episodes, slots])
-        ago = jnp.where(stands_still[..., None], 0, jnp.arange(self.frame_stack))
+        ago = jnp.where(is_static[..., None], 0, jnp.arange(self.frame_stack))
         images = unpack(stored[episodes[..., None], jnp.maximum(slots[..., None] - ago, 0)])
         return images.reshape(*slots.shape, -1, *images.shape[-2:])
 
@@ -225,7 +225,7 @@ class Replay(NamedTuple):
         episodes, slots = jnp.indices(stored.shape[:2])
         return self._read(stored, episodes, slots, slots > self.horizon)
 
-    def stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
+    def read_stored(self, state: ReplayState, indices: Indices) -> dict[str, jax.Array]:
         """Read the arrays that auxiliary tasks stored for transitions, by task: [B, ...]."""
         return {name: unpack(array[indices.episode, indices.time]) for name, array in state.episodes.stored.items()}
 

@@ -166,7 +166,7 @@ class Sampler:
         batch = batch.replace(shift=choice.shift)
         if choice.target_key is not None:
             assert self.auxiliary is not None
-            batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.stored(state, choice.indices))
+            batch = self.auxiliary.with_targets(choice.target_key, batch, self.replay.read_stored(state, choice.indices))
         reached = batch.observation_tp1
         if self.as_goal is not None:
             # Stacked images also show motion, while goals are at rest; convert achieved observations to the same form.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.learner.networks import normalizer
-from jaxrl_vis.learner.networks.blocks import shifted, to_blocks
+from jaxrl_vis.learner.networks.blocks import shift_images, to_blocks
 from jaxrl_vis.learner.networks.kernels import encoder as encoder_kernel
 from jaxrl_vis.learner.networks.modules import Encoder, Head
 from jaxrl_vis.learner.networks.normalizer import Scaling
@@ -248,20 +248,20 @@ class Networks:
         """
         mean, scale = scaling
         if not self.sees_images:
-            return self._normalized(observations, mean, scale)
+            return self._normalize(observations, mean, scale)
         if self.uses_kernel:
             limit = self.config.network.normalizer_clip
             return encoder_kernel.prepare(observations, mean, scale, self._levels, limit, self.dtype, shift)
         if shift is not None:
-            return to_blocks(shifted(self._normalized(observations, mean, scale), shift), self._levels)
-        return self._normalized(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
+            return to_blocks(shift_images(self._normalize(observations, mean, scale), shift), self._levels)
+        return self._normalize(*(to_blocks(array, self._levels) for array in (observations, mean, scale)))
 
     def normalize(self, scaling: Scaling, observations: jax.Array, shift: jax.Array | None = None) -> jax.Array:
         """Normalise like `prepare`, without reordering: [B, ...] in the compute dtype."""
-        normalized = self._normalized(observations, *scaling)
-        return normalized if shift is None else shifted(normalized, shift)
+        normalized = self._normalize(observations, *scaling)
+        return normalized if shift is None else shift_images(normalized, shift)
 
-    def _normalized(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
+    def _normalize(self, observations: jax.Array, mean: jax.Array, scale: jax.Array) -> jax.Array:
         limit = self.config.network.normalizer_clip
         return jnp.clip((observations.astype(jnp.float32) - mean) * scale, -limit, limit).astype(self.dtype)
 

@@ -58,7 +58,7 @@ def describe(arrays: dict[str, Any]) -> dict[str, list]:
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
 
 
-def to_save(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
+def saved_leaves(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
     """Return the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
     if not distributed.are_several():
         return to_host(tree, copy)

@@ -20,7 +20,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.config import RESUMABLE, Config, Mark, config_from_dict, marked, of_weightings
+from jaxrl_vis.config import RESUMABLE, Config, Mark, config_from_dict, marked, weighting_options
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host import provenance
 from jaxrl_vis.host.files import check_path, is_temporary, read_json, write_atomically
@@ -144,7 +144,7 @@ class RunFolder:
         if not lock.is_in_place():
             raise FolderGoneError(_where_gone(self.path, lock.current_path(), "before the run began"))
 
-    def check_ours(self, run_id: str, lock: HeldLock) -> None:
+    def check_ownership(self, run_id: str, lock: HeldLock) -> None:
         """Check that the folder still belongs to a run, before writing into it.
 
         Args:
@@ -364,7 +364,7 @@ def contradictions(saved: Config, config: Config, ignored: Mark = RESUMABLE) -> 
     """
     before, requested, but_for = saved.flat(), config.flat(), marked(ignored)
     # Options of weightings are not read if losses are neither weighted nor logarithmic.
-    unread = of_weightings() if saved.auxiliary.weighting == config.auxiliary.weighting == "none" else ()
+    unread = weighting_options() if saved.auxiliary.weighting == config.auxiliary.weighting == "none" else ()
     return [
         f"{name} (saved {before[name]}, asked {requested[name]})"
         for name in sorted(before)

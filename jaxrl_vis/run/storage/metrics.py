@@ -29,8 +29,8 @@ RUN_ID = "run_id"
 """Key of the run's id in a row, a checkpoint's manifest or a config.json."""
 
 
-class Place(NamedTuple):
-    """Place of a row in a training run: keys that every row has.
+class RowKeys(NamedTuple):
+    """Keys that every row has, which identify it in a training run.
 
     Attributes:
         seed: Seed.
@@ -45,7 +45,7 @@ class Place(NamedTuple):
     env_steps: int
 
 
-_NO_FIGURES = {*Place._fields, RUN_ID} - {"updates"}
+_NO_FIGURES = {*RowKeys._fields, RUN_ID} - {"updates"}
 _MAX_VALUE = 2**63  # of a number in a row: the range of integer arrays
 _SHOWN = 8  # line numbers in a message
 
@@ -59,7 +59,7 @@ def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed
         return {}
     return {
         name: [
-            _nine_digits(math.fsum(values) / len(history)) for values in zip(*(entry[name] for entry in history), strict=True)
+            _round_digits(math.fsum(values) / len(history)) for values in zip(*(entry[name] for entry in history), strict=True)
         ]
         for name in history[0]
     }
@@ -73,11 +73,11 @@ def with_precision(metrics: PerSeed) -> PerSeed:
     if "train/filtered_false_share" not in metrics:
         return metrics
     pairs = zip(metrics["train/filtered_false_share"], metrics["train/filtered_share"], strict=True)
-    precision = [_nine_digits(false / dropped) if dropped > 0.0 else math.nan for false, dropped in pairs]
+    precision = [_round_digits(false / dropped) if dropped > 0.0 else math.nan for false, dropped in pairs]
     return {**metrics, "train/filter_precision": precision}
 
 
-def _nine_digits(value: float) -> float:
+def _round_digits(value: float) -> float:
     # The precision of a float32, so that the file stays readable.
     return float(f"{value:.9g}")
 
@@ -162,7 +162,7 @@ def _read_row(line: bytes) -> dict[str, Any] | None:
         row = parse_json(line.decode("utf-8"))
     except ValueError:
         return None
-    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in Place._fields):
+    if not isinstance(row, dict) or not all(is_count(row.get(name)) for name in RowKeys._fields):
         return None
     if not isinstance(row.get(RUN_ID), str | None):
         return None
@@ -184,7 +184,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return read_contents(path).rows
 
 
-def cut_back(
+def truncate(
     path: Path, iteration: int, run_id: str, aside: Path, others: Path, keeps_later: bool, evaluated: int = 0
 ) -> str | None:
     """Remove the rows after ``iteration``, which a resumed run writes again, and the rows of other runs.

@@ -275,7 +275,7 @@ class Recent:
         return self._folder / f"{iteration}.{kind}"
 
 
-def names_of_others(folder: Path) -> list[str]:
+def foreign_names(folder: Path) -> list[str]:
     """Return the names of foreign files in a folder of recent states; empty if there is no folder."""
     kinds = (".state", ".rollout")
     entries = folder.iterdir() if folder.is_dir() else ()

@@ -14,7 +14,7 @@ from jaxrl_vis.run.storage.checkpoint import BEST, FULL, LIGHT, RECENT
 from jaxrl_vis.run.storage.metrics import RUN_ID, PerSeed
 from jaxrl_vis.run.storage.progress import Progress
 from jaxrl_vis.run.storage.restoring import state_without_learner
-from jaxrl_vis.run.verifying.inspection import Expected, Findings, format_list
+from jaxrl_vis.run.verifying.inspection import Findings, RowConditions, format_list
 from jaxrl_vis.types import LoopState
 
 NOT_REPEATED = (RUN_ID, "time/", "resume/")
@@ -71,7 +71,7 @@ class Repeater:
     def __init__(
         self,
         programs: Programs,
-        expected: Expected,
+        expected: RowConditions,
         rows: Sequence[Row],
         manifests: Mapping[tuple[str, int], dict[str, Any]],
         report: Verification,
@@ -121,7 +121,7 @@ class Repeater:
         outcome, _ = self._programs.evaluate(loop.train)
         evaluated = self._programs.pending(outcome).read_per_seed(len(self._expected.seeds))
         best: list[tuple[int, str, Any, Any]] | None = None
-        for begin in self._begins(iteration, history):
+        for begin in self._mean_starts(iteration, history):
             made = self._repeated_rows(iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)])
             differences = [
                 (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
@@ -148,7 +148,9 @@ class Repeater:
             self._echo(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
 
     def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:
-        self._report.largest = max([self._report.largest, *(_relative(value, again) for _, _, value, again in differences)])
+        self._report.largest = max(
+            [self._report.largest, *(_relative_difference(value, again) for _, _, value, again in differences)]
+        )
         shown = format_list(
             f"seed {seed} {key} is {value} in the file, {again} here" for seed, key, value, again in differences
         )
@@ -157,7 +159,7 @@ class Repeater:
             hint = " (or eval_episodes had another value then)"
         self._note_difference(f"iteration {iteration}, from {name}: {shown}{hint}")
 
-    def _begins(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
+    def _mean_starts(self, iteration: int, history: Mapping[int, PerSeed]) -> list[int]:
         """List candidates for the iteration after which the means of a row begin, the one implied by eval_interval first."""
         interval, earliest = self._expected.eval_interval, min(history, default=iteration + 1) - 1
         scheduled = max((iteration - 1) // interval * interval, earliest)
@@ -247,7 +249,7 @@ def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tu
             yield name, value, again
 
 
-def _relative(value: Any, repeated: Any) -> float:
+def _relative_difference(value: Any, repeated: Any) -> float:
     """Return the difference of two numbers relative to the larger one; infinite if either value is not numeric."""
     if not (isinstance(value, int | float) and isinstance(repeated, int | float)):
         return math.inf

@@ -33,7 +33,7 @@ from jaxrl_vis.run.trainer import Trainer, make_trainer
 from jaxrl_vis.run.trust import check as check_trusted
 from jaxrl_vis.run.verifying.inspection import (
     LOST,
-    Expected,
+    RowConditions,
     check_files,
     check_record,
     format_list,
@@ -107,7 +107,7 @@ class _Verifier:
         self._programs, self._config, self._folder = trainer.programs, trainer.config, folder
         self._record, self._report, self._echo = record, report, echo
         program = trainer.program
-        self._expected = Expected(
+        self._expected = RowConditions(
             seeds=list(trainer.seeds),
             updates=program.updates_per_iteration,
             env_steps=program.steps_per_iteration,

@@ -57,12 +57,12 @@ class SearchResult(NamedTuple):
     Attributes:
         reward: [E] float32, maximum reward at the end of an episode.
         is_reached: [E] bool, whether that episode truly reaches the goal.
-        could_reach: [E] bool, whether any of the sequences reaches it.
+        is_reachable: [E] bool, whether any of the sequences reaches it.
     """
 
     reward: Any
     is_reached: Any
-    could_reach: Any
+    is_reachable: Any
 
 
 def _actions(key: jax.Array, horizon: int, size: int) -> jax.Array:

@@ -111,7 +111,7 @@ def audit(
             "calibration_error": measures.calibration_error(predicted, is_reached),
             "exploited": float(np.mean(claimed & ~best.is_reached)),
             "solved": float(np.mean(best.is_reached)),
-            "solvable": float(np.mean(best.could_reach)),
+            "solvable": float(np.mean(best.is_reachable)),
         }
     return records, pairs, values
 

@@ -125,17 +125,17 @@ def is_finished(cell: Cell, runs: Path) -> bool:
     return _final_env_steps(find_folder(cell, runs), cell) is not None and contradiction(cell, runs) is None
 
 
-def finished_rows(cell: Cell, runs: Path, as_it_is: bool = False) -> list[dict[str, Any]]:
+def finished_rows(cell: Cell, runs: Path, ignore_settings: bool = False) -> list[dict[str, Any]]:
     """Read the evaluations of a finished cell, up to its end, from metrics.jsonl; empty if it is not finished.
 
     Args:
         cell: The cell.
         runs: The folder of run folders.
-        as_it_is: Whether to accept a run with other settings, such as those of a preset in an earlier version.
+        ignore_settings: Whether to accept a run with other settings, such as those of a preset in an earlier version.
     """
     folder = find_folder(cell, runs)
     end = _final_env_steps(folder, cell)
-    if end is None or not (as_it_is or contradiction(cell, runs) is None):
+    if end is None or not (ignore_settings or contradiction(cell, runs) is None):
         return []
     return [row for row in RunFolder(folder).rows() if row["env_steps"] <= end]
 

@@ -25,14 +25,14 @@ class Line:
         task, variant: Names of the task and the variant.
         rows: Evaluations of all seeds, from metrics.jsonl.
         records: Contents of config.json of each of its runs.
-        unlike: Settings in which these runs differ from those that would be trained now.
+        setting_differences: Settings in which these runs differ from those that would be trained now.
     """
 
     task: str
     variant: str
     rows: Sequence[Mapping[str, Any]]
     records: Sequence[Mapping[str, Any]] = ()
-    unlike: Sequence[str] = ()
+    setting_differences: Sequence[str] = ()
 
     @property
     def points(self) -> list[tuple[int, float]]:
@@ -64,28 +64,30 @@ class Line:
 
 
 def read_lines(
-    cells: Mapping[tuple[str, str], Sequence[Cell]], runs: Path, as_they_are: bool = False
+    cells: Mapping[tuple[str, str], Sequence[Cell]], runs: Path, ignore_settings: bool = False
 ) -> tuple[dict[tuple[str, str], Line], list[str]]:
     """Read the lines of finished cells, and list unfinished ones.
 
     Args:
         cells: Runs of each line, by (task, variant).
         runs: Folder of the run folders.
-        as_they_are: Whether to read runs with other settings as well, such as those of a preset in an earlier version.
+        ignore_settings: Whether to read runs with other settings as well, such as those of a preset in an earlier version.
 
     Returns:
         Lines by (task, variant), without those with an unfinished cell; and a text for each unfinished cell.
     """
     lines, unfinished = {}, []
     for (task, variant), parts in cells.items():
-        rows_by_cell = [finished_rows(cell, runs, as_they_are) for cell in parts]
+        rows_by_cell = [finished_rows(cell, runs, ignore_settings) for cell in parts]
         unfinished += [
             f"{cell.name}: {describe_progress(cell, runs)}" for cell, rows in zip(parts, rows_by_cell, strict=True) if not rows
         ]
         if all(rows_by_cell):
             records = [_record(find_folder(cell, runs)) for cell in parts]
-            unlike = sorted({text for cell in parts for text in _differences(cell, runs)})
-            lines[task, variant] = Line(task, variant, [row for rows in rows_by_cell for row in rows], records, unlike)
+            setting_differences = sorted({text for cell in parts for text in _differences(cell, runs)})
+            lines[task, variant] = Line(
+                task, variant, [row for rows in rows_by_cell for row in rows], records, setting_differences
+            )
     return lines, unfinished
 
 
@@ -156,13 +158,13 @@ def mean_success(line: Line, up_to: int) -> float:
     return float(np.mean(values)) if values else 0.0
 
 
-def final(line: Line, metric: str = SUCCESS) -> tuple[float, float, float]:
+def final_quartiles(line: Line, metric: str = SUCCESS) -> tuple[float, float, float]:
     """Compute quartiles over seeds of a metric at the end: 25 %, median, 75 %."""
     values = [row[metric] for row in line.rows if row["env_steps"] == line.end and row.get(metric) is not None]
     return _quartiles(values)
 
 
-def area(line: Line) -> tuple[float, float, float]:
+def area_quartiles(line: Line) -> tuple[float, float, float]:
     """Compute quartiles over seeds of the mean success over all evaluations, the area under the curve: 25 %, median, 75 %."""
     return _quartiles([float(np.nanmean(row)) for row in line.values(SUCCESS)[1]])
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.studies.engine.results import SUCCESS, Line, final, find_steps
+from jaxrl_vis.studies.engine.results import SUCCESS, Line, final_quartiles, find_steps
 from jaxrl_vis.studies.figures.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.figures.show import FigureContent, Request
 from jaxrl_vis.studies.figures.tables import table_row
@@ -62,7 +62,7 @@ def _tables(lines: Mapping[tuple[str, str], Line], tasks: Sequence[str]) -> tupl
             mean, (low, high) = interquartile_mean(areas), bootstrap_interval(areas)
             until = find_steps(line, LEVEL)
             seconds = None if until.steps is None else _seconds(line, until.steps)
-            end = final(line)
+            end = final_quartiles(line)
             cells = [f"{mean:.3f} ({low:.3f} to {high:.3f})", f"{end[1]:.3f} ({end[0]:.3f} to {end[2]:.3f})", str(until)]
             cells += ["–" if seconds is None else f"{seconds:.0f}", f"{_seconds(line, line.end):.0f}"]
             text.append(table_row([VARIANTS[variant].label, *cells]))

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxrl_vis.studies.engine.results import DISTANCE, SUCCESS, Line, area, final
+from jaxrl_vis.studies.engine.results import DISTANCE, SUCCESS, Line, area_quartiles, final_quartiles
 from jaxrl_vis.studies.figures.drawing import Curve, Panel, Picture
 from jaxrl_vis.studies.figures.show import FigureContent, Request
 from jaxrl_vis.studies.figures.tables import table_row
@@ -90,9 +90,9 @@ def _figures(line: Line) -> dict[str, Quartiles | float]:
     """Compute quartiles over seeds of evaluation metrics, and medians of reward statistics."""
     filtered = _mean(line, _FILTERED)
     return {
-        "final_success": final(line, SUCCESS),
-        "area": area(line),
-        "final_distance": final(line, DISTANCE),
+        "final_success": final_quartiles(line, SUCCESS),
+        "area": area_quartiles(line),
+        "final_distance": final_quartiles(line, DISTANCE),
         "positive_share": _mean(line, "train/positive_share"),
         "false_positive_share": _mean(line, "train/false_positive_share"),
         "false_negative_share": _mean(line, "train/false_negative_share"),
@@ -141,7 +141,7 @@ def _oracle_notes(lines: Mapping[tuple[str, str], Line]) -> list[str]:
     for (task, variant), line in lines.items():
         if variant == "oracle" and task in _ORACLE_WORKS:
             metric, wanted = _ORACLE_WORKS[task]
-            _, median, _ = final(line, metric)
+            _, median, _ = final_quartiles(line, metric)
             if median < wanted if metric == SUCCESS else median > wanted:
                 quantity, bound = ("success", "at least") if metric == SUCCESS else ("final distance", "at most")
                 notes.append(

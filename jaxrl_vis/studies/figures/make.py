@@ -53,7 +53,7 @@ def make_figure(request: Request, echo: Callable[[str], None] = streams.echo) ->
         run_cells(
             list(wanted.values()), request.runs, lambda: shared(list_devices(), request.per_device), request.seconds, echo=echo
         )
-    lines, unfinished = read_lines(cells, request.runs, as_they_are=request.draw_only)
+    lines, unfinished = read_lines(cells, request.runs, ignore_settings=request.draw_only)
     for text in unfinished:
         echo(f"not drawn: {text}")
     if not any(variant in variants for _, variant in lines):
@@ -102,9 +102,10 @@ def _common_notes(study: Study, lines: dict[tuple[str, str], Line], unfinished: 
         if line.has_lost_replay()
     ]
     notes += [
-        f"{task}, {study.family.variants[variant].label}: not as it would be trained now, with {'; '.join(line.unlike)}."
+        f"{task}, {study.family.variants[variant].label}: not as it would be trained now, "
+        f"with {'; '.join(line.setting_differences)}."
         for (task, variant), line in lines.items()
-        if line.unlike
+        if line.setting_differences
     ]
     records = [record for line in lines.values() for record in line.records]
     for name, values in (

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxrl_vis.report.plots import format_steps
-from jaxrl_vis.run.storage.metrics import Place
+from jaxrl_vis.run.storage.metrics import RowKeys
 from jaxrl_vis.studies.engine.results import SUCCESS, Line, read_lines
 from jaxrl_vis.studies.engine.study import make_cells
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
@@ -65,7 +65,7 @@ def _steps_table(lines: Lines, tasks: Sequence[str]):
         known = [(steps, value) for steps, value in points if steps <= ends.get(task, 0)]
         if known:
             rows = [
-                Place(seed=0, iteration=0, updates=0, env_steps=steps)._asdict() | {SUCCESS: value} for steps, value in known
+                RowKeys(seed=0, iteration=0, updates=0, env_steps=steps)._asdict() | {SUCCESS: value} for steps, value in known
             ]
             named[task].append(LabelledLine(VARIANTS[variant].label, Line(task, variant, rows), _AUTHORS))
     return steps_table(named, LEVELS)

@@ -7,7 +7,7 @@ from typing import Any
 from scipy.stats import spearmanr
 
 from jaxrl_vis.report.plots import format_steps
-from jaxrl_vis.studies.engine.results import Line, final, find_steps, mean_success, mean_weight
+from jaxrl_vis.studies.engine.results import Line, final_quartiles, find_steps, mean_success, mean_weight
 
 BASELINE = "none"
 
@@ -64,7 +64,7 @@ def _cells(named: LabelledLine, base: Line | None, levels: Sequence[float], comm
         result = find_steps(named.line, level)
         is_base = base is None or named.line.variant == BASELINE
         cells += [str(result), "" if base is None or is_base else result.ratio(find_steps(base, level))]
-    low, median, high = final(named.line)
+    low, median, high = final_quartiles(named.line)
     end = f"{median:.2f}" if len(named.line.seeds) == 1 else f"{median:.2f} ({low:.2f} to {high:.2f})"
     return [*cells, f"{mean_success(named.line, common):.3f}", end]
 
@@ -87,7 +87,7 @@ def _csv_rows(named: LabelledLine, base: Line | None, levels: Sequence[float], c
                 speed_up="" if base is None or named.line.variant == BASELINE else result.ratio(find_steps(base, level)),
                 mean_success=round(mean_success(named.line, common), 4),
                 mean_success_to=common,
-                final_success=round(final(named.line)[1], 4),
+                final_success=round(final_quartiles(named.line)[1], 4),
             )
         )
     return rows

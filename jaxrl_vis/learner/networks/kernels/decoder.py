@@ -124,7 +124,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
         """As in `kernels.passes`."""
         return dot(jnp.ones((MIN_ROWS, values.shape[0]), values.dtype), values)
 
-    def one_tile(number, carry):
+    def process_tile(number, carry):
         sums, squares = carry
         here = pl.ds(number * tile, tile)
         hidden, finer, pixels = _forward(cells_ref[here, :], weights)
@@ -145,7 +145,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
 
     zeros = [jnp.zeros(value.shape if value.ndim > 1 else (MIN_ROWS, value.shape[0]), jnp.float32) for value in weights]
     start = Weights(*zeros), jnp.zeros(weights.bias_2.shape, jnp.float32)
-    sums, squares = jax.lax.fori_loop(0, cells_ref.shape[0] // tile, one_tile, start)
+    sums, squares = jax.lax.fori_loop(0, cells_ref.shape[0] // tile, process_tile, start)
     first = 0
     for like, value in zip((*weights, weights.bias_2), (*sums, squares), strict=True):
         if value.shape != like.shape:  # sixteen copies of the same sum

@@ -38,7 +38,7 @@ def _tangent_kernel(x_ref, *refs):
     inputs, (out_ref, tangent_ref) = refs[:-2], refs[-2:]
     weights, tangent_weights = load_weights(inputs[: len(inputs) // 2]), load_weights(inputs[len(inputs) // 2 :])
 
-    def one_tile(tile, _):
+    def process_tile(tile, _):
         values, tangents = x_ref[tile_quarters(tile), :], None
         for level, parameters in enumerate(zip(*weights, *tangent_weights, strict=True)):
             tangents = None if tangents is None else layer_inputs(tangents, level)
@@ -46,7 +46,7 @@ def _tangent_kernel(x_ref, *refs):
         assert tangents is not None  # there is a layer
         out_ref[tile_rows(tile), :], tangent_ref[tile_rows(tile), :] = values, tangents
 
-    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, process_tile, None)
 
 
 def _layer_jvp(

@@ -68,13 +68,13 @@ def probe_program() -> Any:
     sizes = (64, 64), (64, 16), (64, 16)
     weights = Weights(tuple(map(jnp.zeros, sizes)), tuple(jnp.zeros(columns) for _, columns in sizes))
 
-    def all_three(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
+    def run_kernels(images: jax.Array, mean: jax.Array, scale: jax.Array, weights: Weights) -> Weights:
         patches = prepare_on_gpu(images, mean, scale, None, levels, 5.0, jnp.bfloat16)
         patches = patches.reshape(-1, patches.shape[-1])
         out = _apply_on_gpu(patches, weights, 0, patches.shape[0])
         return _gpu_backward(patches, weights, out, out, 0, patches.shape[0])
 
-    return jax.jit(all_three).trace(images, of_pixels, of_pixels, weights)
+    return jax.jit(run_kernels).trace(images, of_pixels, of_pixels, weights)
 
 
 def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
@@ -131,10 +131,10 @@ def load_weights(refs: Any) -> Weights:
 def _forward_kernel(x_ref, *refs):
     weights, out_ref = load_weights(refs[:-1]), refs[-1]
 
-    def one_tile(tile, _):
+    def process_tile(tile, _):
         *_, out_ref[tile_rows(tile), :] = _layers(x_ref[tile_quarters(tile), :], weights)
 
-    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, None)
+    jax.lax.fori_loop(0, out_ref.shape[0] // TILE, process_tile, None)
 
 
 def tile_rows(tile: Any) -> Any:
@@ -155,7 +155,7 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         """Sum over rows, repeated in every row of the result: as a matrix product, this takes half the time of a reduction."""
         return dot(jnp.ones((MIN_ROWS, values.shape[0]), values.dtype), values)
 
-    def one_tile(tile, sums):
+    def process_tile(tile, sums):
         values = [x_ref[tile_quarters(tile), :]]
         values += [*_layers(values[0], hidden_layers), out_ref[tile_rows(tile), :]]
         gradient, of_kernels, of_biases = gradient_ref[tile_rows(tile), :], list(sums.kernels), list(sums.biases)
@@ -171,7 +171,7 @@ def _backward_kernel(x_ref, out_ref, gradient_ref, *refs):
         tuple(jnp.zeros(kernel.shape, jnp.float32) for kernel in weights.kernels),
         tuple(jnp.zeros((MIN_ROWS, bias.shape[0]), jnp.float32) for bias in weights.biases),
     )
-    sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, one_tile, start), 0
+    sums, first = jax.lax.fori_loop(0, out_ref.shape[0] // TILE, process_tile, start), 0
     # Sums of biases are sixteen copies of the same row.
     for value in (*sums.kernels, *(jnp.sum(value, axis=0) * (1.0 / MIN_ROWS) for value in sums.biases)):
         sums_ref[pl.ds(first, value.size)] = value.reshape(-1)

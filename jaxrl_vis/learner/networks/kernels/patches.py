@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
 
-from jaxrl_vis.learner.networks.blocks import shifted
+from jaxrl_vis.learner.networks.blocks import shift_images
 from jaxrl_vis_envs.compiling.gpu_kernels import kernel_call
 
 LEVELS = 3
@@ -60,7 +60,7 @@ def _prepare_kernel(images_ref, mean_ref, scale_ref, *refs, shape, levels, limit
     pixel, there = (channel * height + row) * width + column, channel < channels
     still = [pixel, there, *statistics(pixel, there)]
 
-    def one_image(image, _):
+    def prepare_image(image, _):
         places = still
         if moves:
             from_row, from_column = row - moves[0][image, 0], column - moves[0][image, 1]
@@ -72,7 +72,7 @@ def _prepare_kernel(images_ref, mean_ref, scale_ref, *refs, shape, levels, limit
         values = jnp.clip((values - mean) * scale, -limit, limit).astype(out_ref.dtype)
         out_ref[image] = values.reshape(parts).transpose(order).reshape(patches, size)
 
-    jax.lax.fori_loop(0, images, one_image, None)
+    jax.lax.fori_loop(0, images, prepare_image, None)
 
 
 def prepare_on_gpu(
@@ -116,7 +116,7 @@ def prepare_plain(
     """Compute `kernels.encoder.prepare` in plain JAX."""
     if shift is not None:
         values = jnp.clip((images.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
-        return to_patches(shifted(values, shift), levels)
+        return to_patches(shift_images(values, shift), levels)
     patches, mean, scale = (to_patches(array, levels) for array in (images, mean, scale))
     return jnp.clip((patches.astype(jnp.float32) - mean) * scale, -limit, limit).astype(dtype)
 
