@@ -191,7 +191,7 @@ class RunLoop:
     # -- Before
 
     def _prepare(self, is_resumed: bool, memory: str) -> dict[str, Any]:
-        """Restore and compile; return the compiled programs by name. Nothing is written."""
+        """Restore, if the run resumes, and compile; return the compiled programs by name. Nothing is written."""
         programs, steps = self._programs, self._program.steps_per_iteration
         self._echo(f"{self._config.environment.env}, {describe(self._config)}, on {programs.layout.name}; {memory}")
         self._echo(f"{self._total} iterations of {steps:,} environment steps per seed; files go to {self._folder.path}")

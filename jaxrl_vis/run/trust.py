@@ -99,7 +99,11 @@ def _is_stored(name: str) -> bool:
 
 
 def _files(config: Config) -> dict[str, Path | None]:
-    """Locate the modules of a run's custom parts, by name, without importing anything; None if there is none."""
+    """Locate the modules of a run's custom parts, by name, without importing anything; None for one that is not found.
+
+    Raises:
+        RequestError: A name is not of the form ``module:Name``, or the folder of modules is invalid.
+    """
     files = {}
     for kind, name in own_names(config).items():
         try:

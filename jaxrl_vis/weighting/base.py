@@ -159,7 +159,7 @@ def log_loss(loss: jax.Array, eps: float) -> jax.Array:
 
 
 def log_slope(loss: jax.Array, eps: float) -> jax.Array:
-    """Compute the derivative of `log_loss`: 1 / (max(L, 0) + eps), without gradient."""
+    """Compute the derivative of `log_loss`, 1 / (max(L, 0) + eps), [] float, without gradient."""
     return 1.0 / (jnp.maximum(jax.lax.stop_gradient(loss), 0.0) + eps)
 
 
@@ -365,6 +365,6 @@ def zeros_for(label: str, names: Iterable[str], shared: Params, *leading: int) -
 
 
 def weight_metrics(weights: Weights, dots: Mapping[str, jax.Array] | None = None) -> Metrics:
-    """Return the metrics ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if ``dots`` is given."""
+    """Return the metrics ``weight/NAME`` of each auxiliary loss, and ``dot/NAME`` if ``dots`` is given, [] float32 each."""
     shown = {f"weight/{name}": weight for name, weight in weights.items() if name != MAIN}
     return shown | {f"dot/{name}": value for name, value in (dots or {}).items()}

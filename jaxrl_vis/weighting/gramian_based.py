@@ -98,7 +98,7 @@ def of_gramian(
 
 
 def _plain(weights: Callable[[jax.Array], jax.Array]) -> Solve:
-    """Build a solver without memory."""
+    """Build a solver without memory from a function of the Gramian [K, K] that returns weights [K]."""
     return lambda gramian, state: (weights(gramian), None)
 
 

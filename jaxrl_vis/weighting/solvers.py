@@ -80,7 +80,7 @@ def nonnegative(
 
 
 def _pivot(matrix: jax.Array, target: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Solve the problem of `nonnegative` for a positive definite matrix."""
+    """Solve the problem of `nonnegative` for a positive definite matrix; arguments and results as there."""
     count, eps = len(target), jnp.finfo(matrix.dtype).eps
 
     def solve(free: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -275,7 +275,7 @@ def to_simplex(vector: jax.Array) -> jax.Array:
 
 
 def quadratic(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """Compute the scalar x^T M x at full matrix-multiplication precision."""
+    """Compute x^T M x, [], of a matrix [K, K] and a vector [K] at full matrix-multiplication precision."""
     precision: Any = jax.lax.Precision.HIGHEST
     return jnp.dot(vector, jnp.dot(matrix, vector, precision=precision), precision=precision)
 

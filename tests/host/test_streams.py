@@ -136,7 +136,7 @@ def test_a_bar_shows_what_matters_at_any_width(width, monkeypatch):
         with RunConsole() as console:
             console.start(total=120_000, done=40)
             console.advance(1234, 98_765.0)
-            console.evaluated([0.93], [0.0123], "m")
+            console.show_evaluation([0.93], [0.0123], "m")
 
     def measure():
         with progress("pairs") as done:

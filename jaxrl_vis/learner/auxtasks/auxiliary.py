@@ -55,7 +55,7 @@ class Auxiliary:
         return (*after, *(name for name, task in self.tasks.items() if task.view is not None))
 
     def init_heads(self, key: jax.Array) -> dict[str, Params]:
-        """Initialise the parameters of all heads, by task."""
+        """Initialise the parameters of all heads, by task, from a typed key []."""
         return {name: task.init(task.fold(key)) for name, task in self.tasks.items()}
 
     def init_state(self, critic: Params, key: jax.Array) -> WeightingState | None:
@@ -168,7 +168,7 @@ class Auxiliary:
 
 
 def _scale_latents(view: View, weight: jax.Array) -> View:
-    """Multiply the gradient with respect to a view's latents by ``weight``, leaving the latents unchanged."""
+    """Multiply the gradient with respect to a view's latents by ``weight`` [], leaving the latents unchanged."""
     names = ("latent_t", "latent_tp1", "latent_view")
     latents = {name: getattr(view, name) for name in names if getattr(view, name) is not None}
     return view.replace(**{name: _scale_gradient(latent, weight) for name, latent in latents.items()})

@@ -137,7 +137,7 @@ def _filter(size: int, taps: np.ndarray, border: str) -> np.ndarray:
 
 
 def _gaussian(radius: int, sigma: float) -> np.ndarray:
-    """Return Gaussian weights at -radius, ..., radius, normalised to a sum of 1."""
+    """Return Gaussian weights [2 radius + 1] at -radius, ..., radius, normalised to a sum of 1."""
     weights = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / sigma))
     return weights / weights.sum()
 

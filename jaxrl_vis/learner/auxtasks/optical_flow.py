@@ -55,7 +55,7 @@ def to_bytes(strength: jax.Array, stretch: bool = False) -> jax.Array:
 
 
 def from_bytes(flow: jax.Array, stretch: bool = False) -> jax.Array:
-    """Invert `to_bytes`, up to rounding: [...] float32."""
+    """Invert `to_bytes` with the same ``stretch``, up to rounding: [...] uint8 -> [...] float32."""
     return flow.astype(jnp.float32) / _scale(stretch)
 
 
@@ -80,7 +80,7 @@ def flow_strength(images_t: jax.Array, images_tp1: jax.Array, frame_stack: int =
 
 
 def flow_strength_along(images: jax.Array, frame_stack: int = 1, stretch: bool = False) -> jax.Array:
-    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32."""
+    """Compute `flow_strength` between successive images: [T + 1, C, H, W] -> [T, H, W] float32; options as there."""
     return _strength(farneback.flow_along(grey(images, frame_stack) / _unit(stretch)), stretch)
 
 

@@ -160,12 +160,12 @@ def _start(networks: Networks, auxiliary: Auxiliary, learned_reward: LearnedRewa
 
 
 def _stack_counts(agent: Agent) -> jax.Array:
-    """Stack `WorkingState.counts` in one array: XLA would launch a kernel for each scalar counter."""
+    """Stack `WorkingState.counts` in one array [3]: XLA would launch a kernel for each scalar counter."""
     return jnp.stack([adam.count(agent.critic_optimizer), adam.count(agent.actor_optimizer), agent.updates])
 
 
 def _with_counts(agent: Agent, counts: jax.Array) -> Agent:
-    """Restore the counters in the agent."""
+    """Return the agent with its counters replaced by ``counts``, [3] int32 as in `WorkingState`."""
     return agent.replace(
         critic_optimizer=adam.with_count(agent.critic_optimizer, counts[0]),
         actor_optimizer=adam.with_count(agent.actor_optimizer, counts[1]),

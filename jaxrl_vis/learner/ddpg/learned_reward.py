@@ -89,7 +89,7 @@ class LearnedReward:
     optimizer: optax.GradientTransformation
 
     def init(self, key: jax.Array) -> ModelState:
-        """Initialise the model."""
+        """Initialise the parameters and the optimiser's state from a typed key []."""
         params = self.init_params(key)
         return ModelState(params=params, optimizer=self.optimizer.init(params))
 

@@ -31,7 +31,7 @@ from jaxrl_vis.weighting import MAIN, Weighted, WeightingState, weighted_grad
 
 
 class ComputeCopies(NamedTuple):
-    """Parameters of an agent's four networks in the compute dtype (`Networks.compute_copy`)."""
+    """Compute copies of an agent's four networks (`Networks.compute_copy`), or their parameters with these substituted."""
 
     actor: Params
     critic: Params
@@ -248,7 +248,7 @@ class Objectives:
         batch: Batch,
         weights: dict[str, jax.Array] | None = None,
     ) -> dict[str, jax.Array]:
-        """Compute the auxiliary losses of a network's latents, by name.
+        """Compute the auxiliary losses of a network's latents, [] float32 by name.
 
         ``weights`` are applied here only if they are for the encoder alone; the sum of the losses applies those of the heads.
         """

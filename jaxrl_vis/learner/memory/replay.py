@@ -39,7 +39,7 @@ def pack(observations: jax.Array) -> jax.Array:
 
 
 def unpack(observations: jax.Array) -> jax.Array:
-    """Invert `pack`."""
+    """Invert `pack`: [..., W/4] uint32 -> [..., W] uint8, other dtypes unchanged."""
     if observations.dtype != jnp.uint32:
         return observations
     *shape, words = observations.shape
@@ -147,7 +147,7 @@ class Replay(NamedTuple):
         return ReplayState(episodes=episodes, size=jnp.minimum(state.size + self.num_envs, self.num_episodes))
 
     def _latest(self, iteration: jax.Array) -> jax.Array:
-        """Return the position of the last episode of the rollout of ``iteration``."""
+        """Return the position, [] int32, of the last episode of the rollout of ``iteration``."""
         return (iteration % self.num_rollouts + 1) * self.num_envs - 1
 
     def is_stored(self, state: ReplayState, iteration: jax.Array) -> jax.Array:

@@ -216,7 +216,7 @@ class Sampler:
         return make_reward(self.config, self.resolved.method, self.mask)
 
     def _estimated_reward(self, batch: Batch, clutter_end: jax.Array | None) -> jax.Array:
-        """Compute the oracle's rewards, with an estimator's errors if the configuration has any."""
+        """Compute the oracle's rewards [B] float32, with an estimator's errors if the configuration has any."""
         config, positive, negative = self.config, self.resolved.reward_positive, self.resolved.reward_negative
         states = (
             reward_errors.estimate(batch.state_tp1, config.study.reward_noise) if config.study.reward_noise else batch.state_tp1

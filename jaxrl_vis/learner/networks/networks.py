@@ -153,7 +153,7 @@ class Networks:
         return Encoder(self.config.network.encoder_filters, self.config.network.latent_size, self.dtype)
 
     def head(self, outputs: int, output_bias: float = 0.0, stabilised: bool = False) -> Any:
-        """Build a head of the configured hidden layers: a flax module, inputs as for `Dense` -> [B, outputs] float32."""
+        """Build a head with the configured hidden layers, a flax module (`modules.Head`); arguments as there."""
         return Head(self.config.network.hidden_sizes, outputs, output_bias, self.dtype, stabilised)
 
     @property
@@ -169,7 +169,7 @@ class Networks:
         return params
 
     def init_encoder(self, key: jax.Array) -> Params:
-        """Initialise an encoder of images, for ``{"encoder": ...}``."""
+        """Initialise the parameters of an encoder of images, for ``{"encoder": ...}``, from a typed key []."""
         blocks = to_blocks(jnp.zeros((1, *self.observation_spec.shape)), self._levels)
         return self._encoder.init(key, blocks)["params"]
 

@@ -197,13 +197,13 @@ def _avoid_shardy() -> None:
 def make_layout(config: Config) -> Layout:
     """Place the seeds of a run, and the shards of each learner, on devices.
 
+    For several devices, this may change JAX's global configuration (`_avoid_shardy`).
+
     Args:
         config: Configuration of the run, of which ``devices``, ``data_devices`` and ``seeds`` are used.
 
     Raises:
         RequestError: There are too few devices, or a run of several processes would leave some of them unused.
-
-    For several devices, this may change JAX's global configuration (`_avoid_shardy`).
     """
     if config.run.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE

@@ -60,7 +60,7 @@ def nonfinite_simulation(loop: LoopState, num_envs: int) -> str | None:
 
 
 def _first_true(is_bad: np.ndarray) -> np.ndarray:
-    """Return the index of the first true value along the last axis; the axis' length if there is none."""
+    """Return the index [...] of the first true value along the last axis of [..., N]; N if there is none."""
     return np.where(is_bad.any(-1), is_bad.argmax(-1), is_bad.shape[-1])
 
 

@@ -87,7 +87,7 @@ def export_run(
 
 
 def _check_folder(folder: Path, overwrite: bool) -> None:
-    """Raise a RequestError if ``folder`` is a file, or has contents that must not be replaced."""
+    """Raise a RequestError if ``folder`` is a file, or has other contents than an exported policy to ``overwrite``."""
     check_writable(folder, "--out", folder=True)
     names = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
     if names and contracts.FILE not in names:
@@ -114,7 +114,11 @@ def _input_ranges(policy: Policy) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def _write(
     folder: Path, kind: str, policy: Policy, layers: Layers | None, frames: golden.Golden, contract: dict[str, Any]
 ) -> None:
-    """Write the files, the contract last, so that an interrupted export has no contract."""
+    """Write the files, the contract last, so that an interrupted export has no contract.
+
+    Raises:
+        StorageError: A file cannot be written.
+    """
     file, described = folder / FORMATS[kind], folder / contracts.FILE
     contents = b""  # created before existing files are deleted
     if kind == "stablehlo":
@@ -164,7 +168,11 @@ def check_file(path: Path | str) -> Check:
 
 
 def _load_program(contract: Contract) -> Any:
-    """Load a policy in ONNX or StableHLO, and compare its inputs and outputs with the contract."""
+    """Load a policy in ONNX or StableHLO, and compare its inputs and outputs with the contract.
+
+    Raises:
+        RequestError: The file cannot be loaded, or does not fit the contract.
+    """
     model = (onnx_file.Model if contract.format == "onnx" else stablehlo.Program)(contract.file)
     tensors = {**model.inputs, **model.outputs}
     for name, (shape, dtype) in contract.forms.items():

@@ -60,7 +60,7 @@ def check_resumable(path: Path, resume: bool) -> None:
 
 
 def _check_run_path(path: Path) -> None:
-    """Check that ``path`` can be a run folder: orbax accepts only names in UTF-8."""
+    """Raise a `RequestError` if ``path`` cannot be a run folder: orbax accepts only names in UTF-8."""
     check_path(path / "config.json")
     try:
         str(path.resolve()).encode()
@@ -178,6 +178,10 @@ class RunFolder:
 
     def check(self, config: Config, resume: bool = False, overwrite: bool = False) -> bool:
         """Check whether this folder may be used for ``config``. Changes nothing.
+
+        Args:
+            config: The requested configuration.
+            resume, overwrite: Whether an earlier run may be resumed, or deleted.
 
         Returns:
             True if an earlier run is to be resumed, False if a new run starts.

@@ -203,7 +203,7 @@ class Recent:
         return loop, header["progress"]
 
     def _read_rollouts(self, checksums: dict[str, int], episodes: Arrays) -> None:
-        """Fill ``episodes``, arrays [S, N, ...], from the rollouts' files."""
+        """Fill ``episodes``, arrays [S, N, ...], from the rollouts' files in place; raise `Unusable` if one is damaged."""
         num_episodes = next(iter(episodes.values())).shape[1]
         for number, checksum in checksums.items():
             contents = self._read(self._path(int(number), "rollout"))

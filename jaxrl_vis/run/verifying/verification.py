@@ -236,7 +236,7 @@ class _Verifier:
         return False
 
     def _check_presence(self, is_written: bool) -> None:
-        """Report a lack of checkpoints although the run is far enough to have one."""
+        """Report a lack of checkpoints if the run is far enough to have one, unless another process is writing."""
         last = max((row["iteration"] for row in self._rows), default=0)
         interval = self._config.run.checkpoint_interval
         # An evaluation's rows are written before the checkpoint of the same iteration.

@@ -124,7 +124,15 @@ def table(records: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def draw(pairs: Pairs, values: Mapping[str, np.ndarray], threshold: float, unit: str, out: Path) -> None:
-    """Write a figure of rewards against true distances (quartiles in bins of the distance) and of their calibration."""
+    """Write a figure of rewards against true distances (quartiles in bins of the distance) and of their calibration.
+
+    Args:
+        pairs: Pairs of images and goals.
+        values: Rewards [N] of the pairs, by name of the reward.
+        threshold: Distance up to which a goal counts as reached.
+        unit: Unit of the distances.
+        out: File of the figure; its suffix determines the format.
+    """
     names: Sequence[Any] = list(values)
     figure = Figure(figsize=(3.1 * max(2, len(names)), 5.6), layout="constrained")
     axes = figure.subplots(2, max(2, len(names)), squeeze=False)

@@ -54,7 +54,7 @@ def start_process(words: Sequence[str], log: Path, environment: Mapping[str, str
 
 
 def train_command(cell: Cell, folder: Path, resume: bool) -> list[str]:
-    """Return the command that trains a cell."""
+    """Return the words of the command that trains a cell in ``folder``, or resumes its run there."""
     words = [sys.executable, "-m", "jaxrl_vis", "train", *training_options(cell.config), "--run-dir", str(folder)]
     return [*words, "--resume"] if resume else words
 

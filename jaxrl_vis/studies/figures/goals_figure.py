@@ -20,7 +20,7 @@ _WALL, _COMPILATION = "time/wall_s", "time/compile_s"
 def make_content(
     _: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]
 ) -> FigureContent:
-    """Create the content of the figure from its lines."""
+    """Create the panels and tables of the figure for these tasks and variants, from its lines by (task, variant)."""
     shown = {key: line for key, line in lines.items() if key[1] in variants}
     of_steps = [Panel(f"{task}: success", _curves(shown, task)) for task in tasks]
     of_seconds = [Panel(f"{task}: success, by seconds", _curves(shown, task, by_seconds=True)) for task in tasks]

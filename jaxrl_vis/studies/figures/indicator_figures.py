@@ -32,7 +32,7 @@ _ORACLE_WORKS: dict[str, tuple[str, float]] = {
 def make_content(
     _: Request, lines: Mapping[tuple[str, str], Line], tasks: Sequence[str], variants: Sequence[str]
 ) -> FigureContent:
-    """Create the content of a figure from its lines."""
+    """Create the panels and tables of a figure for these tasks and variants, from its lines by (task, variant)."""
 
     def row(metric: str, title: str, is_share: bool = True) -> list[Panel]:
         return [Panel(f"{task}: {title}", _curves(lines, task, variants, metric), is_share) for task in tasks]

@@ -22,7 +22,7 @@ Lines = Mapping[tuple[str, str], Line]
 
 
 def make_content(request: Request, lines: Lines, tasks: Sequence[str], variants: Sequence[str]) -> FigureContent:
-    """Create the content of a figure from its lines."""
+    """Create the panels and tables of a figure for these tasks and variants, from its lines by (task, variant)."""
     is_weights = request.figure == WEIGHTS
     panels = [Panel(task, (_weights if is_weights else _success)(lines, task, variants), not is_weights) for task in tasks]
     text, rows = _weights_table(request, lines, tasks) if is_weights else _steps_table(lines, tasks)

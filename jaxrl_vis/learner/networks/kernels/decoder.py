@@ -110,7 +110,7 @@ def _cast(weights: Weights, dtype: Any) -> Weights:
 
 
 def _forward(cells: jax.Array, weights: Weights) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Compute the rectified cells and the layer above them, in the dtype of ``cells``, and the pixels in float32."""
+    """Compute rectified cells [R, F] and the next layer [R, 4 G] in the dtype of ``cells``, and pixels [R, 16 C'] float32."""
     dtype = cells.dtype
     hidden = relu(cells.astype(jnp.float32) + weights.bias_in[None, :]).astype(dtype)
     finer = layer(hidden, weights.kernel_1, weights.bias_1)
@@ -157,7 +157,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
 def _squared_error_on_gpu(
     cells: jax.Array, target: jax.Array, weights: Weights, scale: float, interpret: bool = False
 ) -> tuple[jax.Array, jax.Array, Weights]:
-    """Compute the scaled sum of squared errors, and its gradients with respect to cells and weights."""
+    """Compute the scaled sum of squared errors [], and its gradients with respect to cells and weights; see `squared_error`."""
     count, features = cells.shape
     tile = divisor(count, _CELLS)
     block = tile * tiles_of_program(count // tile, count // tile, _TILES)

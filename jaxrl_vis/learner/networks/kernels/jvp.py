@@ -66,7 +66,7 @@ def _layer_jvp(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
 def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int, interpret: bool = False) -> jax.Array:
-    """Compute `apply`, differentiable in forward mode with respect to the weights."""
+    """Compute `apply`, with the same arguments, but differentiable in forward mode with respect to the weights."""
     return apply(patches, weights, first, count, interpret)
 
 

@@ -78,7 +78,7 @@ def probe_program() -> Any:
 
 
 def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
-    """Call the kernel if the program is compiled for a GPU that runs it, else its equivalent in plain JAX."""
+    """Call the kernel if the program is compiled for a GPU that runs it, or interpreted, else its equivalent in plain JAX."""
     if interpret:
         return on_gpu(*arguments)
     return dispatch_by_platform(lambda *args: (on_gpu if use_gpu_kernels(probe) else plain)(*args), *arguments)
@@ -94,7 +94,7 @@ def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -
 
 
 def layer(values: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """Apply a dense layer with rectifier, in the dtype of ``values``."""
+    """Apply a dense layer with rectifier: [R, inputs] -> [R, outputs], in the dtype of ``values``."""
     return relu(dot(values, kernel) + bias[None, :]).astype(values.dtype)
 
 
@@ -269,7 +269,7 @@ def _apply_backward(first: int, count: int, interpret: bool, residuals: Any, gra
 def _gpu_backward(
     patches: jax.Array, weights: Weights, out: jax.Array, gradient: jax.Array, first: int, count: int, interpret: bool = False
 ) -> Weights:
-    """Compute the gradients of the weights, float32."""
+    """Compute the gradients with respect to the weights, float32, from the result ``out`` of `apply` and its gradient."""
     outputs = out.shape[1]
     block = TILE * tiles_of_program(math.gcd(first, count) // TILE, count // TILE, _BACKWARD_TILES)
     programs = count // block
