@@ -182,7 +182,7 @@ class Saver:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """Context that converts OSErrors into a `StorageError`; for file operations of the run only."""
+        """Convert OSErrors within this context into a `StorageError`; for file operations of the run only."""
         try:
             yield
         except OSError as error:

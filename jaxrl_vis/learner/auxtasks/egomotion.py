@@ -34,7 +34,7 @@ def make(spec: Spec) -> AuxTask:
 def egomotion_pair(
     key: jax.Array, images: jax.Array, border: Border = "clip", max_shift: float = 0.0
 ) -> tuple[jax.Array, jax.Array]:
-    """Rotate images by random angles, uniform up to 30 degrees either way, and optionally shift them.
+    """Rotate images by random angles, uniform up to 30 degrees in either direction, and optionally shift them.
 
     Args:
         key: [] typed key.

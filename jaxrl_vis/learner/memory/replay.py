@@ -196,8 +196,8 @@ class Replay(NamedTuple):
             goal_episode: [B] int32, episodes of the goal slots; None for the transitions' own episodes.
 
         Returns:
-            Transitions without rewards; ``state_tp1`` is that after one step, whatever ``steps``. Stacked images of goals are
-            at rest: copies of the newest one.
+            Transitions without rewards; ``state_tp1`` is the state after one step, even if ``steps`` is greater. Stacked images
+            of goals are static: copies of the newest one.
         """
         observations, states, actions = state.episodes.observations, state.episodes.states, state.episodes.actions
         episode, time = indices

@@ -1,7 +1,7 @@
 """Files of frozen image encoders: parameters of `modules.Encoder`, and the normalisation of the images.
 
 shape     [3] int64: C, H, W of the images
-mean      [C, H, W] float32; likewise ``scale``, 1 / standard deviation
+mean      [C, H, W] float32; the same shape and dtype: ``scale``, 1 / standard deviation
 kernel_0, bias_0, ..., latent/kernel, latent/bias     float32
 """
 

@@ -158,7 +158,7 @@ def read_contract(path: Path) -> Contract:
         path: The policy's file, the contract, or the folder of both.
 
     Raises:
-        RequestError: The contract is missing or damaged, or describes another file.
+        RequestError: The contract is missing or damaged, describes another file, or the policy is missing.
     """
     folder = path if path.is_dir() else path.parent
     file, hint = folder / FILE, "export again with --overwrite"

@@ -83,37 +83,37 @@ class RunFolder:
 
     @property
     def config(self) -> Path:
-        """Configuration of the run, with versions and device."""
+        """Path of the run's configuration, with versions and device."""
         return self.path / "config.json"
 
     @property
     def metrics(self) -> Path:
-        """One line per seed and evaluation."""
+        """Path of the metrics, one line per seed and evaluation."""
         return self.path / "metrics.jsonl"
 
     @property
     def processes(self) -> Path:
-        """One line per process: the number of iterations that it has begun."""
+        """Path of the number of iterations that each process has begun, one line per process."""
         return self.path / "processes.jsonl"
 
     @property
     def checkpoints(self) -> Path:
-        """Tiers of checkpoints."""
+        """Path of the folder with the tiers of checkpoints."""
         return self.path / "checkpoints"
 
     @property
     def nonfinite(self) -> Path:
-        """Dumped states with non-finite numbers."""
+        """Path of the folder with dumped states that have non-finite numbers."""
         return self.path / "nonfinite"
 
     @property
     def curve(self) -> Path:
-        """Success and distance against environment steps."""
+        """Path of the plot of success and distance against environment steps."""
         return self.path / "curve.png"
 
     @property
     def video(self) -> Path:
-        """Episodes of the trained policy."""
+        """Path of the video of the trained policy's episodes."""
         return self.path / "video.gif"
 
     def rows(self) -> list[dict[str, Any]]:

@@ -20,7 +20,7 @@ from jaxrl_vis.host.files import is_count, sync_folder, write_atomically
 from jaxrl_vis_envs.documents import parse_json
 
 PerSeed = dict[str, list[float]]
-"""Maps names to one number per seed."""
+"""One number per seed, by name."""
 
 Row = Mapping[str, Any]
 """A line of the file."""

@@ -95,7 +95,7 @@ def run_cells(
     Raises:
         RequestError: No device was found, or the folder cannot be written to.
         KeyboardInterrupt: Ctrl-C, after all processes have saved and ended.
-        Terminated: Another signal, likewise.
+        Terminated: Another signal, after all processes have saved and ended.
     """
     missing = [cell for cell in cells if not is_finished(cell, runs)]
     if not missing:
@@ -207,7 +207,7 @@ class _Grid:
                 running.process.send_signal(signal.SIGTERM)
 
     def _end_at_once(self) -> None:
-        """End all processes, after any error; does nothing if all have ended."""
+        """Terminate all processes that still run, and kill those that have not ended after 20 s."""
         self._signal()
         deadline = time.monotonic() + _GRACE_S
         for running in self._running:

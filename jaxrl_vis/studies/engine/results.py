@@ -41,7 +41,7 @@ class Line:
 
     @property
     def seeds(self) -> list[int]:
-        """The seeds, ascending."""
+        """Seeds, in ascending order."""
         return sorted({row["seed"] for row in self.rows})
 
     @property

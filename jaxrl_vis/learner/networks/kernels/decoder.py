@@ -121,7 +121,7 @@ def _kernel(cells_ref, target_ref, *refs, tile, scale):
     weights, (gradient_ref, sums_ref) = Weights(*(ref[...] for ref in refs[:-2])), refs[-2:]
 
     def add_rows(values):
-        """As in `kernels.passes`."""
+        """Sum over rows, repeated in every row of the result, as in `kernels.passes`."""
         return dot(jnp.ones((MIN_ROWS, values.shape[0]), values.dtype), values)
 
     def process_tile(number, carry):
