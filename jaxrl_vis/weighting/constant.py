@@ -30,7 +30,14 @@ def none() -> Weighting:
 
 
 def none_log(main_eps: float = 1e-8) -> Weighting:
-    """Use the logarithm of the main loss alone, to separate its effect from that of auxiliary losses."""
+    """Use the logarithm of the main loss alone, to separate its effect from that of auxiliary losses.
+
+    Args:
+        main_eps: See `Weighting`.
+
+    Raises:
+        RequestError: ``main_eps`` is not positive.
+    """
     return _constant("none_log", 0.0, auxiliary=False, log=True, main_eps=main_eps)
 
 
@@ -40,7 +47,14 @@ def plain_sum() -> Weighting:
 
 
 def balance(eps: Eps = 0.02, main_eps: float = 1e-8) -> Weighting:
-    """Sum the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing")."""
+    """Sum the logarithms of all losses (thesis 5.2.3.3, "Gradient Balancing").
+
+    Args:
+        eps, main_eps: See `Weighting`.
+
+    Raises:
+        RequestError: ``eps`` or ``main_eps`` is not positive.
+    """
     return _constant("balance", 1.0, log=True, eps=eps, main_eps=main_eps)
 
 
@@ -53,7 +67,8 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: Eps
         eps, main_eps: See `Weighting`.
 
     Raises:
-        RequestError: A weight is not finite; from ``init``: a loss has no weight, or a weight has no loss.
+        RequestError: A weight is not finite, or ``eps`` or ``main_eps`` is not positive; from ``init``: a loss has no weight, or
+            a weight has no loss.
     """
     for weight in weights.values() if isinstance(weights, Mapping) else [weights]:
         if not math.isfinite(weight):
@@ -71,6 +86,9 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
         log: Whether to minimise the logarithms of the losses.
         eps, main_eps: See `Weighting`.
         heads: See `Weighting`; always in the thesis, so that the head of a loss with weight 0 continues to be trained.
+
+    Raises:
+        RequestError: ``eps`` or ``main_eps`` is not positive.
     """
 
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:

@@ -37,7 +37,8 @@ class Options(TypedDict, total=False):
 
     Attributes:
         log: Whether logarithms of the losses are minimised and compared, which makes the result independent of their units.
-        eps, main_eps, heads: See `Weighting`. Default of ``heads`` is always: weights apply to the shared parameters alone.
+        eps, main_eps, heads: See `Weighting`. A RequestError is raised unless ``eps`` and ``main_eps`` are positive. Default of
+            ``heads`` is always: weights apply to the shared parameters alone.
     """
 
     log: bool

@@ -6,8 +6,8 @@
 
 Every device runs the whole training iteration on its own part (`jax.shard_map`), so only averages over shards are
 communicated. Random numbers are generated for the whole learner, and each device uses its part of them: environment number 7
-starts and explores identically on any number of devices. Batches differ in one respect from those of a single device: part d of a
-batch is sampled from the episodes of the environments of device d, so each group of environments contributes equally.
+starts and explores identically on any number of devices. Batches differ in one respect from those of a single device: part d of
+a batch is sampled from the episodes of the environments of device d, so each group of environments contributes equally.
 """
 
 import dataclasses

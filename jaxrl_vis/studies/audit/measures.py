@@ -24,7 +24,7 @@ def error_shares(reward: np.ndarray, is_reached: np.ndarray) -> tuple[float, flo
     """Compute the fraction of false positives among unreached pairs, and that of false negatives among reached pairs.
 
     Args:
-        reward: [N] float32; at least 0.5 counts as positive.
+        reward: [N] float; at least 0.5 counts as positive.
         is_reached: [N] bool, ground truth.
 
     Returns:
