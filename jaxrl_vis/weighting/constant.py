@@ -67,8 +67,8 @@ def fixed(weights: float | Mapping[str, float] = 1.0, log: bool = True, eps: Eps
         eps, main_eps: See `Weighting`.
 
     Raises:
-        RequestError: A weight is not finite, or ``eps`` or ``main_eps`` is not positive; from ``init``: a loss has no weight, or
-            a weight has no loss.
+        RequestError: A weight is not finite, or ``eps`` or ``main_eps`` is not positive; from ``init``: a loss has no weight,
+            or a weight has no loss.
     """
     for weight in weights.values() if isinstance(weights, Mapping) else [weights]:
         if not math.isfinite(weight):

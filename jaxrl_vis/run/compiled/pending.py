@@ -16,7 +16,7 @@ from jaxrl_vis.types import Metrics
 
 @jax.jit
 def stack_metrics(metrics: Metrics) -> jax.Array:
-    """Stack metrics, [S] or [] each, in the order of their names: [K, S]."""
+    """Stack K metrics, [S] or [] each, in the order of their names: [K, S], or [K] if all are []."""
     return jnp.stack(jnp.broadcast_arrays(*(metrics[name] for name in sorted(metrics))))
 
 

@@ -88,7 +88,7 @@ def dispatch(on_gpu: Any, plain: Any, *arguments: Any, interpret: bool) -> Any:
 
 
 def dot(left: jax.Array, right: jax.Array, contract: tuple[int, int] = (1, 0)) -> jax.Array:
-    """Multiply matrices, accumulating in float32; contract axis ``contract[0]`` of the left with ``contract[1]`` of the right."""
+    """Multiply matrices, contracting axis ``contract[0]`` of the left with ``contract[1]`` of the right; return float32."""
     dimensions = (((contract[0],), (contract[1],)), ((), ()))
     return jax.lax.dot_general(left, right, dimensions, preferred_element_type=jnp.float32)
 
