@@ -60,9 +60,10 @@ def choose_batches(config: Config, sampler: Sampler, replay: ReplayState, key: j
 
 
 def _update_statistics(train: TrainState, episodes: Episodes, key: jax.Array, config: Config, sampler: Sampler) -> TrainState:
-    """Update the normalisers from the observations of a rollout, or from as many transitions sampled from it.
+    """Return the learner with normalisers updated from a rollout, or from as many transitions sampled from it.
 
-    Which of both is set by ``normalizer_source``. Goals update their own normaliser if there is one, else the common one.
+    The option ``normalizer_source`` selects one of these. Goals update their own normaliser if there is one, else the common
+    one.
     """
     if config.study.normalizer_source == "rollouts":
         observations, goals = episodes.observations, episodes.observations[:, -1:]

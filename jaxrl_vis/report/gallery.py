@@ -67,7 +67,7 @@ def print_table(names: Sequence[str] | None = None) -> None:
 
 
 def _make_all(names: Sequence[str] | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """Create the environments ``names``; or all, with errors of those that cannot be created.
+    """Create the environments ``names``, or all; return them, and the errors of those that cannot be created, by name.
 
     Raises:
         RequestError: One of ``names`` cannot be created.

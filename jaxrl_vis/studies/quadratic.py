@@ -54,7 +54,7 @@ def authors_rule() -> Weighting:
 
 
 def descend(weighting: Weighting) -> Paths:
-    """Run gradient descent from all starts in parallel."""
+    """Run gradient descent from all `STARTS` in parallel, with `STEPS` steps; return the paths."""
     gradient = weighted_grad(losses, weighting)
     names = (MAIN, *AUXILIARY)
 

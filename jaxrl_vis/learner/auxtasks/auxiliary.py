@@ -98,7 +98,7 @@ class Auxiliary:
         return {name: jax.eval_shape(task.episode, images) for name, task in self.tasks.items() if task.episode is not None}
 
     def with_targets(self, key: jax.Array, batch: Batch, stored: dict[str, jax.Array]) -> Batch:
-        """Add the views and targets of all tasks to a batch.
+        """Return a batch with the views and targets of all tasks added.
 
         Args:
             key: [] typed key for random views.

@@ -106,7 +106,7 @@ def _collect_latents(auxiliary: Auxiliary, encoded: Latents | dict[str, jax.Arra
 
 
 def _next_latents(networks: Networks, copies: ComputeCopies, inputs: Inputs, latents: Latents) -> tuple[jax.Array, jax.Array]:
-    """Encode the next observation and the goal for the target actor and the target critic: [2, B, latent] each.
+    """Encode next observations and goals for the target actor, and for the target critic; return [2, B, latent] of each.
 
     Heads take them in this order; inputs are stored as (goal, after). ``latents`` are the online critic's.
     """

@@ -131,7 +131,7 @@ class Replay(NamedTuple):
         return ReplayState(episodes=self._to_storage(rollout), size=jnp.full((), self.num_envs, jnp.int32))
 
     def insert(self, state: ReplayState, rollout: Episodes, iteration: jax.Array) -> ReplayState:
-        """Write the E episodes of a rollout; once the ring is full, they overwrite the oldest ones.
+        """Write the E episodes of a rollout, over the oldest ones once the ring is full; return the new state.
 
         Args:
             state: State of the replay before the insertion.

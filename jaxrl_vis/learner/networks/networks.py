@@ -194,7 +194,7 @@ class Networks:
         return jax.tree.map(jnp.copy, copied)  # a donated buffer must not appear twice
 
     def with_encoder(self, params: Params, other: Params) -> Params:
-        """Add the encoder of ``other`` to ``params``, unless they have their own or none is needed."""
+        """Return ``params`` with the encoder of ``other``, unless they have their own or ``other`` has none."""
         if "encoder" in params or "encoder" not in other:
             return params
         return {**params, "encoder": other["encoder"]}

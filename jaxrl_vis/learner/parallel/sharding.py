@@ -123,7 +123,7 @@ class Layout:
         return jit(mapped, **shardings, **options)
 
     def with_shardings(self, shapes: Any, specs: Any) -> Any:
-        """Add shardings to shapes (as of `jax.eval_shape`).
+        """Return shapes (as from `jax.eval_shape`) with shardings; unchanged on one device.
 
         Args:
             shapes: A pytree.
@@ -138,7 +138,7 @@ class Layout:
         return jax.tree.map(placed, self.shardings(specs), shapes)
 
     def put(self, tree: Any, specs: Any) -> Any:
-        """Place arrays by their specs; a leaf of ``specs`` covers a subtree of ``tree``."""
+        """Place arrays by their specs, and return them; a leaf of ``specs`` covers a subtree. Unchanged on one device."""
         if self.mesh is None:
             return tree
 

@@ -146,7 +146,7 @@ def _write(
 
 
 def check_file(path: Path | str) -> Check:
-    """Run an exported policy on its golden frames.
+    """Run an exported policy on its golden frames, and return the result of the comparison with their actions.
 
     Args:
         path: The policy's file, or its folder.

@@ -62,7 +62,7 @@ def record(trainer: Trainer, train: TrainState, policy: Policy) -> Golden:
 
 
 def to_bytes(golden: Golden) -> bytes:
-    """Write golden frames as a compressed .npz file."""
+    """Return golden frames as the contents of a compressed .npz file."""
     file = io.BytesIO()
     np.savez_compressed(file, **golden._asdict())
     return file.getvalue()

@@ -16,7 +16,7 @@ BATCH = "batch"
 
 
 def require() -> tuple[Any, Any]:
-    """Import onnx and onnxruntime.
+    """Import onnx and onnxruntime, and return both modules.
 
     Raises:
         RequestError: One of them is missing.

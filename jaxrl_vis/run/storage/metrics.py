@@ -66,7 +66,10 @@ def average_metrics(history: Sequence[Mapping[str, Sequence[float]]]) -> PerSeed
 
 
 def with_precision(metrics: PerSeed) -> PerSeed:
-    """Add the precision of the filter to ``metrics``: the fraction of the dropped negatives that were false; NaN if none.
+    """Return ``metrics`` with the precision of the filter: the fraction of dropped negatives that were false; NaN if none.
+
+    Without statistics of a filter, ``metrics`` are returned unchanged.
+
 
     This is a ratio of means, not a mean of ratios: the fraction among all dropped samples.
     """

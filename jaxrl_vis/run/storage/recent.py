@@ -175,7 +175,7 @@ class Recent:
         return self._header(iteration)
 
     def restore(self, iteration: int, template: LoopState) -> tuple[LoopState, dict[str, Any]]:
-        """Restore a state, and the progress that was saved with it.
+        """Restore a state; return it, and the progress that was saved with it.
 
         Args:
             iteration: One of `iterations`.

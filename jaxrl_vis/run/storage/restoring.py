@@ -79,7 +79,7 @@ def read_manifest(read: Read, where: Path) -> dict[str, Any]:
 def restore_items(
     read: Read, where: Path, manifest: dict[str, Any], template: LoopState, with_replay: bool
 ) -> tuple[TrainState, LoopState | None]:
-    """Restore the learner, and with the replay the complete state, of the checkpoint at ``where``.
+    """Restore the checkpoint at ``where``; return the learner, and the complete state or None.
 
     Args:
         read: See the module.

@@ -30,7 +30,7 @@ _SHOWN = 160  # side of an image on the page, px
 
 
 def require() -> Any:
-    """Import viser.
+    """Import viser, and return the module.
 
     Raises:
         RequestError: viser is missing.

@@ -97,7 +97,13 @@ def play(env: GoalEnv, count: int, seed: int) -> Episodes:
 
 
 def with_noise(pairs: Pairs, deviation: float, seed: int) -> Pairs:
-    """Add camera noise of standard deviation ``deviation`` grey levels to all images and goals, independently for each."""
+    """Return pairs with camera noise on all images and goals, independent for each: uint8, rounded and clipped.
+
+    Args:
+        pairs: Pairs of images and goals.
+        deviation: Standard deviation of the noise in grey levels; if it is 0, ``pairs`` are returned unchanged.
+        seed: Seed of the noise.
+    """
     if deviation == 0.0:
         return pairs
     draw = np.random.default_rng(seed)
