@@ -98,9 +98,11 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         slopes = weighting.slopes(losses)
         dots = {name: slopes[MAIN] * slopes[name] * statistics[name] for name in state.weights if name != MAIN}
-        one = state.weights[MAIN]
+        main_weight = state.weights[MAIN]
         # Use the sign of the dot product itself: slopes are positive, but a small product might underflow.
-        weights = {MAIN: one} | {name: jnp.where(statistics[name] >= 0.0, one, 0.0 * one) for name in dots}
+        weights = {MAIN: main_weight} | {
+            name: jnp.where(statistics[name] >= 0.0, main_weight, 0.0 * main_weight) for name in dots
+        }
         return weights, state.replace(weights=weights, updates=state.updates + 1), weight_metrics(weights, dots)
 
     weighting = check_eps(Weighting("cosine", init, update, needs="dots", log=log, eps=eps, main_eps=main_eps, heads=heads))

@@ -207,18 +207,18 @@ def make_layout(config: Config) -> Layout:
     """
     if config.run.devices == 1 and jax.process_count() == 1:
         return ONE_DEVICE
-    there = jax.devices()
-    if config.run.devices > len(there):
-        what = "there is 1" if len(there) == 1 else f"there are {len(there)}"
+    available = jax.devices()
+    if config.run.devices > len(available):
+        what = "there is 1" if len(available) == 1 else f"there are {len(available)}"
         raise RequestError(
-            f"devices {config.run.devices} asks for more than {what} ({there[0].device_kind}): write --devices all"
+            f"devices {config.run.devices} asks for more than {what} ({available[0].device_kind}): write --devices all"
         )
-    if jax.process_count() > 1 and config.run.devices < len(there):
+    if jax.process_count() > 1 and config.run.devices < len(available):
         raise RequestError(
-            f"devices {config.run.devices} would leave some of the {len(there)} devices of {jax.process_count()} processes "
+            f"devices {config.run.devices} would leave some of the {len(available)} devices of {jax.process_count()} processes "
             "without work: write --devices all, or start fewer processes"
         )
     _avoid_shardy()
     along_data = data_devices(config)
-    devices = np.asarray(there[: config.run.devices], dtype=object).reshape(-1, along_data)
+    devices = np.asarray(available[: config.run.devices], dtype=object).reshape(-1, along_data)
     return Layout(Mesh(devices, (SEED, DATA)), Shards(along_data))

@@ -89,8 +89,8 @@ def _available_bytes(layout: Layout) -> int | None:
     if layout.mesh is None:
         return available_bytes()
     if layout.devices[0].platform == "cpu":  # all of them share the host's memory
-        there = available_bytes()
-        return None if there is None else there // len(layout.devices)
+        host_bytes = available_bytes()
+        return None if host_bytes is None else host_bytes // len(layout.devices)
     available = [available_bytes(device) for device in layout.devices]
     return None if None in available else min(count for count in available if count is not None)
 
@@ -127,12 +127,12 @@ def check_memory(
     bytes_per_rollout = replay * steps_per_iteration / capacity
     collected = bytes_per_rollout * frame_stack
     batch = collected / steps_per_iteration * config.run.batch_size * 4
-    other = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
+    other_bytes = train * (1 + _TRAIN_COPIES) + collected * _ROLLOUT_COPIES + batch * _BATCH_COPIES + _SLACK_BYTES
     available, suffix = _available_bytes(layout), "" if layout.num_devices == 1 else " a device"
     if available is None:
         return f"replay {format_bytes(replay)}{suffix}"
-    if replay + other > available:
-        fitting = int((available - other) // bytes_per_rollout) * steps_per_iteration
+    if replay + other_bytes > available:
+        fitting = int((available - other_bytes) // bytes_per_rollout) * steps_per_iteration
         if fitting > 0:
             hint = f"--replay-transitions {fitting} fits"
         else:
@@ -140,7 +140,7 @@ def check_memory(
         seeds = "1 seed" if config.run.seeds == 1 else f"{config.run.seeds} seeds"
         raise RequestError(
             f"a replay of {config.run.replay_transitions} transitions for {seeds} needs "
-            f"{format_bytes(replay)}{suffix}, and networks and rollouts {format_bytes(other)} more; there are "
+            f"{format_bytes(replay)}{suffix}, and networks and rollouts {format_bytes(other_bytes)} more; there are "
             f"{format_bytes(available)}{suffix}: {hint}"
         )
     return f"replay {format_bytes(replay)} of {format_bytes(available)}{suffix}"

@@ -117,17 +117,21 @@ class Repeater:
 
     def _compare(self, name: str, iteration: int, loop: LoopState, history: Mapping[int, PerSeed]) -> None:
         """Compare the rows of an iteration with the repetition."""
-        there = [row for row in self._rows if row["iteration"] == iteration]
+        rows = [row for row in self._rows if row["iteration"] == iteration]
         outcome, _ = self._programs.evaluate(loop.train)
         evaluated = self._programs.pending(outcome).read_per_seed(len(self._expected.seeds))
         best: list[tuple[int, str, Any, Any]] | None = None
         for begin in self._mean_starts(iteration, history):
-            made = self._repeated_rows(iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)])
+            repeated = self._repeated_rows(
+                iteration, evaluated, [history[number] for number in range(begin + 1, iteration + 1)]
+            )
             differences = [
-                (row["seed"], key, value, again) for row in there for key, value, again in _differences(row, made[row["seed"]])
+                (row["seed"], key, value, again)
+                for row in rows
+                for key, value, again in _differences(row, repeated[row["seed"]])
             ]
             if best is None:
-                best, numbers = differences, sum(len(_comparable_values(row)) for row in there)
+                best, numbers = differences, sum(len(_comparable_values(row)) for row in rows)
             if not differences:
                 if best:
                     self.without_evaluation.update(range(begin + 1, iteration))
@@ -139,12 +143,12 @@ class Repeater:
         assert best is not None
         if iteration not in self.repeated:
             self.repeated.add(iteration)
-            self._report.rows += len(there)
+            self._report.rows += len(rows)
             self._report.numbers += numbers
         if best:
             self._report_differences(name, iteration, best)
         else:
-            seeds = "1 seed" if len(there) == 1 else f"{len(there)} seeds"
+            seeds = "1 seed" if len(rows) == 1 else f"{len(rows)} seeds"
             self._echo(f"  iteration {iteration}: {numbers} numbers of {seeds}, all equal")
 
     def _report_differences(self, name: str, iteration: int, differences: Sequence[tuple[int, str, Any, Any]]) -> None:

@@ -162,8 +162,8 @@ class _Verifier:
         libraries = ", ".join(f"{name} {versions[name]}" for name in ("jax", "jaxlib", "python") if name in versions)
         where = f"{device.get('count')} {device.get('kind')}, {device.get('cpu_count')} cores"
         self._echo(f"made by revision {recorded['revision'] or 'unknown'}, {libraries or 'unknown versions'}, on {where}")
-        other = [name for name in recorded if recorded[name] != current.get(name)]
-        report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in other]
+        changed = [name for name in recorded if recorded[name] != current.get(name)]
+        report.elsewhere += [f"{name} {recorded[name]} then, {current.get(name)} now" for name in changed]
         if recorded["revision"] is None:
             report.elsewhere.append("config.json names no revision")
         elif str(recorded["revision"]).endswith("-dirty"):

@@ -15,9 +15,9 @@ def ranks(values: np.ndarray) -> np.ndarray:
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
     """Compute Spearman's rank correlation of two arrays [N]; 0 if all values of one are equal."""
-    one, other = (ranks(values) - (len(values) - 1) / 2.0 for values in (first, second))
-    size = np.sqrt(np.sum(one**2) * np.sum(other**2))
-    return 0.0 if size == 0.0 else float(np.sum(one * other) / size)
+    first_ranks, second_ranks = (ranks(values) - (len(values) - 1) / 2.0 for values in (first, second))
+    size = np.sqrt(np.sum(first_ranks**2) * np.sum(second_ranks**2))
+    return 0.0 if size == 0.0 else float(np.sum(first_ranks * second_ranks) / size)
 
 
 def error_shares(reward: np.ndarray, is_reached: np.ndarray) -> tuple[float, float]:

@@ -53,8 +53,8 @@ def _rewards(name: str, reward: Reward, images: np.ndarray, goals: np.ndarray) -
     """
     compiled, rows = jaxrl_vis_envs.jit(_with_errors_named(name, reward)), []
     for first in range(0, len(images), _BATCH):
-        part = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
-        rows.append(np.asarray(compiled(images[part], goals[part]))[: len(images) - first])
+        indices = np.arange(first, first + _BATCH) % len(images)  # the last batch wraps around, so that all have the same size
+        rows.append(np.asarray(compiled(images[indices], goals[indices]))[: len(images) - first])
         if rows[-1].shape != (min(_BATCH, len(images) - first),):
             raise RequestError(f"reward {name} has the shape {rows[-1].shape[1:]} for each image: it must be one number")
     values = np.concatenate(rows).astype(np.float64)

@@ -54,21 +54,21 @@ def _prepare_kernel(images_ref, mean_ref, scale_ref, *refs, shape, levels, limit
     halves = [axis for level in range(finer + 1) for axis in (1 + level, finer + 4 + level)]
     order = (finer + 3, *halves, 0, finer + 2, 2 * finer + 5)
 
-    def statistics(pixel: jax.Array, there: jax.Array) -> list[jax.Array]:
-        return [plgpu.load(ref.at[pixel], mask=there, other=0.0) for ref in (mean_ref, scale_ref)]
+    def statistics(pixel: jax.Array, mask: jax.Array) -> list[jax.Array]:
+        return [plgpu.load(ref.at[pixel], mask=mask, other=0.0) for ref in (mean_ref, scale_ref)]
 
-    pixel, there = (channel * height + row) * width + column, channel < channels
-    still = [pixel, there, *statistics(pixel, there)]
+    pixel, is_channel = (channel * height + row) * width + column, channel < channels
+    still = [pixel, is_channel, *statistics(pixel, is_channel)]
 
     def prepare_image(image, _):
         places = still
         if moves:
             from_row, from_column = row - moves[0][image, 0], column - moves[0][image, 1]
-            inside = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width) & there
+            is_inside = (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width) & is_channel
             pixel = (channel * height + from_row) * width + from_column
-            places = [pixel, inside, *statistics(pixel, inside)]
-        pixel, inside, mean, scale = places
-        values = plgpu.load(images_ref.at[image, pixel], mask=inside, other=0).astype(jnp.float32)
+            places = [pixel, is_inside, *statistics(pixel, is_inside)]
+        pixel, is_inside, mean, scale = places
+        values = plgpu.load(images_ref.at[image, pixel], mask=is_inside, other=0).astype(jnp.float32)
         values = jnp.clip((values - mean) * scale, -limit, limit).astype(out_ref.dtype)
         out_ref[image] = values.reshape(parts).transpose(order).reshape(patches, size)
 
