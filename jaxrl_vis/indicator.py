@@ -113,9 +113,9 @@ class Learner:
         if auxiliary.tasks:
             raise RequestError("a learner on the host has no auxiliary losses: leave out aux_tasks")
         setup = Setup(self.config, resolved, self._spec, action_size, auxiliary)
-        wanted = self.config.run.algorithm
-        maker = find("algorithm", wanted, train_step.ALGORITHMS, self.config.environment.env_folder)
-        self._algorithm = call("algorithm", wanted, maker, setup, of=Algorithm)
+        algorithm = self.config.run.algorithm
+        maker = find("algorithm", algorithm, train_step.ALGORITHMS, self.config.environment.env_folder)
+        self._algorithm = call("algorithm", algorithm, maker, setup, of=Algorithm)
         self._replay = Replay(capacity, 1, horizon)
         self._sampler = Sampler(self.config, resolved, self._replay, threshold)
         self._key = jax.random.key(self.config.run.seed)
@@ -127,8 +127,8 @@ class Learner:
     def _check_array(self, name: str, array: Any, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         array = np.asarray(array)
         if array.shape != shape or (dtype == np.uint8) != (array.dtype == np.uint8) or not np.all(np.isfinite(array)):
-            wanted = "uint8" if dtype == np.uint8 else "finite numbers"
-            raise RequestError(f"{name} must be {wanted} of the shape {shape}, not {array.dtype} of {array.shape}")
+            expected = "uint8" if dtype == np.uint8 else "finite numbers"
+            raise RequestError(f"{name} must be {expected} of the shape {shape}, not {array.dtype} of {array.shape}")
         return array.astype(dtype)
 
     def add(self, observations: Any, actions: Any, goal: Any = None, states: Any = None) -> None:

@@ -271,8 +271,8 @@ def _is_finite(value: Any) -> bool:
         return False
 
 
-def _refuse(label: str, kind: Any, value: Any) -> NoReturn:
-    raise RequestError(f"{label} must be {_KINDS[kind]}, not {_quote(value)}{_suggestion(kind, value)}")
+def _refuse(label: str, base: Any, value: Any) -> NoReturn:
+    raise RequestError(f"{label} must be {_KINDS[base]}, not {_quote(value)}{_suggestion(base, value)}")
 
 
 def _quote(value: Any) -> str:
@@ -281,10 +281,10 @@ def _quote(value: Any) -> str:
     return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]}..."
 
 
-def _suggestion(kind: Any, value: Any) -> str:
+def _suggestion(base: Any, value: Any) -> str:
     """Return a hint with the integer spelling of a whole number written otherwise, such as 1e6; empty if not applicable."""
     try:
-        number = float(value) if kind is int and not isinstance(value, bool) else math.nan
+        number = float(value) if base is int and not isinstance(value, bool) else math.nan
     except (TypeError, ValueError, OverflowError):
         return ""
     return f": write {int(number)}" if number.is_integer() and abs(number) < 2**53 else ""

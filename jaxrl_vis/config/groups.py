@@ -339,9 +339,9 @@ def weighting_options() -> dict[str, tuple[str, ...]]:
     return {name: mark.names for name, mark in marks.items()}
 
 
-def options_read_by(kind: type[T]) -> dict[str, T]:
-    """Map each field annotated with an instance of ``kind``, `OfAlgorithm` or `OfMethod`, to that instance."""
-    return {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, kind)}
+def options_read_by(owner: type[T]) -> dict[str, T]:
+    """Map each field annotated with an instance of ``owner``, `OfAlgorithm` or `OfMethod`, to that instance."""
+    return {name: extra for name, field in OPTIONS.items() for extra in field.extras if isinstance(extra, owner)}
 
 
 def check_names(changes: Mapping[str, Any]) -> Mapping[str, Any]:

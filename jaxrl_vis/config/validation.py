@@ -49,8 +49,8 @@ def validate(config: Config) -> Config:
         )
     for name, algorithms in options_read_by(OfAlgorithm).items():
         if _is_changed(config, name) and run.algorithm in ALGORITHMS and run.algorithm not in algorithms.names:
-            wanted = " or ".join(algorithms.names)
-            raise RequestError(f"{name} is an option of --algorithm {wanted}, and this is {run.algorithm}: leave it out")
+            readers = " or ".join(algorithms.names)
+            raise RequestError(f"{name} is an option of --algorithm {readers}, and this is {run.algorithm}: leave it out")
     for name, reader in options_read_by(OfMethod).items():
         if _is_changed(config, name) and config.reward.method in METHODS and config.reward.method != reader.name:
             raise RequestError(
@@ -98,16 +98,16 @@ def _validate_devices(config: Config) -> None:
     groups = devices // along_data
     if seeds % groups:
         where = f"{groups} devices" if along_data == 1 else f"{groups} groups of {along_data} devices"
-        more = math.ceil(seeds / groups) * groups
+        rounded = math.ceil(seeds / groups) * groups
         raise RequestError(
-            f"seeds {seeds} cannot be divided among {where}: write --seeds {more}, or --data-devices {devices} to "
+            f"seeds {seeds} cannot be divided among {where}: write --seeds {rounded}, or --data-devices {devices} to "
             "divide each learner"
         )
     for name in marked(DIVIDED):
         value = config.value(name)
         if value % along_data:
-            option, more = f"--{name.replace('_', '-')}", math.ceil(value / along_data) * along_data
-            raise RequestError(f"{name} {value} cannot be divided among {along_data} devices: write {option} {more}")
+            option, rounded = f"--{name.replace('_', '-')}", math.ceil(value / along_data) * along_data
+            raise RequestError(f"{name} {value} cannot be divided among {along_data} devices: write {option} {rounded}")
 
 
 def _validate_reward(config: Config) -> None:

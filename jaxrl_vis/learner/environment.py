@@ -39,11 +39,11 @@ def locate_env(config: Config) -> Config:
     for kind, name in plugins.own_names(config).items():
         if kind != "task":
             folders[name] = import_folder(plugins.load(name, config.environment.env_folder)[0])
-    places = {folder: name for name, folder in folders.items() if folder is not None}
-    if len(places) > 1:
-        where = " and ".join(f"{name} in {folder}" for folder, name in places.items())
+    names = {folder: name for name, folder in folders.items() if folder is not None}
+    if len(names) > 1:
+        where = " and ".join(f"{name} in {folder}" for folder, name in names.items())
         raise RequestError(f"modules of a run must lie in one folder, or be installed; here are {where}")
-    return config.replace(env_folder=next(iter(places), None))
+    return config.replace(env_folder=next(iter(names), None))
 
 
 def make_env(config: Config) -> GoalEnv:

@@ -131,7 +131,7 @@ def render_poses(env: Any, key: jax.Array, goals: int, size: int) -> Frame:
 
     scene = Scene.from_mjmodel(env.mj_model, env.camera, size, size)
     # A loop over single images compiles faster than a batch, and a few images render quickly.
-    draw = jaxrl_vis_envs.jit(lambda poses: jax.lax.map(lambda one: render(scene, one), poses))
+    draw = jaxrl_vis_envs.jit(lambda poses: jax.lax.map(lambda pose: render(scene, pose), poses))
     return jax.tree.map(np.asarray, draw(jaxrl_vis_envs.jit(sample)(keys)))
 
 

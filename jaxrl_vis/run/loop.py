@@ -118,8 +118,8 @@ class RunLoop:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with run_lock(self._folder.path, self._echo) if self._writes else contextlib.nullcontext() as self._lock, self._console:
             if is_resumed and earlier.is_finished(self._folder, self._checkpoints, self._programs, self._total, self._echo):
-                if self._writes and (said := earlier.truncate_metrics(self._folder, self._checkpoints, sys.maxsize)):
-                    self._echo(said)
+                if self._writes and (note := earlier.truncate_metrics(self._folder, self._checkpoints, sys.maxsize)):
+                    self._echo(note)
                 self._echo(earlier.finished_message(self._folder, self._checkpoints, self._config, self._total))
                 return
             interruption = Interruption()
@@ -261,8 +261,8 @@ class RunLoop:
             foreign: Checkpoints of other runs that were set aside.
         """
         if is_resumed:
-            if said := earlier.truncate_metrics(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
-                self._echo(said)
+            if note := earlier.truncate_metrics(self._folder, self._checkpoints, self._done, bool(damaged), self._evaluated_at):
+                self._echo(note)
             self._evaluated_seeds = {row["seed"] for row in self._folder.rows() if row["iteration"] == self._done}
         for path in damaged:
             self._echo(f"kept for inspection: {path}")

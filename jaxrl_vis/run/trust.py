@@ -83,8 +83,8 @@ def check(run_dir: Path, config: Config, is_permitted: bool, hint: str = "pass t
 def describe_code(run_dir: Path, config: Config) -> str:
     """Return the clause of messages that lists the custom code of a run, and the files that it is imported from."""
     files = _files(config)
-    parts = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]
-    return f"the run in {run_dir} runs code that is not of this project: {', '.join(parts)}"
+    reasons = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]
+    return f"the run in {run_dir} runs code that is not of this project: {', '.join(reasons)}"
 
 
 def _folder() -> Path:

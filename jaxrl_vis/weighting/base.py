@@ -306,40 +306,40 @@ def check_eps(weighting: Weighting) -> Weighting:
     return weighting
 
 
-def start(names: Iterable[str], weights: Mapping[str, float], **more: Any) -> WeightingState:
+def start(names: Iterable[str], weights: Mapping[str, float], **fields: Any) -> WeightingState:
     """Return the initial state of a weighting with a main loss.
 
     Args:
         names: Names of the auxiliary losses.
         weights: Initial weights of the auxiliary losses, by name.
-        more: Values of other fields.
+        fields: Values of other fields.
     """
     filled = {MAIN: jnp.ones(())} | {name: jnp.asarray(weights[name], jnp.ones(()).dtype) for name in names}
-    return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **more)
+    return WeightingState(weights=filled, updates=jnp.zeros((), jnp.int32), **fields)
 
 
-def start_equal(label: str, names: Iterable[str], **more: Any) -> WeightingState:
+def start_equal(label: str, names: Iterable[str], **fields: Any) -> WeightingState:
     """Return the initial state of a weighting without a main loss: equal weights that sum to 1.
 
     Args:
         label: Name of the weighting, for error messages.
         names: Names of all losses.
-        more: Values of other fields.
+        fields: Values of other fields.
     """
     ordered = all_names(label, names)
     weights = {name: jnp.full((), 1.0 / len(ordered), jnp.ones(()).dtype) for name in ordered}
-    return WeightingState(weights=weights, updates=jnp.zeros((), jnp.int32), **more)
+    return WeightingState(weights=weights, updates=jnp.zeros((), jnp.int32), **fields)
 
 
-def next_state(state: WeightingState, weights: Weights, **more: Any) -> tuple[WeightingState, Metrics]:
+def next_state(state: WeightingState, weights: Weights, **fields: Any) -> tuple[WeightingState, Metrics]:
     """Return the state after an update, and metrics ``weight/NAME`` of all losses.
 
     Args:
         state: Previous state.
         weights: Weights of this step; or of the next one, if they do not depend on the gradients that they combine.
-        more: New values of other fields.
+        fields: New values of other fields.
     """
-    after = keep_dtypes(state.replace(weights=weights, updates=state.updates + 1, **more), state)
+    after = keep_dtypes(state.replace(weights=weights, updates=state.updates + 1, **fields), state)
     return after, {f"weight/{name}": weight for name, weight in after.weights.items()}
 
 

@@ -109,9 +109,9 @@ def cosine(log: bool = False, eps: Eps = 0.02, main_eps: float = 1e-8, heads: He
     return weighting
 
 
-def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool = True, **more: Any) -> Weighting:
+def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool = True, **options: Any) -> Weighting:
     def init(names: Iterable[str], shared: Params = None) -> WeightingState:
-        if not more.get("main", True):
+        if not options.get("main", True):
             ones = start_equal(name, names)
             return ones.replace(weights={loss: jnp.ones_like(weight) for loss, weight in ones.weights.items()})
         others = auxiliary_names(name, names, needed=auxiliary)
@@ -126,5 +126,5 @@ def _constant(name: str, weights: float | Mapping[str, float], auxiliary: bool =
     def update(losses: Losses, statistics: Any, state: WeightingState) -> tuple[Weights, WeightingState, Metrics]:
         return state.weights, state.replace(updates=state.updates + 1), weight_metrics(state.weights) if auxiliary else {}
 
-    reads_losses = more.get("log", False)
-    return check_eps(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **more))
+    reads_losses = options.get("log", False)
+    return check_eps(Weighting(name, init, update, auxiliary=auxiliary, reads_losses=reads_losses, **options))

@@ -269,13 +269,15 @@ def _gradient_by_latents(
 def _replace_subtree(shared: Selector, params: Params, inside: Params, outside: Params) -> Params:
     """Merge two trees like the parameters: shared parameters from ``inside``, all others from ``outside``."""
     is_shared = _embed(shared, params, jax.tree.map(jnp.ones_like, shared(outside)))
-    return jax.tree.map(lambda chosen, one, other: jnp.where(chosen > 0, one, other), is_shared, inside, outside)
+    return jax.tree.map(
+        lambda mask, shared_leaf, other_leaf: jnp.where(mask > 0, shared_leaf, other_leaf), is_shared, inside, outside
+    )
 
 
-def _embed(shared: Selector, params: Params, part: Params) -> Params:
-    """Place ``part`` in the shared parameters and zero in all others, in the dtypes of ``part`` or float32."""
-    dtype = jnp.result_type(jnp.float32, *jax.tree.leaves(part))
+def _embed(shared: Selector, params: Params, subset: Params) -> Params:
+    """Place ``subset`` in the shared parameters and zero in all others, in the dtypes of ``subset`` or float32."""
+    dtype = jnp.result_type(jnp.float32, *jax.tree.leaves(subset))
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, dtype), params)
-    part = jax.tree.map(lambda leaf: leaf.astype(dtype), part)
-    (placed,) = jax.linear_transpose(shared, shapes)(part)  # the transpose of a selection inserts its parts
+    subset = jax.tree.map(lambda leaf: leaf.astype(dtype), subset)
+    (placed,) = jax.linear_transpose(shared, shapes)(subset)  # the transpose of a selection inserts its parts
     return placed

@@ -129,7 +129,7 @@ def upgrad(**options: Unpack[Options]) -> Weighting:
 
     def weights(gramian: jax.Array) -> jax.Array:
         preferences = jnp.eye(len(gramian), dtype=gramian.dtype) / len(gramian)
-        return jnp.sum(jax.vmap(lambda one: solvers.dual_cone(gramian, one))(preferences), axis=0)
+        return jnp.sum(jax.vmap(lambda preference: solvers.dual_cone(gramian, preference))(preferences), axis=0)
 
     return of_gramian("upgrad", _plain(weights), **options)
 

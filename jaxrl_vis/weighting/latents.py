@@ -24,9 +24,9 @@ AtLatents = Mapping[str, Mapping[str, Any]]
 """Gradients with respect to latents, by loss and by group of latents that it reads."""
 
 
-def cast_like(tree: Params, other: Params) -> Params:
+def cast_like(tree: Params, template: Params) -> Params:
     """Cast the leaves of a tree to the dtypes of another."""
-    return jax.tree.map(lambda leaf, model: leaf.astype(model.dtype), tree, other)
+    return jax.tree.map(lambda leaf, template_leaf: leaf.astype(template_leaf.dtype), tree, template)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +65,8 @@ class Encoding:
         for group, pullback in self.pullbacks.items():
             readers = {name: at[group] for name, at in at_latents.items() if name in coefficients and group in at}
             if readers:
-                (part,) = pullback(cast_like(weighted_sum(readers, coefficients), self.latents[group]))
-                total = jax.tree.map(lambda before, more: before + more.astype(before.dtype), total, part)
+                (term,) = pullback(cast_like(weighted_sum(readers, coefficients), self.latents[group]))
+                total = jax.tree.map(lambda before, more: before + more.astype(before.dtype), total, term)
         return total
 
     def dots(self, direction: Params, at_latents: AtLatents) -> dict[str, jax.Array]:
@@ -148,12 +148,12 @@ class LossDerivatives:
         """Sum the weighted gradients with respect to the parameters, except for the paths through latents: float32."""
         leaves, structure = jax.tree.flatten(params)
 
-        def total(place: int, leaf: jax.Array) -> jax.Array:
+        def total(index: int, leaf: jax.Array) -> jax.Array:
             zeros = jnp.zeros(leaf.shape, jnp.promote_types(leaf.dtype, jnp.float32))
-            gradients = {name: of[place] for name, of in self.of_params.items() if place in of}
+            gradients = {name: of[index] for name, of in self.of_params.items() if index in of}
             return sum((coefficients[name] * gradient.astype(zeros.dtype) for name, gradient in gradients.items()), zeros)
 
-        return jax.tree.unflatten(structure, [total(place, leaf) for place, leaf in enumerate(leaves)])
+        return jax.tree.unflatten(structure, [total(index, leaf) for index, leaf in enumerate(leaves)])
 
 
 def differentiate(
@@ -173,17 +173,17 @@ def differentiate(
     program, results = traced
     losses, of_params, at_latents, extra = {}, {}, {}, None
     reads = _find_reads(program, split_result(results, has_aux)[0], len(leaves), encoding)
-    for name, (places, groups) in reads.items():
+    for name, (indices, groups) in reads.items():
 
         def compute_loss(chosen: dict[int, jax.Array], latents: dict[str, Any], name: str = name) -> tuple[jax.Array, Any]:
-            now = [chosen.get(place, leaf) for place, leaf in enumerate(leaves)]
+            current = [chosen.get(index, leaf) for index, leaf in enumerate(leaves)]
             inputs = encoding.latents | latents
             read = inputs if encoding.has_names else inputs[_ALL]
-            by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, now), read, *args), has_aux)
+            by_name, extra = split_result(losses_fn(jax.tree.unflatten(structure, current), read, *args), has_aux)
             return to_float32(jnp.asarray(by_name[name])), extra
 
         # Differentiate each loss separately, so that the compiler can remove the computation of all others as dead code.
-        chosen, read = {place: leaves[place] for place in places}, {group: encoding.latents[group] for group in groups}
+        chosen, read = {index: leaves[index] for index in indices}, {group: encoding.latents[group] for group in groups}
         losses[name], pullback, aux = jax.vjp(compute_loss, chosen, read, has_aux=True)
         of_params[name], at_latents[name] = pullback(jnp.ones_like(losses[name]))
         extra = aux if name == MAIN or MAIN not in reads else extra
@@ -206,6 +206,6 @@ def _find_reads(program: Any, losses: Mapping[str, Any], num_leaves: int, encodi
         for equation in reversed(program.jaxpr.eqns):
             if equation.primitive.name != "stop_gradient" and needed.intersection(equation.outvars):
                 needed.update(variable for variable in equation.invars if not isinstance(variable, Literal))
-        places = [index for index, variable in enumerate(of_leaf) if variable in needed]
-        reads[name] = places, [group for group, members in of_group.items() if needed.intersection(members)]
+        indices = [index for index, variable in enumerate(of_leaf) if variable in needed]
+        reads[name] = indices, [group for group, members in of_group.items() if needed.intersection(members)]
     return reads

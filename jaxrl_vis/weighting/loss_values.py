@@ -218,10 +218,10 @@ def famo(learning_rate: float = 0.025, decay: float = 1e-3, reference: float = 0
         learned = {"logits": optax.apply_updates(memory["logits"], changes), "rule": rule_state}
         previous = {name: memory[name] for name in learned}
         # There are no losses before the first ones.
-        now = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, previous)
-        ratios = jax.nn.softmax(now["logits"]) / above
+        current = jax.tree.map(lambda new, old: jnp.where(state.updates > 0, new, old), learned, previous)
+        ratios = jax.nn.softmax(current["logits"]) / above
         weights = by_name(losses, ratios / jnp.sum(ratios))
-        return weights, *next_state(state, weights, memory={**now, "logs": jnp.log(above)})
+        return weights, *next_state(state, weights, memory={**current, "logs": jnp.log(above)})
 
     return Weighting("famo", init, update, main=False)
 

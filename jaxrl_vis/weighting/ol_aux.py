@@ -110,7 +110,7 @@ def make_rule(
     if maximum is not None and not maximum >= max(minimum or 0.0, 0.0):
         raise RequestError(f"maximum of weighting {label} must be at least its minimum, not {maximum}")
 
-    def move(state: WeightingState, mean: dict[str, jax.Array], sums: Any, **more: Any) -> WeightingState:
+    def move(state: WeightingState, mean: dict[str, jax.Array], sums: Any, **fields: Any) -> WeightingState:
         due = (state.updates + 1) % interval == 0
         weights = {MAIN: state.weights[MAIN]}
         for name, value in mean.items():
@@ -118,7 +118,7 @@ def make_rule(
             moved = old + step_size * (old * value if multiplicative else value)
             weights[name] = jnp.where(due, jnp.clip(moved, minimum, maximum), old)
         sums = jax.tree.map(lambda leaf: jnp.where(due, 0.0, leaf), sums)
-        after = WeightingState(weights=weights, updates=state.updates + 1, sums=sums, **more)
+        after = WeightingState(weights=weights, updates=state.updates + 1, sums=sums, **fields)
         return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)  # the carry of a scan must keep its dtypes
 
     return move

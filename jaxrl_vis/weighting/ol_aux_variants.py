@@ -128,8 +128,8 @@ def ol_aux_ablation(
             raise RequestError(f"weighting {label} keeps parameters: give init all of them, too")
         sums = {name: jnp.zeros(()) for name in (MAIN, *others)}
         sums = {"losses": sums, "gradients": zeros_for(label, (MAIN, *others), shared)}
-        held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), params)
-        return start(others, dict.fromkeys(others, 1.0), sums=sums, params=held)
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), params)
+        return start(others, dict.fromkeys(others, 1.0), sums=sums, params=zeros)
 
     def hold(params: Params, state: WeightingState) -> WeightingState:
         is_new = state.updates % interval == 0

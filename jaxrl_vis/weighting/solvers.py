@@ -236,9 +236,9 @@ def bargain(gramian: jax.Array, preferences: jax.Array, exponent: float = 1.0) -
     greatest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(gramian)), 0.0))
     lengths = relative * jnp.where(greatest > 0.0, greatest, 1.0)
     # With a = x scale / lengths, the equation is unit x = ratios x^(-power), where the maximum of ratios is 1.
-    wanted = preferences * lengths ** (power - 1.0)
-    scale = jnp.max(wanted) ** (1.0 / (1.0 + power))
-    ratios = wanted / jnp.max(wanted)
+    targets = preferences * lengths ** (power - 1.0)
+    scale = jnp.max(targets) ** (1.0 / (1.0 + power))
+    ratios = targets / jnp.max(targets)
 
     def objective(x: jax.Array) -> jax.Array:
         utility = jnp.log(x) if power == 1.0 else x ** (1.0 - power) / (1.0 - power)

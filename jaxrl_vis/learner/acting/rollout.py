@@ -112,9 +112,9 @@ class Rollout(NamedTuple):
     record: Any
 
 
-def _episode_major(*parts: jax.Array) -> jax.Array:
+def _episode_major(*arrays: jax.Array) -> jax.Array:
     """Concatenate arrays [steps, S, K, ...] along time, and move that axis behind the episodes: [S, K, all steps, ...]."""
-    return jnp.moveaxis(jnp.concatenate(parts), 0, 2)
+    return jnp.moveaxis(jnp.concatenate(arrays), 0, 2)
 
 
 def play(

@@ -76,8 +76,8 @@ class Auxiliary:
         Args:
             critic: All parameters of the critic.
         """
-        held = (critic,) if self.weighting.hold is not None else ()
-        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *held)
+        params = (critic,) if self.weighting.hold is not None else ()
+        return self.weighting.init((MAIN, *self.tasks), critic.get("encoder"), *params)
 
     def with_stored(self, episodes: Episodes) -> Episodes:
         """Return the E episodes of a rollout with the arrays that tasks compute once per episode (`AuxTask.episode`)."""

@@ -261,15 +261,15 @@ def make_ddpg(
 
     def gradients(working: WorkingState, prepared: PreparedBatch, with_actor: bool = True) -> tuple[Gradients, Metrics]:
         agent, (batch, inputs, image, noise) = working.agent, prepared
-        now = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
+        copies = ComputeCopies(*map(networks.with_compute_copy, _network_parameters(agent), working.copies))
         rewarded = None
         if learned_reward is not None:
             rewarded = learned_reward.of_batch(agent.reward_model, working.scaling.observations, inputs, batch)
         if rewarded is not None:
             batch = batch.replace(reward=rewarded.reward)
         assert batch.reward is not None
-        state = auxiliary.start(now.critic) if agent.weighting is None else agent.weighting
-        weighted = learning.critic_gradient(now, inputs, image, batch, noise)(now.critic, state)
+        state = auxiliary.start(copies.critic) if agent.weighting is None else agent.weighting
+        weighted = learning.critic_gradient(copies, inputs, image, batch, noise)(copies.critic, state)
         latents, value, keep = weighted.extra
         counts = diagnostics.count_rewards(
             batch.reward, keep, resolved.reward_positive, resolved.reward_negative, batch.success, rewarded is not None
@@ -278,7 +278,7 @@ def make_ddpg(
         actor_gradient, mean_square = None, None
         if with_actor:
             (policy_loss, action), actor_gradient = jax.value_and_grad(learning.actor_loss, has_aux=True)(
-                now.actor, now.critic, inputs, latents, image, batch, weighted.weights
+                copies.actor, copies.critic, inputs, latents, image, batch, weighted.weights
             )
             actor_gradient = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), actor_gradient)
             metrics["train/actor_loss"], mean_square = policy_loss, jnp.mean(jnp.square(action))

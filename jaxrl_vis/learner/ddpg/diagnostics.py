@@ -22,7 +22,6 @@ def count_rewards(
 
     ``positive_share`` is a fraction already.
 
-
     If a batch is divided among devices, average the counts over the devices before calling `fractions`.
 
     Args:
@@ -48,16 +47,16 @@ def count_rewards(
     }
 
 
-def fractions(counts: Metrics, parts: int = 1) -> Metrics:
+def fractions(counts: Metrics, num_shards: int = 1) -> Metrics:
     """Compute fractions of a batch, [] float32 by name; docs/learner.md defines them.
 
     Args:
-        counts: Counts from `count_rewards`; for a batch in several parts, their mean over the parts.
-        parts: Number of parts.
+        counts: Counts from `count_rewards`; for a batch divided into shards, their mean over the shards.
+        num_shards: Number of shards.
     """
 
-    def fraction(part: str, total: str) -> jax.Array:
-        return counts[part] / jnp.maximum(counts[total], 1.0 / parts)
+    def fraction(count: str, total: str) -> jax.Array:
+        return counts[count] / jnp.maximum(counts[total], 1.0 / num_shards)
 
     result = {"positive_share": counts["positive_share"], "filtered_share": fraction("filtered", "negative")}
     if "failure" not in counts:

@@ -95,14 +95,14 @@ class Dense(nn.Module):
         kernel = self.param("kernel", self.kernel_init, (width, self.size)).astype(self.dtype)
         total, first = self.param("bias", self.bias_init, (self.size,)).astype(self.dtype), 0
         for values in inputs:
-            parts, _, part = values.shape
-            rows = kernel[first : first + parts * part].reshape(parts, part, self.size)
+            blocks, _, block_size = values.shape
+            rows = kernel[first : first + blocks * block_size].reshape(blocks, block_size, self.size)
             values = values.astype(self.dtype)
-            if part <= _NARROW:
+            if block_size <= _NARROW:
                 total = total + jnp.sum(values[..., None] * rows[:, None], axis=(0, 2))
             else:
                 total = total + jnp.sum(product(values, rows), axis=0)
-            first += parts * part
+            first += blocks * block_size
         return total
 
 

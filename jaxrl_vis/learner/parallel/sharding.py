@@ -99,8 +99,8 @@ class Layout:
         """Convert a tree of partition specs to shardings for `jax.jit` and `jax.device_put`; None on one device."""
         if self.mesh is None:
             return None
-        place = functools.partial(NamedSharding, self.mesh)
-        return jax.tree.map(place, specs, is_leaf=lambda leaf: isinstance(leaf, Spec))
+        make_sharding = functools.partial(NamedSharding, self.mesh)
+        return jax.tree.map(make_sharding, specs, is_leaf=lambda leaf: isinstance(leaf, Spec))
 
     def spread(
         self, function: Callable, in_specs: tuple, out_specs: Any, jit: Callable, kept_as: Any = None, **options: Any
@@ -132,8 +132,8 @@ class Layout:
         if self.mesh is None:
             return shapes
 
-        def placed(sharding: NamedSharding, part: Any) -> Any:
-            return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), part)
+        def placed(sharding: NamedSharding, subtree: Any) -> Any:
+            return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), subtree)
 
         return jax.tree.map(placed, self.shardings(specs), shapes)
 
@@ -142,8 +142,8 @@ class Layout:
         if self.mesh is None:
             return tree
 
-        def placed(sharding: NamedSharding, part: Any) -> Any:
-            return jax.tree.map(lambda leaf: put_array(leaf, sharding), part)
+        def placed(sharding: NamedSharding, subtree: Any) -> Any:
+            return jax.tree.map(lambda leaf: put_array(leaf, sharding), subtree)
 
         return jax.tree.map(placed, self.shardings(specs), tree)
 

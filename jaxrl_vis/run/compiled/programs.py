@@ -155,7 +155,7 @@ class Programs:
                                 lowered = function.lower(*arguments)
                         futures[name] = pool.submit(lowered.compile)
                     self._finish(missing, concurrent_work)
-                    self._keep({name: future.result() for name, future in futures.items()})
+                    self._store({name: future.result() for name, future in futures.items()})
                 if traces is not None:
                     traces.write()
                 break
@@ -184,7 +184,7 @@ class Programs:
             to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
         concurrent_work()
 
-    def _keep(self, compiled: dict[str, Any]) -> None:
+    def _store(self, compiled: dict[str, Any]) -> None:
         """Store compiled programs, and compile the stacking of their metrics."""
         for program in compiled.values():
             if metrics := getattr(program.out_info, "metrics", None):

@@ -113,10 +113,10 @@ def is_intact(array: np.ndarray, described: list) -> bool:
     return checksum == (_row_checksum(array, axes[0]) if axes else _checksum(array))
 
 
-def _is_folded(one: Sequence[int], other: Sequence[int]) -> bool:
+def _is_folded(first: Sequence[int], second: Sequence[int]) -> bool:
     """Return True for shapes [S, rollouts, E, ...] and [S, rollouts * E, ...] of the same episodes (`sharding.Layout`)."""
-    (start, *rest), (folded_start, *fold_replay) = sorted((tuple(one), tuple(other)), key=len)
-    return len(fold_replay) >= 2 and start == folded_start and rest == [fold_replay[0] * fold_replay[1], *fold_replay[2:]]
+    (seeds, *rest), (other_seeds, *unfolded) = sorted((tuple(first), tuple(second)), key=len)
+    return len(unfolded) >= 2 and seeds == other_seeds and rest == [unfolded[0] * unfolded[1], *unfolded[2:]]
 
 
 def restore_target(shape: Sequence[int], expected: jax.ShapeDtypeStruct) -> Any:

@@ -149,9 +149,9 @@ def read_contents(path: Path) -> Contents:
     for number, line in enumerate([*lines, last], 1):
         is_last = number > len(lines)  # not terminated by a line break
         row = _read_row(line)
-        place = None if row is None else (row["iteration"], row["seed"], row.get(RUN_ID))
-        if row is not None and place is not None and place not in rows:
-            rows[place] = row
+        key = None if row is None else (row["iteration"], row["seed"], row.get(RUN_ID))
+        if row is not None and key is not None and key not in rows:
+            rows[key] = row
         elif is_last and row is None:
             torn = line.strip()
         elif line.strip():
@@ -218,8 +218,8 @@ def truncate(
     evaluated_seeds = {row["seed"] for row in rows if row["iteration"] == evaluated}
     if contents.torn and evaluated and (not evaluated_seeds or evaluated_seeds < {row["seed"] for row in rows}):
         damaged.append((path.read_bytes().count(b"\n") + 1, contents.torn))
-    _keep(aside, [line for _, line in damaged] + [json.dumps(row).encode() for row in later])
-    _keep(others, [json.dumps(row).encode() for row in foreign])
+    _append_lines(aside, [line for _, line in damaged] + [json.dumps(row).encode() for row in later])
+    _append_lines(others, [json.dumps(row).encode() for row in foreign])
     text = "".join(json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration)
     if text.encode() != path.read_bytes():
         write_atomically(path, text)
@@ -228,7 +228,7 @@ def truncate(
     return f"{path.name} held {', and '.join(findings)}; left out here" if findings else None
 
 
-def _keep(path: Path, lines: Sequence[bytes]) -> None:
+def _append_lines(path: Path, lines: Sequence[bytes]) -> None:
     if lines:
         path.parent.mkdir(parents=True, exist_ok=True)
         _append(path, b"".join(line + b"\n" for line in lines))

@@ -144,12 +144,12 @@ class Recent:
                 file.write(_bytes(array))
         self._remove_stale_files()
 
-    def _write_rollout(self, number: int, parts: Arrays) -> int:
+    def _write_rollout(self, number: int, arrays: Arrays) -> int:
         """Write the episodes of one rollout, arrays [S, E, ...] one after the other; return their checksum."""
         checksum = 0
         with _appearing(self._path(number, "rollout")) as file:
-            for part in parts.values():
-                contents = _bytes(part)
+            for array in arrays.values():
+                contents = _bytes(array)
                 checksum = zlib.crc32(contents, checksum)
                 file.write(contents)
         return checksum
@@ -271,8 +271,8 @@ class Recent:
         except OSError as error:
             raise Unusable(f"{path.name}: {error.strerror or type(error).__name__}") from None
 
-    def _path(self, iteration: int, kind: str) -> Path:
-        return self._folder / f"{iteration}.{kind}"
+    def _path(self, iteration: int, extension: str) -> Path:
+        return self._folder / f"{iteration}.{extension}"
 
 
 def foreign_names(folder: Path) -> list[str]:
@@ -283,9 +283,9 @@ def foreign_names(folder: Path) -> list[str]:
     return sorted(name for name, path in bare.items() if not (path.suffix in kinds and path.stem.isdigit()))
 
 
-def _numbers(folder: Path, kind: str) -> list[int]:
+def _numbers(folder: Path, extension: str) -> list[int]:
     try:
-        return [int(file.stem) for file in folder.iterdir() if file.suffix == f".{kind}" and file.stem.isdigit()]
+        return [int(file.stem) for file in folder.iterdir() if file.suffix == f".{extension}" and file.stem.isdigit()]
     except OSError:
         return []
 

@@ -78,7 +78,9 @@ class Session:
             state = env.advance(state, act(parameters, observation[None], aim(parameters, goal[None]))[0])
             return state, env.observe(state)
 
-        self._begin, self._look, self._step, self._place = map(jaxrl_vis_envs.jit, (begin, look, step, env.goal_configuration))
+        self._begin, self._look, self._step, self._configure_goal = map(
+            jaxrl_vis_envs.jit, (begin, look, step, env.goal_configuration)
+        )
         self.reset()
         self.sample_goal()
 
@@ -108,7 +110,7 @@ class Session:
         """
         assert self.env.goal_box is not None
         low, high = self.env.goal_box
-        self._update_goal(self._place(jnp.asarray(np.clip(point, low, high), jnp.float32)))
+        self._update_goal(self._configure_goal(jnp.asarray(np.clip(point, low, high), jnp.float32)))
 
     def _update_goal(self, goal_data: Any) -> None:
         image, goal_state = self._look(goal_data)
@@ -196,9 +198,9 @@ class Page:
     def drag(self, point: np.ndarray) -> None:
         """Request a goal at a point [3] (m, world frame); the latest request since the last step counts."""
         self._dragged = point
-        self._requests.put(self._place)
+        self._requests.put(self._move_goal)
 
-    def _place(self) -> None:
+    def _move_goal(self) -> None:
         if self._dragged is not None:
             point, self._dragged, self._is_dragging = self._dragged, None, True
             self._session.place_goal(point)

@@ -91,16 +91,16 @@ class Policy:
     def _check(self, name: str, value: Any) -> None:
         """Raise a RequestError unless ``value`` has the shape and dtype of an observation."""
         spec = self.observation_spec
-        shape, wanted = np.shape(value), tuple(spec.shape)
-        if shape != wanted:
+        shape, expected = np.shape(value), tuple(spec.shape)
+        if shape != expected:
             hint = ""
-            if shape[1:] == wanted:
+            if shape[1:] == expected:
                 hint = ": jax.vmap(policy) takes a batch"
-            elif len(wanted) == 3 and shape == (*wanted[1:], wanted[0]):
+            elif len(expected) == 3 and shape == (*expected[1:], expected[0]):
                 hint = f": images are planar here, so move the channels first, np.moveaxis({name}, -1, 0)"
-            elif len(wanted) == 3 and name == "goal" and shape == (wanted[0] // self.env.frame_stack, *wanted[1:]):
+            elif len(expected) == 3 and name == "goal" and shape == (expected[0] // self.env.frame_stack, *expected[1:]):
                 hint = f": repeat the goal's image {self.env.frame_stack} times, as policy.env.as_goal does"
-            raise RequestError(f"{self.env_name}: {name} must have the shape {wanted}, not {shape}{hint}")
+            raise RequestError(f"{self.env_name}: {name} must have the shape {expected}, not {shape}{hint}")
         dtype = np.dtype(getattr(value, "dtype", None) or np.asarray(value).dtype)
         if spec.dtype == jnp.uint8:
             if dtype != np.uint8:

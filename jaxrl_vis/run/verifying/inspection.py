@@ -120,11 +120,11 @@ def _fault(row: Mapping[str, Any], expected: RowConditions) -> str:
 
 
 def _check_order(name: str, rows: Sequence[Mapping[str, Any]], expected: RowConditions, findings: Findings) -> None:
-    places = [(row["iteration"], row["seed"]) for row in rows]
-    twice = sorted(place for place, count in collections.Counter(places).items() if count > 1)
+    keys = [(row["iteration"], row["seed"]) for row in rows]
+    twice = sorted(key for key, count in collections.Counter(keys).items() if count > 1)
     for iteration, seed in twice:
         findings.problems.append(f"{name}: iteration {iteration}, seed {seed} occurs more than once")
-    unique = list(dict.fromkeys(places))
+    unique = list(dict.fromkeys(keys))
     if unique != sorted(unique):
         first = next(after for before, after in zip(unique, unique[1:], strict=False) if after < before)
         findings.problems.append(f"{name}: iteration {first[0]}, seed {first[1]} is out of order")

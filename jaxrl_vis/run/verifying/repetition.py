@@ -244,11 +244,11 @@ def _comparable_values(row: Mapping[str, Any]) -> Row:
     return {name: value for name, value in row.items() if not name.startswith(NOT_REPEATED)}
 
 
-def _differences(row: Mapping[str, Any], made: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the name, the value of ``row`` and that of ``made``, for values that differ as JSON text."""
+def _differences(row: Mapping[str, Any], repeated: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name, the value of ``row`` and that of ``repeated``, for values that differ as JSON text."""
     compared = _comparable_values(row)
-    for name in dict.fromkeys([*compared, *made]):
-        value, again = compared.get(name, "nothing"), made.get(name, "nothing")
+    for name in dict.fromkeys([*compared, *repeated]):
+        value, again = compared.get(name, "nothing"), repeated.get(name, "nothing")
         if json.dumps(value) != json.dumps(again):
             yield name, value, again
 

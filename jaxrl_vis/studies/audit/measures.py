@@ -31,8 +31,8 @@ def error_shares(reward: np.ndarray, is_reached: np.ndarray) -> tuple[float, flo
         Both fractions; NaN if there is no such pair.
     """
     positive = reward >= 0.5
-    parts = positive[~is_reached], ~positive[is_reached]
-    false_positive, false_negative = (float(np.mean(part)) if part.size else float("nan") for part in parts)
+    errors = positive[~is_reached], ~positive[is_reached]
+    false_positive, false_negative = (float(np.mean(flags)) if flags.size else float("nan") for flags in errors)
     return false_positive, false_negative
 
 

@@ -168,10 +168,10 @@ class _Grid:
     def _start(self, cell: Cell, device: Device) -> None:
         folder, log = self._runs / cell.name, self._runs / f"{cell.name}.log"
         words = self._command(cell, folder, RunFolder(folder).config.exists())
-        place = f"[{self._total - len(self._waiting)}/{self._total}] {cell.name}"
+        label = f"[{self._total - len(self._waiting)}/{self._total}] {cell.name}"
         process = self._start_command(words, log, device.environment)
         self._running.append(_Running(cell, device, process, log, time.monotonic()))
-        self._echo(f"{place}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
+        self._echo(f"{label}: {'resumes' if '--resume' in words else 'starts'} on {device.name}")
 
     def _end(self, done: _Running) -> None:
         self._running.remove(done)

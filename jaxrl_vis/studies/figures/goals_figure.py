@@ -39,8 +39,8 @@ def _curves(lines: Mapping[tuple[str, str], Line], task: str, by_seconds: bool =
     for (of_task, variant), line in lines.items():
         if of_task == task:
             steps, values = line.values(SUCCESS)
-            places = np.array([_seconds(line, count) for count in steps]) if by_seconds else steps
-            curves.append(Curve(VARIANTS[variant].label, VARIANTS[variant].colour, places, values))
+            positions = np.array([_seconds(line, count) for count in steps]) if by_seconds else steps
+            curves.append(Curve(VARIANTS[variant].label, VARIANTS[variant].colour, positions, values))
     return curves
 
 

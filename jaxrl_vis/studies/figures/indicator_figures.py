@@ -140,12 +140,12 @@ def _oracle_notes(lines: Mapping[tuple[str, str], Line]) -> list[str]:
     notes = []
     for (task, variant), line in lines.items():
         if variant == "oracle" and task in _ORACLE_WORKS:
-            metric, wanted = _ORACLE_WORKS[task]
+            metric, required = _ORACLE_WORKS[task]
             _, median, _ = final_quartiles(line, metric)
-            if median < wanted if metric == SUCCESS else median > wanted:
+            if median < required if metric == SUCCESS else median > required:
                 quantity, bound = ("success", "at least") if metric == SUCCESS else ("final distance", "at most")
                 notes.append(
-                    f"{task}: the oracle itself ends at a {quantity} of {median:.3f}, where {bound} {wanted:g} is asked for: "
+                    f"{task}: the oracle itself ends at a {quantity} of {median:.3f}, where {bound} {required:g} is asked for: "
                     "this comparison of methods does not count."
                 )
     return notes

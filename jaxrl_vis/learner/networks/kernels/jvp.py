@@ -73,10 +73,10 @@ def apply_forwards(patches: jax.Array, weights: Weights, first: int, count: int,
 @apply_forwards.defjvp
 def _apply_along(first: int, count: int, interpret: bool, primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     patches, weights = primals
-    place = {"first": first, "count": count}
-    on_gpu = functools.partial(_gpu_jvp, **place, interpret=interpret)
-    plainly = functools.partial(_plain_jvp, **place)
-    return dispatch(on_gpu, plainly, patches, weights, tangents[1], interpret=interpret)
+    rows = {"first": first, "count": count}
+    on_gpu = functools.partial(_gpu_jvp, **rows, interpret=interpret)
+    plain = functools.partial(_plain_jvp, **rows)
+    return dispatch(on_gpu, plain, patches, weights, tangents[1], interpret=interpret)
 
 
 def _gpu_jvp(
