@@ -148,11 +148,15 @@ class Layout:
         return jax.tree.map(placed, self.shardings(specs), tree)
 
     def fold_replay(self, replay: ReplayState, num_envs: int) -> ReplayState:
-        """Return one device's part of a learner's replay in its form between two iterations.
+        """Return one device's part of a learner's replay in the form in which it is stored between two iterations.
 
         Args:
             replay: Replay of one learner, [rollouts * E, ...].
             num_envs: E, number of environments in this part.
+
+        Returns:
+            The replay with episodes [rollouts, E, ...] and the size of the whole learner's replay; unchanged if a learner has a
+            single device.
         """
         count = self.shards.count
         if count == 1:

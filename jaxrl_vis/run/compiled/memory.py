@@ -172,8 +172,7 @@ def check_compiled(programs: dict[str, Any], is_allocated: bool, layout: Layout 
 def fit_together(programs: dict[str, Any], is_allocated: bool, layout: Layout = ONE_DEVICE) -> bool:
     """Return True if all programs fit into memory at once, so that one may be launched while another still runs.
 
-    Also if the free memory is unknown.
-
+    The result is True, too, if the free memory is unknown.
 
     Args:
         programs, is_allocated, layout: As in `check_compiled`.

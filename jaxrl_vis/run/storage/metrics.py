@@ -70,7 +70,6 @@ def with_precision(metrics: PerSeed) -> PerSeed:
 
     Without statistics of a filter, ``metrics`` are returned unchanged.
 
-
     This is a ratio of means, not a mean of ratios: the fraction among all dropped samples.
     """
     if "train/filtered_false_share" not in metrics:
