@@ -113,9 +113,9 @@ class Timed:
     def compile(self) -> None:
         """Compile the programs, or load them from the compilation cache."""
         self.programs.compiled("init")
-        self.programs.of_training()
+        self.programs.training_programs()
         if self.evaluates:
-            self.programs.of_evaluation()
+            self.programs.evaluation_programs()
 
 
 def compile_all(everything: list[Timed]) -> float:

@@ -67,7 +67,7 @@ def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None =
             policy.seed,
             {policy.seed: score_float16},
             policy.env.distance_unit,
-            name_here=name,
+            shipped_name=name,
             remark=remark,
         )
         write_atomically(folder / "README.md", text)

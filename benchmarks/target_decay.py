@@ -14,7 +14,7 @@ from benchmarks.ledger.markers import WIDTH
 from benchmarks.ledger.records import RESULTS
 from jaxrl_vis.config import config_from_dict
 from jaxrl_vis.report.learning import curve, steps_to
-from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.run.storage.folder import read_record
 from jaxrl_vis.run.storage.metrics import read_rows
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
@@ -87,7 +87,7 @@ def _read_group(decay: float, folders: list[Path]) -> Group:
 def steps_cell(group: Group, level: float) -> str:
     """Format the environment steps to a level, or the budget within which it was not reached."""
     steps = steps_to(group.points, level)
-    return f"> {show_steps(group.points[-1][0])}" if steps is None else show_steps(steps)
+    return f"> {format_steps(group.points[-1][0])}" if steps is None else format_steps(steps)
 
 
 def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[str]:
@@ -96,7 +96,7 @@ def task_table(task: str, groups: dict[tuple[str, str, float], Group]) -> list[s
     theirs = released_curves()
     lines = [
         f"| {title} | decay | seeds | {' | '.join(f'steps to {level:g}' for level in levels)} | mean success to "
-        f"{show_steps(budget)}, IQM (95 %) | distance to the authors' curve |",
+        f"{format_steps(budget)}, IQM (95 %) | distance to the authors' curve |",
         "|---|---|---|" + "---|" * len(levels) + "---|---|",
     ]
     for variant, label in VARIANTS.items():

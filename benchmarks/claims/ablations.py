@@ -289,7 +289,7 @@ def _options() -> str:
     ]
     budgets = {record: budget for _, _, record, budget in settings}
     rows = [
-        Row(f"{task}, to {c.show_steps(budget)}" if task else "", record, [setting])
+        Row(f"{task}, to {c.format_steps(budget)}" if task else "", record, [setting])
         for task, setting, record, budget in settings
     ]
     mean = c.Column("mean success, IQM (95 %)", lambda record: c.interval(record.means(budgets[record])))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.claims.records import DISTANCE, SUCCESS, Record
-from jaxrl_vis.report.plots import show_steps
+from jaxrl_vis.report.plots import format_steps
 from jaxrl_vis.studies.figures.authors import mean_difference, released_curves
 from jaxrl_vis.studies.seed_statistics import bootstrap_interval, interquartile_mean, permutation_p_value
 
@@ -67,7 +67,7 @@ def speed_up(record: Record, reference: Record, level: float) -> str:
 def steps_cell(record: Record, level: float) -> str:
     """Format the environment steps to a level, or the budget within which it was not reached."""
     steps = record.steps_to(level)
-    return f"> {show_steps(record.points[-1][0])}" if steps is None else show_steps(steps)
+    return f"> {format_steps(record.points[-1][0])}" if steps is None else format_steps(steps)
 
 
 def _source(record: Record) -> str:
@@ -115,7 +115,7 @@ def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = N
         values = record.at(steps, metric)
         return "" if values is None else f"{np.median(values):.{digits}f}"
 
-    return Column(title or show_steps(steps), cell)
+    return Column(title or format_steps(steps), cell)
 
 
 def of_seeds(steps: int, digits: int = 2) -> Column:
@@ -125,7 +125,7 @@ def of_seeds(steps: int, digits: int = 2) -> Column:
         values = record.at(steps)
         return "" if values is None else ", ".join(f"{value:.{digits}f}" for value in values)
 
-    return Column(show_steps(steps), cell)
+    return Column(format_steps(steps), cell)
 
 
 def min_success(steps: int) -> Column:
@@ -135,7 +135,7 @@ def min_success(steps: int) -> Column:
         values = record.at(steps)
         return "" if values is None else f"{values.min():.2f}"
 
-    return Column(f"least at {show_steps(steps)}", cell)
+    return Column(f"least at {format_steps(steps)}", cell)
 
 
 def mean_at(steps: int) -> Column:
@@ -145,7 +145,7 @@ def mean_at(steps: int) -> Column:
         values = record.at(steps)
         return "" if values is None else f"{values.mean():.2f}"
 
-    return Column(show_steps(steps), cell)
+    return Column(format_steps(steps), cell)
 
 
 def success_at(steps: int) -> Column:
@@ -155,7 +155,7 @@ def success_at(steps: int) -> Column:
         values = record.at(steps)
         return "" if values is None else band(values)
 
-    return Column(f"success at {show_steps(steps)}", cell)
+    return Column(f"success at {format_steps(steps)}", cell)
 
 
 def final(metric: str = SUCCESS, title: str = "success at the end", digits: int = 3) -> Column:
@@ -190,7 +190,7 @@ def training_mean(metric: str, title: str, digits: int = 3) -> Column:
 
 def mean_success(budget: int | None = None) -> Column:
     """Return the column of the interquartile mean over seeds of the mean success up to a budget, with bootstrap interval."""
-    title = f"mean success to {show_steps(budget)}" if budget else "mean success over training"
+    title = f"mean success to {format_steps(budget)}" if budget else "mean success over training"
     return Column(f"{title}, IQM (95 %)", lambda record: _of_seeds(record, lambda: interval(record.means(budget))))
 
 

@@ -85,7 +85,7 @@ def rank_correlation(task: str) -> float:
 def _weights() -> str:
     tasks = {run(task, "ol_aux_5"): task for task in (FETCH, HAND, FINGER)}
     correlation = c.Column("rank correlation with the gain alone", lambda record: f"{rank_correlation(tasks[record]):+.1f}")
-    rows = [Row(f"{task}, to {c.show_steps(record.points[-1][0])}", record) for record, task in tasks.items()]
+    rows = [Row(f"{task}, to {c.format_steps(record.points[-1][0])}", record) for record, task in tasks.items()]
     return table(["mean weight over training"], rows, [*c.weights(AUX_TASKS), correlation])
 
 
@@ -135,7 +135,7 @@ def _gaps() -> str:
     rows = [Row(label, record) for label, record in [*hand, *finger]]
     at_end = {id(record): 600_000 for _, record in hand} | {id(record): 1_400_000 for _, record in finger}
     success = c.Column("success", lambda record: f"{record.median(at_end[id(record)]):.2f}")
-    steps = c.Column("environment steps", lambda record: c.show_steps(at_end[id(record)]))
+    steps = c.Column("environment steps", lambda record: c.format_steps(at_end[id(record)]))
     return table(["undone"], rows, [c.seeds(), steps, success, c.names()])
 
 
@@ -161,7 +161,7 @@ def _main() -> str:
             record = claim(task, variant)
             base[record] = (claim(task, "none"), BUDGETS[task])
             label = f"{LABELS[variant]} alone" if variant in AUX_TASKS else LABELS[variant]
-            rows.append(Row(f"{task}, to {c.show_steps(BUDGETS[task])}" if variant == "none" else "", record, [label]))
+            rows.append(Row(f"{task}, to {c.format_steps(BUDGETS[task])}" if variant == "none" else "", record, [label]))
 
     def p_cell(record: Record) -> str:
         reference, budget = base[record]

@@ -83,7 +83,7 @@ class Claim:
 def _ol_aux(first: str, second: str, tasks: Mapping[str, int]) -> list[Comparison]:
     return [
         Comparison(
-            f"{SHORT[task]} to {c.show_steps(budget)}",
+            f"{SHORT[task]} to {c.format_steps(budget)}",
             ol_aux.claim(task, first, budget),
             ol_aux.claim(task, second, budget),
             budget,
@@ -161,7 +161,7 @@ def _speed_ups() -> Claim:
     for task, label in words.items():
         budget = ol_aux.BUDGETS[task]
         pair = (with_decay(task, "ol_aux_5", 0.95), with_decay(task, "none", 0.95))
-        comparisons.append(Comparison(f"{label} at 0.95, to {c.show_steps(budget)}", *pair, budget))
+        comparisons.append(Comparison(f"{label} at 0.95, to {c.format_steps(budget)}", *pair, budget))
     return Claim(
         "OL-AUX-5 needs 2 times fewer steps on Fetch, about 3 times fewer on hand and finger",
         _answer(comparisons),
@@ -177,7 +177,7 @@ def _single_tasks() -> Claim:
     for task, budget in ol_aux.BUDGETS.items():
         records = {name: ol_aux.claim(task, name) for name in AUX_TASKS}
         best = max(records, key=lambda name: records[name].means(budget).mean())
-        place = f"{SHORT[task]} to {c.show_steps(budget)} (best: {best.replace('_', ' ')})"
+        place = f"{SHORT[task]} to {c.format_steps(budget)} (best: {best.replace('_', ' ')})"
         comparisons.append(Comparison(place, ol_aux.claim(task, "ol_aux_5"), records[best], budget))
     return _comparison_rows(
         "OL-AUX-5 is always better than, or level with, the best single task",
@@ -191,7 +191,7 @@ def _best_single_task() -> Claim:
     budget, label = ol_aux.BUDGETS[HAND], "inverse_dynamics"
     others = {name: ol_aux.claim(HAND, name) for name in AUX_TASKS if name != label}
     second = max(others, key=lambda name: others[name].means(budget).mean())
-    place = f"hand to {c.show_steps(budget)}, against the second best ({second.replace('_', ' ')})"
+    place = f"hand to {c.format_steps(budget)}, against the second best ({second.replace('_', ' ')})"
     comparison = Comparison(place, ol_aux.claim(HAND, label), others[second], budget)
     return _comparison_rows("Inverse dynamics is the best single task on the hand", [comparison], f"[5.5]({_LAB}#figure-55)")
 

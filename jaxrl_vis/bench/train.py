@@ -50,7 +50,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
     """
     loop = programs.program.init(seed_keys(programs.program, 0))
     start = time.perf_counter()
-    programs.of_training()
+    programs.training_programs()
     compile_s = time.perf_counter() - start
     loop, waiting = programs.train_iteration(loop)
     pending = programs.pending(waiting)

@@ -69,12 +69,12 @@ def overview(group: str = "") -> str:
     return "\n".join([*lines, "", f"`{PROGRAM} COMMAND --help` lists the options of a command."])
 
 
-def main(words: Sequence[str] | None = None, should_stop: Callable[[int], None] | None = None) -> int:
+def main(words: Sequence[str] | None = None, force_exit: Callable[[int], None] | None = None) -> int:
     """Run one command. Output errors do not end it, and signals end it in order.
 
     Args:
         words: The command line without the program's name; None: that of this process.
-        should_stop: See `Ending`.
+        force_exit: See `Ending`.
 
     Returns:
         The exit status.
@@ -83,7 +83,7 @@ def main(words: Sequence[str] | None = None, should_stop: Callable[[int], None] 
         SystemExit: A command's help was printed.
     """
     words = sys.argv[1:] if words is None else words
-    with safe_streams() as printed, Ending(should_stop) as ending:
+    with safe_streams() as printed, Ending(force_exit) as ending:
         try:
             status = _run_with_status(words, ending)
         except SystemExit as end:
@@ -147,7 +147,7 @@ def entry() -> None:
     second signal, are not waited for.
     """
     reserve_standard_files()
-    status = main(should_stop=lambda number: os._exit(_ended_by(number)))
+    status = main(force_exit=lambda number: os._exit(_ended_by(number)))
     detach_broken_streams()
     if status == _STATUS[RequestError]:
         distributed.leave_together()

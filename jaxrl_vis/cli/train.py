@@ -16,7 +16,7 @@ from jaxrl_vis.host.plugins import own_names
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.loggers import group
 from jaxrl_vis.run.loggers.group import LoggerName
-from jaxrl_vis.run.storage.folder import check_there, default_folder, read_config
+from jaxrl_vis.run.storage.folder import check_resumable, default_folder, read_config
 
 
 def describe_default(name: str) -> str:
@@ -153,7 +153,7 @@ def run(options: Train) -> int:
         raise RequestError("--resume and --overwrite contradict each other; give one of them")
     group.check(options.log)
     if options.run_dir is not None:
-        check_there(options.run_dir, options.resume)
+        check_resumable(options.run_dir, options.resume)
     if options.env is not None:
         check_env(options.env, options.changes.get("env_folder"))
     config = validate(training_config(options))
@@ -161,7 +161,7 @@ def run(options: Train) -> int:
         streams.echo("\n".join(config_lines(config, set(options.changes))))
         return 0
     run_dir = options.run_dir or default_folder(config)
-    check_there(run_dir, options.resume)
+    check_resumable(run_dir, options.resume)
     if options.resume and "env_folder" not in options.changes and (run_dir / "config.json").exists():
         named = {options.env, *(word for value in options.changes.values() for word in _words(value))}
         if set(own_names(config).values()) - named:

@@ -19,7 +19,7 @@ def own_names(config: Config) -> dict[str, str]:
     """Return the custom parts ``module:Name`` of a configuration, by their role: task, algorithm, aux_tasks 1, ..."""
     names = {"task": config.environment.env}
     for field, hint in fields.hints(Config).items():
-        if not fields.is_name_or_parts(hint):
+        if not fields.names_components(hint):
             continue
         value = config.value(field)
         names |= (

@@ -117,7 +117,7 @@ def test_a_kernel_that_does_not_compile_is_left_out_and_named_once(gpu, monkeypa
 def run_of(function) -> Programs:
     """A run of which ``init`` is a function of keys, and nothing else is there."""
     programs = Programs(
-        preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, part_size=1, plays_any=False, init=jax.jit(function))
+        preset("debug"), SimpleNamespace(env=None, layout=ONE_DEVICE, part_size=1, plays_parts=False, init=jax.jit(function))
     )
     programs.shapes = SimpleNamespace(train=None)  # type: ignore[assignment]
     return programs

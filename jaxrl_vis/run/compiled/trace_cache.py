@@ -155,7 +155,10 @@ class TraceCache:
         return hashlib.sha256(self._path(name).name.encode() + b"\0" + data).digest()
 
     def _is_private(self) -> bool:
-        """Return True if the folder is private to this user; first revoke the permissions of others if this user owns it."""
+        """Return True if the folder is private to this user; first revoke the permissions of others if this user owns it.
+
+        If not, print the reason to stderr, once per process.
+        """
         try:
             status = self._folder.stat()
             if stranger_to(status) is not None:
