@@ -1,4 +1,4 @@
-"""README table of five figures compared with alternative software, written from the records."""
+"""README table of figures compared with alternative software, written from the records."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -40,6 +40,7 @@ class Rate:
 
 
 _IMAGE = {"image_size": 64, "pixels": "rgbd"}
+_LABELLED = {"image_size": 64, "pixels": "rgbds"}
 
 RATES = (
     Rate(
@@ -49,6 +50,15 @@ RATES = (
     Rate(
         "Images of MuJoCo Warp's own scene of 127 geoms, likewise",
         *("render/scene", "render/peer_warp", {"scene": "primitives", **_IMAGE}, "H200", "images", "MuJoCo Warp"),
+    ),
+    Rate(
+        "Images of a Fetch arm with its own meshes, 64x64 RGB-D and labels, on an H100",
+        *("render/scene", "render/peer_warp", {"scene": "fetch_mesh", **_LABELLED}, "H100", "images", "MuJoCo Warp"),
+    ),
+    Rate(
+        "Images of 500 meshes with shadows, likewise",
+        *("render/scene", "render/peer_warp", {"scene": "clutter", "shadows": True, **_LABELLED}, "H100", "images"),
+        "MuJoCo Warp",
     ),
     Rate(
         "Images of VisualFetchReach on two CPU cores",
