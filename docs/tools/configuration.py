@@ -1,4 +1,4 @@
-"""Writes the tables of docs/configuration.md from `jaxrl_vis.config`; a test fails where the page is not what this writes.
+"""Write the tables of docs/configuration.md from `jaxrl_vis.config`; a test fails if the page is out of date.
 
 python docs/tools/configuration.py
 """
@@ -21,14 +21,14 @@ def _shown(value: object) -> str:
 
 
 def _default(name: str) -> str:
-    """Format the value of ``fast``, and after it those of presets that differ."""
+    """Format the value of an option in the preset ``fast``, followed by those of presets that differ."""
     values = {preset: config.value(name) for preset, config in PRESETS.items()}
     others = [f"{preset}: {_shown(value)}" for preset, value in values.items() if value not in (values["fast"], preset)]
     return "<br>".join([f"**{_shown(values['fast'])}**", *others])
 
 
 def table() -> str:
-    """Return the tables of all options, group by group."""
+    """Return the tables of all options in Markdown, group by group."""
     lines: list[str] = []
     group = ""
     for field, text in describe_options(Config):
@@ -44,7 +44,7 @@ def table() -> str:
 
 
 def of_tasks() -> str:
-    """Return the table of the values that presets have otherwise for some tasks."""
+    """Return the table of the task-specific values of presets, in Markdown."""
     lines = [
         "## Task-specific values of presets",
         "",
@@ -69,7 +69,7 @@ def of_tasks() -> str:
 
 
 def page(text: str) -> str:
-    """Return the page with its tables as they are to be."""
+    """Return the text of the page with up-to-date tables."""
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(LAST)
     return f"{before}{BEGIN}{table()}{END}\n{of_tasks()}{LAST}{after}"

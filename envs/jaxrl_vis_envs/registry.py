@@ -37,7 +37,7 @@ _ENTRIES: dict[str, _Entry] = {}
 
 
 class UnknownEnvironmentError(ValueError):
-    """Error for an environment name that does not exist."""
+    """Error for a name that is not, or not uniquely, that of a complete environment."""
 
 
 class UnknownOverrideError(ValueError):
@@ -168,7 +168,8 @@ def make(name: str, **overrides: Any) -> GoalEnv:
         UnknownEnvironmentError: There is no such environment; the message suggests the nearest names.
         UnknownOverrideError: There is no such field; the message suggests the nearest names.
         TaskModuleError: Its module cannot be imported, or the environment cannot be built.
-        ValueError: A field's value is out of range, or JAX runs in 64 bits and the environment does not support it.
+        ValueError: A field's value is out of range, the environment lacks an attribute or a method has the wrong parameters, or
+            JAX runs in 64 bits and the environment does not support it.
     """
     entry = _entry(name)
     fields = [field.name for field in dataclasses.fields(entry.config_class)]

@@ -67,6 +67,9 @@ def load(module: str, folder: str | None = None, installed: bool = False) -> Mod
         folder: Folder from which it was imported earlier; it may no longer exist. None if unknown.
         installed: Search only Python's path.
 
+    Returns:
+        The module, imported already if it was loaded before.
+
     Raises:
         TaskModuleError: The module is missing or cannot be imported, or another one of the same name is already loaded.
     """
@@ -113,7 +116,7 @@ def import_folder(module: ModuleType) -> str | None:
 
 
 def blame(error: BaseException, file: str | None) -> str:
-    """Describe an error in user code in one line: its type, its message, and the line of ``file`` that caused it."""
+    """Describe an error in user code in one line: its type, its message, and the line of ``file``, if any, that caused it."""
     if isinstance(error, SyntaxError):
         return f"{type(error).__name__}: {error.msg} ({Path(error.filename or '?').name}, line {error.lineno})"
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]

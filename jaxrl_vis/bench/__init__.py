@@ -23,7 +23,7 @@ BENCHMARKS = ("render", "physics", "env", "update", "train")
 
 
 def run(benchmark: str, results: Path | None = None, json: Path | None = None, **settings: Any) -> list[Measurement]:
-    """Run one benchmark; print and store its records.
+    """Run one benchmark; print and store its records, and return its measurements.
 
     Args:
         benchmark: One of `BENCHMARKS`.
@@ -45,7 +45,7 @@ def keep_records(
     results: Path | None = None,
     json: Path | None = None,
 ) -> list[Measurement]:
-    """Run ``measure`` while monitoring `conditions`; print and store a record of every measurement that it yields.
+    """Run ``measure`` while monitoring `conditions`; print, store and return every measurement that it yields.
 
     Args:
         benchmark: Name in the file of records.

@@ -24,7 +24,12 @@ def start_states(env: GoalEnv, count: int) -> State:
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield environment steps per second for each batch size."""
+    """Yield environment steps per second for each batch size.
+
+    Raises:
+        AssertionError: Environments behave alike.
+        FloatingPointError: A final state is not finite.
+    """
     env = settings.make_env()
     steps = env.horizon if settings.on_accelerator else 10
     counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)

@@ -28,7 +28,11 @@ _STEPS = 5  # random control steps from the common start, after which no two rob
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield images per second for each size, output and batch: of the scene if one is set, else of the environment."""
+    """Yield images per second for each size, output and batch: of the scene if one is set, else of the environment.
+
+    Raises:
+        RequestError: The environment does not observe images, or as in `scenes.models.load`.
+    """
     if settings.scene is not None:
         yield from scene_images.measure(settings, image_sizes(settings))
         return
@@ -64,7 +68,7 @@ def image_sizes(settings: Settings) -> tuple[int, ...]:
 
 
 def poses(settings: Settings, count: int, seed: int = 4) -> Any:
-    """Create states of ``count`` environments in different poses."""
+    """Create states of ``count`` environments after five random control steps, without images."""
     env = settings.make_env()
 
     def scatter(state: Any, key: jax.Array) -> Any:

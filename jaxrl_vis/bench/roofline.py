@@ -98,7 +98,7 @@ def _bytes(tree: Any) -> int:
 
 
 def describe(cost: Cost, seconds: float, dtype: str, device_kind: str) -> dict[str, Any]:
-    """Return the achieved TFLOP/s and GB/s, with their fractions of the device's peak if that is known."""
+    """Return operations, memory traffic and the achieved TFLOP/s and GB/s, with fractions of the device's peak if known."""
     achieved = {
         "gflop": round(cost.flops / 1e9, 3),
         "mbyte": round(cost.bytes / 1e6, 3),

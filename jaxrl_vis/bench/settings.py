@@ -48,7 +48,7 @@ class Settings:
     on_accelerator: bool = False
 
     def for_this_device(self) -> Self:
-        """Fill in the defaults that depend on the device alone; each benchmark fills in its own sizes."""
+        """Return a copy with the defaults that depend on the device alone; each benchmark fills in its own sizes."""
         accelerator = jax.default_backend() != "cpu"
         return dataclasses.replace(
             self,

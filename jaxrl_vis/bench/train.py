@@ -42,8 +42,8 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
         repeats: Maximum number of timed repeats.
 
     Returns:
-        The trained state; the timing of an iteration whose metrics the host reads during the next one; and the seconds of
-        ``compile`` (compilation) and ``host`` (reading metrics).
+        The training state after these iterations; the timing of an iteration whose metrics the host reads during the next one;
+        and the seconds of ``compile`` (compilation) and ``host`` (reading metrics).
 
     Raises:
         FloatingPointError: A metric is not finite.
@@ -74,7 +74,7 @@ def time_iterations(programs: Programs, repeats: int) -> tuple[LoopState, Timing
 
 
 def _wait_for_result(program: TrainStep, call: Callable[[], Any]) -> Callable[[], Any]:
-    """Wrap a call to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
+    """Return ``call``, wrapped to wait for its result if several devices share a CPU's threads: two calls could deadlock."""
     if program.layout.num_devices == 1 or jax.default_backend() != "cpu":
         return call
     return lambda: jax.block_until_ready(call())
@@ -149,7 +149,7 @@ def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
 
 
 def measure(settings: Settings) -> Iterator[Measurement]:
-    """Yield the total environment steps and gradient steps per second of all seeds."""
+    """Yield the total environment steps and gradient steps per second of all seeds; print the time of each part."""
     env = settings.make_env()
     for count in settings.counts((0,), (0,)):  # 0: the preset's number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))

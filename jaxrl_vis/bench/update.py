@@ -64,7 +64,11 @@ def start(program: TrainStep) -> LoopState:
 
 
 def time_updates(program: TrainStep, loop: LoopState, repeats: int) -> tuple[Timing, float]:
-    """Time one call of ``update_many``, which donates ``loop``; return the timing and the seconds of compilation."""
+    """Time one call of ``update_many``, which donates ``loop.train``; return the timing and the seconds of compilation.
+
+    Raises:
+        AssertionError: The parameters of the actor did not change.
+    """
     keys = seed_keys(program, 2)
     compiled, compile_s = compile_timed(program.update_many, loop.train, loop.replay, keys, loop.iteration)
     train = loop.train

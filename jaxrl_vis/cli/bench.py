@@ -44,7 +44,7 @@ class Bench:
     data_devices: int | None = None
     """Number of devices that share each learner; all of them if there is one seed, else one (train)."""
     repeats: int = 5
-    """Timed repeats; the median counts."""
+    """Maximum number of timed repeats; the median is reported."""
     aux_tasks: tuple[AuxTaskName, ...] = ()
     """Auxiliary tasks in the gradient steps (update, train)."""
     weighting: WeightingName = "none"

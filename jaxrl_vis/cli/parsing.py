@@ -202,7 +202,7 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
 def _split(
     command: type, program: str, words: Sequence[str], options: dict[str, _Option]
 ) -> tuple[dict[str, Any], Sequence[str]]:
-    """Split arguments into the words of each given option (or True and False for flags), and the words of none."""
+    """Split arguments into the words of each given option (True or False for flags) and the remaining words."""
     # A dictionary with optional keys: tyro omits options that were not given.
     annotations = {name: option.annotation() for name, option in options.items()}
     form: Any = typing.TypedDict(command.__name__, annotations, total=False)  # pyright: ignore[reportArgumentType]

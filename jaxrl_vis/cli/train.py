@@ -32,7 +32,7 @@ def describe_default(name: str) -> str:
 
 
 def _auto(on_accelerator: bool) -> str:
-    """Return the preset for the hardware."""
+    """Return the preset that ``auto`` stands for."""
     return "fast" if on_accelerator else "cpu"
 
 
@@ -142,7 +142,7 @@ def _words(value: Any) -> tuple[Any, ...]:
 
 
 def run(options: Train) -> int:
-    """Train; reports are shown and saved by the trainer."""
+    """Train, or with ``show_config`` print the configuration; the trainer prints and saves its reports."""
     check_counts(start_timeout=options.start_timeout)
     claim_memory()
     rank = distributed.find_rank(options.coordinator, options.num_processes, options.process_id)

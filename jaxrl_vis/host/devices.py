@@ -56,7 +56,7 @@ def check_devices() -> None:
     """Initialise JAX's devices and report errors of its configuration.
 
     Raises:
-        RequestError: JAX_PLATFORMS names a platform that is not available, or compilation is disabled.
+        RequestError: JAX finds no device, JAX_PLATFORMS names a platform that is not available, or compilation is disabled.
     """
     import jax
 
@@ -82,7 +82,8 @@ def enable_compilation_cache() -> str:
     """Enable JAX's persistent compilation cache, so that later starts take seconds.
 
     A folder that is already configured (JAX_COMPILATION_CACHE_DIR, or jax.config) is kept; otherwise it is ``jaxrl-vis/xla`` in
-    the user's cache folder, if that can be created. `cache_fault` reports problems with it.
+    the user's cache folder, if that can be created. `cache_fault` reports problems with it. Programs that take at least 0.3 s
+    to compile are cached, unless JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS is set.
 
     Returns:
         The folder; empty if there is none.
@@ -211,7 +212,7 @@ def list_devices() -> list[Device]:
 
 
 def shared(devices: Sequence[Device], processes: int) -> list[Device]:
-    """Repeat every device for a number of parallel processes, and divide GPU memory among them."""
+    """Return every device once per parallel process, with GPU memory divided among the processes of a device."""
     if processes == 1:
         return list(devices)
     share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{_MAX_MEMORY / processes:.3f}"}
@@ -235,7 +236,7 @@ def _exists(files: tuple[str, ...]) -> bool:
 
 
 def _default_platform(requested: str) -> str:
-    """Return the platform that JAX chooses without JAX_PLATFORMS, such as ``cpu``. The setting is restored."""
+    """Return the platform that JAX chooses without JAX_PLATFORMS, such as ``cpu``, or ``nothing``. The setting is restored."""
     import jax
     from jax.extend.backend import clear_backends
 

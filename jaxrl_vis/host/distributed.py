@@ -84,10 +84,10 @@ def start(rank: Rank, seconds: int = START_S) -> None:
 
     Args:
         rank: From `find_rank`.
-        seconds: Timeout.
+        seconds: Timeout, s.
 
     Raises:
-        RequestError: They were not found in time.
+        RequestError: The other processes were not found in time, or JAX cannot connect to them.
     """
     import jax
 

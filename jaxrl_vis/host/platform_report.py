@@ -49,14 +49,14 @@ class Training:
     """Smoke test: a complete training run of the smallest preset with images.
 
     Attributes:
-        figures: Results of the last run: ``task``, ``preset``, ``env_steps``, ``env_steps_per_s`` (without compilation) and
-            ``wall_s``.
+        figures: Results of the last run: ``task``, ``env_steps``, ``env_steps_per_s`` (without compilation) and ``wall_s``;
+            None before it.
     """
 
     figures: dict[str, Any] | None = None
 
     def __call__(self) -> str:
-        """Train; the trainer checks that all numbers stay finite."""
+        """Train, and return a line for the report; the trainer raises an error if a number is not finite."""
         import jaxrl_vis
 
         start = time.perf_counter()

@@ -65,11 +65,11 @@ def load(name: str, folder: str | None = None) -> tuple[ModuleType, str]:
 
 
 def call(kind: str, name: str, maker: Any, *arguments: Any, of: type) -> Any:
-    """Call a custom function, and check the type of its result.
+    """Call the function of a custom part, and return its result after checking the type.
 
     Args:
         kind, name: As in `find`, for messages.
-        maker: The function, or the part itself.
+        maker: The function, or the part itself, which is returned as it is.
         arguments: Arguments of the function.
         of: Class of the part.
 

@@ -79,7 +79,7 @@ class SafeStream:
 
 
 def safe(stream: Any) -> SafeStream:
-    """Wrap a stream, such as ``sys.stdout``, which may be None or closed."""
+    """Wrap a stream, such as ``sys.stdout``, which may be None or closed; a `SafeStream` is returned unchanged."""
     return stream if isinstance(stream, SafeStream) else SafeStream(stream)
 
 

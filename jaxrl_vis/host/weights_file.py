@@ -46,7 +46,7 @@ def write_parameters(
         about: Description and origin, as a JSON value.
         bits: Bits per number. With 10, arrays with two or more axes and at least 4,096 numbers are quantised to integers from
             -511 to 511 with a scale per index of the last axis; the others use 16.
-        exact: Names of arrays that keep 32 bits.
+        exact: Names of arrays (paths such as ``detector/params/stem/kernel``) that keep 32 bits, unless they are quantised.
 
     Raises:
         OSError: The file cannot be written.
@@ -62,7 +62,7 @@ def write_parameters(
 
 
 def _quantised(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """Quantize an array float32 [..., C] to 10 bits per number: three arrays by name."""
+    """Quantise an array [..., C] float32 to 10 bits per number: three arrays by name."""
     scale = np.abs(array).max(axis=tuple(range(array.ndim - 1))) / np.float32(_LEVELS)
     levels = np.round(array / np.where(scale > 0, scale, 1)).astype(np.int16)
     low = np.pad((levels & 3).ravel(), (0, -levels.size % 4)).reshape(-1, 4) << _PLACES
@@ -70,7 +70,7 @@ def _quantised(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _restored(high: np.ndarray, low: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Restore a quantized array to float32."""
+    """Restore a quantised array to float32 from its upper 8 bits, its packed lower 2 bits and its scales."""
     lower = ((low[:, None] >> _PLACES) & 3).ravel()[: high.size].reshape(high.shape)
     return (4 * high.astype(np.float32) + lower.astype(np.float32)) * scale
 
@@ -99,10 +99,10 @@ def read_parameters(
             description is not that of a network.
 
     Returns:
-        Parameters, float32; settings; and the rest of the description.
+        Parameters, float32 on the default device; settings; and the rest of the description.
 
     Raises:
-        RequestError: The file is missing, or holds no parameters or those of another network.
+        RequestError: The file is missing, or holds no parameters, those of another network, or numbers that are not finite.
     """
     try:
         if path.suffix.lower() == ".npz" and path.is_file():
@@ -193,7 +193,7 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
         step: Divisor of each number, for whole numbers.
 
     Raises:
-        RequestError: The setting is out of range.
+        RequestError: A number is out of range, or there are none or more than 16.
     """
     unfit = next((value for value in values if not low <= value <= high or (step > 1 and value % step)), None)
     if unfit is not None or not 1 <= len(values) <= 16:

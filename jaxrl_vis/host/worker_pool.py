@@ -200,7 +200,7 @@ class RecordFile:
     """
 
     def __init__(self, path: Path | None, about: Mapping[str, Any], summary: Callable[[list[Record]], Mapping[str, Any]]):
-        """Read the file, if it exists and was written under the same conditions.
+        """Read the file, if it exists; it must have been written under the same conditions.
 
         Args:
             path: The file; None to keep the records in memory only.
@@ -208,7 +208,7 @@ class RecordFile:
             summary: Computes the summary of records in the order of their numbers.
 
         Raises:
-            RequestError: The file has other conditions, or cannot be read.
+            RequestError: The file has other conditions, cannot be read, or holds a damaged record.
         """
         self.records: dict[int, Record] = {}
         self._path, self._about, self._summary = path, json.loads(json.dumps(finite(about))), summary
@@ -232,7 +232,7 @@ class RecordFile:
         self.write()
 
     def write(self) -> None:
-        """Write the file."""
+        """Write the file atomically, unless the records are kept in memory only."""
         if self._path is None:
             return
         ordered = sorted(self.records)
@@ -258,7 +258,7 @@ class RecordFile:
 
 
 def finite(value: Any) -> Any:
-    """Replace non-finite numbers by None, at any depth, for JSON."""
+    """Return a copy with non-finite numbers replaced by None, at any depth, for JSON; tuples become lists."""
     if isinstance(value, Mapping):
         return {name: finite(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -57,7 +57,7 @@ class GymnasiumEnv(gymnasium.Env):
         **overrides: Fields of the environment's configuration to change, as in `jaxrl_vis_envs.make`.
 
     Raises:
-        ValueError: There is no such environment, option, reward or render mode.
+        ValueError: There is no such environment, option, reward or render mode, or no camera to render from.
     """
 
     metadata = {"render_modes": ["rgb_array"]}
@@ -167,7 +167,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         **overrides: See `GymnasiumEnv`.
 
     Raises:
-        ValueError: There is no such environment, option, reward or mode.
+        ValueError: There is no such environment, option, reward or mode, ``num_envs`` is not a positive integer, or as in
+            `GymnasiumEnv`.
     """
 
     def __init__(

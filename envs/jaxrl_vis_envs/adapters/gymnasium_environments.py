@@ -107,7 +107,11 @@ def _space(shapes: dict[str, jax.ShapeDtypeStruct]) -> spaces.Dict:
 
 @functools.cache
 def _camera(env: GoalEnv, size: int) -> Any:
-    """Return a compiled function from the physics and domains of N environments to images [N, size, size, 3] uint8."""
+    """Return a compiled function from the physics and domains of N environments to images [N, size, size, 3] uint8.
+
+    Raises:
+        ValueError: The environment has no MuJoCo model with a camera.
+    """
     mj_model, camera = getattr(env, "mj_model", None), getattr(env, "camera", None)
     if mj_model is None or camera is None:
         raise ValueError(f"{type(env).__name__} has no MuJoCo model with a camera to render through")
@@ -125,6 +129,9 @@ class Environments:
         metadata: Gymnasium metadata.
         action_space: Action space of one environment.
         steps: Number of steps since `reset`.
+
+    Raises:
+        ValueError: There is no such environment, option, reward, render mode or camera.
     """
 
     def __init__(

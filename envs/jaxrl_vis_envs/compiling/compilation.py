@@ -242,7 +242,7 @@ def _has_tensor_cores() -> bool:
 
 @functools.cache
 def _compiles(probe: Callable[[], object]) -> bool:
-    """Return True if a probe compiles for the first NVIDIA GPU."""
+    """Return True if a probe compiles for the first NVIDIA GPU; otherwise print the reason to stderr. Cached per probe."""
     gpu = jax.devices("cuda")[0]
 
     def compile_it() -> None:

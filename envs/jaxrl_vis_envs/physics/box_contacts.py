@@ -28,7 +28,7 @@ def supports(model: mjx.Model) -> bool:
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute the contacts of a model that `supports` accepts; return ``data``, whose poses must be up to date, with them."""
+    """Return ``data`` with the contacts at its poses, which must be up to date; for a model that `supports` accepts."""
     order = np.repeat(np.argsort(model.pair_dim, kind="stable"), _CONTACTS)  # MJX sorts contacts by their dimensions
     geoms = np.stack([model.pair_geom1, model.pair_geom2], axis=1)[order]
     first, second = geoms[::_CONTACTS].T

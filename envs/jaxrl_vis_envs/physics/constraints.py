@@ -19,7 +19,7 @@ _MAX_COUPLED_ROWS = 12
 
 
 def solve(model: mjx.Model, data: mjx.Data, exact: bool) -> mjx.Data:
-    """Compute accelerations with and without constraints (``qacc``, ``qacc_smooth``) and constraint forces
+    """Return ``data`` with accelerations under and without constraints (``qacc``, ``qacc_smooth``) and constraint forces
     (``qfrc_constraint``).
 
     Args:
@@ -86,7 +86,11 @@ def _integrate(model: mjx.Model, position: jax.Array, velocity: jax.Array) -> ja
 
 
 def _has_short_step(model: mjx.Model, data: mjx.Data) -> bool:
-    """Return True if `euler` takes its own step: for hinges and slides with damping, a dense mass matrix and few contacts."""
+    """Return True if `euler` takes its own step instead of MJX's.
+
+    It does, unless implicit damping is disabled, for models that `newton` supports, and for others of hinges and slides only,
+    without actuator activations, with a dense mass matrix and few contacts.
+    """
     is_damped = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     if newton.supports(model):
         return is_damped

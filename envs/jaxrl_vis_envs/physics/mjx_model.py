@@ -244,7 +244,11 @@ def point_velocity(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: j
 
 
 def hinge_jacobian(mj_model: mujoco.MjModel, data: mjx.Data, body: int, point: jax.Array) -> jax.Array:
-    """Return the derivative of a ``point`` [3] (m, world) and of the rotation of ``body`` per radian of each hinge: [nv, 6]."""
+    """Return the derivatives of a ``point`` [3] (m, world) on ``body`` and of the body's rotation with respect to each hinge.
+
+    Returns:
+        [nv, 6] float32: translations (m/rad), then rotations (rad/rad), in the world; 0 for joints that do not move ``body``.
+    """
     moves = ancestor_joints(mj_model, body)
     axis, anchor = data.xaxis, data.xanchor
     if mj_model.nv > mj_model.njnt:  # free joints elsewhere have one axis for six degrees of freedom

@@ -31,9 +31,8 @@ _ROOT_STEPS = 8
 def supports(model: mjx.Model) -> bool:
     """Return True if this solver can replace MJX's for a model.
 
-    It supports up to 12 hinges and slides plus one free joint, pyramidal cones, and the integrators RK4 (without a free joint)
-    and Euler, the latter implicit in the damping (MuJoCo's default), with and without warm starts; but neither dry friction nor
-    activations.
+    It supports up to 12 hinges and slides plus one free joint, the Newton solver with pyramidal cones, and the integrators RK4
+    (without a free joint) and Euler, unless implicit damping is disabled; but neither dry friction nor activations.
     """
     is_free = np.asarray(model.jnt_type) == mujoco.mjtJoint.mjJNT_FREE
     has_few_joints = model.nv - 6 * is_free.sum() <= _MAX_JOINTS and is_free.sum() <= 1 and model.nq == model.nv + is_free.sum()
@@ -47,7 +46,7 @@ def supports(model: mjx.Model) -> bool:
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute accelerations under constraints (``qacc``) and constraint forces on the joints (``qfrc_constraint``).
+    """Return ``data`` with accelerations under constraints (``qacc``) and constraint forces on joints (``qfrc_constraint``).
 
     Args:
         model: Model that the solver `supports`; it takes ``model.opt.iterations`` Newton steps with exact line searches.

@@ -44,7 +44,8 @@ class Views:
         body_names: Name of each label of ``bodies``.
 
     Raises:
-        ValueError: There is no such camera or output, two cameras have the same name, a dictionary lacks a camera, or as in
+        ValueError: There is no such camera or output, no camera or no output is given, two cameras have the same name, the keys
+            of a dictionary are not the cameras, ``clip_range`` is not (near, far) with 0 < near < far, or as in
             `Scene.from_mjmodel`.
     """
 

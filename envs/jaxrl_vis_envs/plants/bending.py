@@ -42,8 +42,8 @@ class Layout(NamedTuple):
 
     Attributes:
         mocap: Index of each stalk's mocap body among the mocap bodies.
-        lower, upper: Bodies; the same if stalks have no knee.
-        lower_geom, upper_geom: Geoms, likewise.
+        lower, upper: Bodies of the segments; the same if stalks have no knee.
+        lower_geom, upper_geom: Geoms of the segments; the same if stalks have no knee.
         joints: [N, P, 2], hinges about x and y, at ground and knee (P = 2) or at the ground alone (P = 1).
     """
 
@@ -139,7 +139,10 @@ def shapes(stands: Stands) -> Shape:
 
 
 def fit(model: Any, layout: Layout, shape: Shape) -> Any:
-    """Return an `mjx.Model` with these stalks; `place_stands` sets their positions."""
+    """Return ``model`` (an `mjx.Model`) with the lengths, radii, masses, stiffness and damping of the stalks in ``shape``.
+
+    `place_stands` sets the positions of the feet and the directions of the lower segments. Stalks must have knees.
+    """
     lower_axis, up, upper_axis = _segments(shape)
     lengths = jnp.stack([jnp.linalg.norm(lower_axis, axis=-1), jnp.linalg.norm(upper_axis, axis=-1)], axis=-1)
     from_lower = jax.vmap(rotations.quat_inv)(_between(up, lower_axis))
@@ -170,7 +173,7 @@ def fit(model: Any, layout: Layout, shape: Shape) -> Any:
 
 
 def place_stands(data: Any, layout: Layout, shape: Shape) -> Any:
-    """Return an `mjx.Data` with the stalks at their feet and the lower segments in their direction."""
+    """Return ``data`` (an `mjx.Data`) with the feet of the stalks at their positions and the lower segments aligned."""
     lower_axis, up, _ = _segments(shape)
     return data.replace(
         mocap_pos=data.mocap_pos.at[layout.mocap].set(jnp.asarray(shape.foot, jnp.float32)),
@@ -195,10 +198,10 @@ class Gusts(NamedTuple):
 
 
 def gusts(key: jax.Array, strength: Any) -> Gusts:
-    """Sample wind.
+    """Sample the wind over one stand: its heading, and the frequencies and phases of its waves.
 
     Args:
-        key: Typed key, [].
+        key: One typed key.
         strength: Displacement at `SWAY_HEIGHT`, m: the amplitude of a sine wave of the same power.
     """
     heading_key, frequency_key, phase_key = jax.random.split(key, 3)
@@ -233,7 +236,7 @@ def hinge_angles(layout: Layout, nv: int, offset: jax.Array) -> jax.Array:
 
 
 def wind_torque(model: Any, layout: Layout, wind: Gusts, foot: jax.Array, time: Any) -> jax.Array:
-    """Return the torques [nv] that would hold the stalks at their `displacement`."""
+    """Return the torques [nv] float32 (N m) that would hold the stalks at their `displacement`."""
     return model.jnt_stiffness * hinge_angles(layout, model.nv, displacement(wind, foot, time))
 
 
@@ -259,7 +262,7 @@ def _properties(radius: Any, segment: int | None, numeric: Any) -> tuple[Any, An
 
 
 def _segments(shape: Shape) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return lower segments, the vertical and upper segments: [N, 3] each."""
+    """Return lower segments (m), upward unit vectors and upper segments (m), as vectors [N, 3] from bottom to top."""
     lower_axis, upper_axis = jnp.asarray(shape.knee - shape.foot), jnp.asarray(shape.top - shape.knee)
     return lower_axis, jnp.zeros_like(lower_axis).at[:, 2].set(1.0), upper_axis
 

@@ -13,10 +13,11 @@ _TURN = np.array([0.0, 0.0, 1.0])
 
 
 def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Leaf, list[float]]]]:
-    """Sample the objects of a plot by day.
+    """Sample the objects of a plot by day, determined by its family and seed.
 
     Returns:
-        Round objects as chains of cones, and flat ones as ribbons, each with its material (`surfaces.MATERIAL`).
+        Round objects as chains of truncated cones (`Stalk`), and flat ones as ribbons (`Leaf`), each with its material
+        (`surfaces.MATERIAL`).
     """
     rng = generator(plot.family, plot.seed, "objects")
     family, scene = plot.family, plot.family.scene

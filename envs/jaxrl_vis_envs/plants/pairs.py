@@ -25,7 +25,7 @@ _MOWN = 0.25
 
 @functools.lru_cache(maxsize=2)
 def daylight(family: Family, seed: int) -> shading.Day | None:
-    """Sample the daylight and the backdrop of a plot from its settled family; None at night."""
+    """Sample the daylight and the backdrop of a plot from its settled family; None at night. The last two are cached."""
     scene = family.scene
     if scene.share <= 0:
         return None

@@ -31,8 +31,8 @@ class Stands:
     Attributes:
         stalk: [B, N] int32, index in `Plot.stalks`; -1 for absent ones, which are parked out of the way.
         foot: [B, N, 3] float32, foot of the stalk on the ground, m, in the frame of the stand.
-        knee: [B, N, 3] float32, joint of its two segments.
-        top: [B, N, 3] float32, end of its upper segment, whose line passes exactly through the stalk at the arm's height.
+        knee: [B, N, 3] float32, joint of its two segments, m, in the same frame.
+        top: [B, N, 3] float32, end of its upper segment, whose line passes exactly through the stalk at the arm's height, m.
         radius: [B, N, 2] float32, radius of the lower segment at half its height and of the upper one at the arm's height, m.
         bending_radius: [B, N, 2] float32, radius of untapered segments with the same compliance at the arm, m.
         origin: [B, 3] float32, origin of the stand in the plot's frame, m.

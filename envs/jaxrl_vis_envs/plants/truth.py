@@ -30,8 +30,8 @@ class StalkInView:
         visible_box: Box around the visible pixels; None if there are none.
         visible: Visible fraction of its area inside the image.
         pixels: Number of visible pixels.
-        band_box, band_visible: Box and visible fraction of the part within a band of heights; None and 0 if that is outside the
-        image.
+        band_box, band_visible: Box and visible fraction of the part within a band of heights; None and 0 if that is outside
+            the image.
     """
 
     stalk: int

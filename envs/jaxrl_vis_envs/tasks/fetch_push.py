@@ -1,13 +1,13 @@
-"""Fetch push: move a box over a table to where the goal image shows it, with the closed gripper of a Fetch robot.
+"""Fetch push: push a box across a table to its position in the goal image, with the closed gripper of a Fetch robot.
 
 Follows FetchPush of Gymnasium-Robotics (version 4; Plappert et al., 2018, arXiv 1802.09464): starts, goals, actions, threshold,
 horizon and the observation of the state task. Arm and camera are those of `fetch_reach`; box, table and fingers have the
 original's shapes, masses, frictions and softness.
 
     VisualFetchPush   observes RGB-D from a camera facing the robot
-    FetchPush         observes the original's 25 numbers
+    FetchPush         observes the original's 25-dimensional state
 
-State: middle of the box in the world, m. Action: as in FetchReach.
+State: position of the box's centre in the world, m. Action: as in FetchReach.
 """
 
 import dataclasses
@@ -104,7 +104,7 @@ class FetchPush(FetchArm):
     metric_names = ("success", "goal_distance", "moved")
 
     def __init__(self, config: FetchPushConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Build the model and compute the start.
+        """Build the model and compute the start state.
 
         Args:
             config: Settings of the task.
@@ -193,9 +193,10 @@ class FetchPush(FetchArm):
         return self._draw is None or super().converts_goals
 
     def as_goal(self, frame: jax.Array) -> jax.Array:
-        """Return the goal observation that the box in ``frame`` meets: the box there, and the arm at rest as in goal images.
+        """Return the goal that ``frame`` achieves.
 
-        A policy that observes states thus learns only where the box should be from a goal, as in the original.
+        For a state observation [25], that is the position of its box, with the arm at rest as in goal images: from a goal, a
+        policy thus learns only where the box should be, as in the original. For images see `GoalEnv.as_goal`.
         """
         if self._draw is not None:
             return super().as_goal(frame)
@@ -226,7 +227,7 @@ def _euler_angles(rotation: jax.Array) -> jax.Array:
 
 
 def _add_box(spec: mujoco.MjSpec) -> None:
-    """Add the box, and replace the fingers of FetchReach's arm by the original's."""
+    """Add the box and a floor on which it can land, and replace the fingers of FetchReach's arm by the original's."""
     for side in ("right", "left"):
         spec.delete(spec.pair(f"{side}_finger_on_table"))
         for name in (f"{side}_finger", f"{side}_fingertip"):

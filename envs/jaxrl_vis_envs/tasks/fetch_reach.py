@@ -101,7 +101,7 @@ class FetchReach(FetchArm):
     chance, difficulty = 0.008, 2.8  # benchmarks/tasks/task_difficulty.py FetchReach --episodes 1000
 
     def __init__(self, config: FetchReachConfig, observer: Callable[[mujoco.MjModel], Observer] | None = None):
-        """Build the model and compute the start.
+        """Build the model and compute the start state.
 
         Args:
             config: Settings of the task.
@@ -165,7 +165,7 @@ class FetchReach(FetchArm):
         return self._start.site_xpos[self._grip] + offset
 
     def _place_link(self, goal: jax.Array) -> jax.Array:
-        """Return the position [3] (m, world) of the gripper's link, pointing down, for a ``goal`` [3]."""
+        """Return the position [3] (m, world) of the downward gripper's link for a ``goal`` [3] (m, world); see ``goal_at``."""
         if self.config.goal_at == "link":
             return goal
         return goal - jnp.asarray(_DOWN_ROTATION @ self.mj_model.site_pos[self._grip], jnp.float32)
@@ -180,7 +180,7 @@ class FetchReach(FetchArm):
         With ``goal_at="link"``, the gripper's link is at the goal instead of the grip.
 
         For 300 goals, the joint angles differ from those after driving the arm there for 200 substeps by .002 rad (median) and
-        .02 rad (99th percentile), and a reset costs a hundredth.
+        .02 rad (99th percentile), and a reset costs a hundredth of that.
         """
         fingertip = self.mj_model.geom("right_fingertip").id
         lowest = _TABLE_TOP + float(self.mj_model.geom_pos[fingertip, 0] + self.mj_model.geom_size[fingertip, 0])

@@ -78,11 +78,11 @@ class MjxGoalEnv(GoalEnv):
 
     @abc.abstractmethod
     def sample_start(self, key: jax.Array) -> mjx.Data:
-        """Sample the start of the episode ``reset(key)``, with poses consistent with its ``qpos``; ``key`` is [], typed."""
+        """Sample the start of the episode ``reset(key)``, with poses consistent with ``qpos``; ``key`` is one typed key."""
 
     @abc.abstractmethod
     def sample_goal(self, key: jax.Array) -> mjx.Data:
-        """Sample the configuration in the goal image of ``reset(key)``, with its poses; ``key`` is [], typed."""
+        """Sample the configuration in the goal image of ``reset(key)``, with its poses; ``key`` is one typed key."""
 
     @abc.abstractmethod
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
@@ -101,7 +101,7 @@ class MjxGoalEnv(GoalEnv):
         """Return the true quantity that goals constrain, `State.achieved_state`: [G] float32."""
 
     def goal_state(self, key: jax.Array, goal_data: mjx.Data) -> jax.Array:
-        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``; by default, `achieved` of that."""
+        """Return the goal state [G] of ``reset(key)``, whose goal image shows ``goal_data``: by default, what that achieves."""
         return self.achieved(goal_data)
 
     def goal_configuration(self, goal: jax.Array) -> mjx.Data:
@@ -137,8 +137,8 @@ class MjxGoalEnv(GoalEnv):
         return self._observe(state.data, state.history, state.domain)
 
     def state_at(self, data: mjx.Data, goal_state: jax.Array, domain: randomization.Domain | None = None) -> State:
-        """Return the State of an episode that starts at ``data``, with goal state [G], without images, and with the
-        randomisation ``domain``.
+        """Return the `State` of an episode that starts at ``data``, with ``goal_state`` [G] float32 and the randomisation
+        ``domain`` (None for none); its ``obs`` is None.
         """
         history = start_history(data.qpos, self.frame_stack)
         return self._measure(data, self.achieved(data), goal_state, None, history, domain)

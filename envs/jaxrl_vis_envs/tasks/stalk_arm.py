@@ -41,7 +41,7 @@ JOINTS = ARM_JOINTS + len(JAWS)
 
 
 def build(stalks: int) -> mujoco.MjModel:
-    """Build the model of the arm among stalks, without actuators: the caller applies forces to its joints."""
+    """Build the model of the arm among ``stalks`` stalks, without actuators: the caller applies forces to its joints."""
 
     def edit(spec: mujoco.MjSpec) -> None:
         for actuator in list(spec.actuators):
@@ -52,7 +52,7 @@ def build(stalks: int) -> mujoco.MjModel:
 
 
 def build_servoed(stalks: int) -> mujoco.MjModel:
-    """Build the model of the arm with fixed, open jaws, driven by position servos, among stalks without knees.
+    """Build the model of the arm with fixed, open jaws, driven by position servos, among ``stalks`` stalks without knees.
 
     The pose of its mocap body "wind" only stores numbers.
     """

@@ -94,7 +94,7 @@ class _Episode(NamedTuple):
 
     Attributes:
         foot: [N, 3] float32, positions of the stalks' feet, m.
-        turn: [N, 4] float32, orientations of the stalks.
+        turn: [N, 4] float32, orientations of the stalks: unit quaternions, scalar first.
         wind: [3] float32, heading and phase of the wind (rad) and the index of the target stalk, as `_gusts` and
             `_displacement` read them.
         height: [] float32, height of the goal, m.
@@ -213,7 +213,7 @@ class StalkReach(MjxGoalEnv):
 
 
 def _turn(axis: int, angle: jax.Array) -> jax.Array:
-    """Return quaternions [N, 4] of rotations by ``angle`` [N] (rad) about a coordinate axis."""
+    """Return quaternions [N, 4] (scalar first) of rotations by ``angle`` [N] (rad) about a coordinate axis."""
     quaternion = jnp.zeros((*angle.shape, 4), jnp.float32)
     return quaternion.at[:, 0].set(jnp.cos(0.5 * angle)).at[:, 1 + axis].set(jnp.sin(0.5 * angle))
 

@@ -30,7 +30,7 @@ ACCELERATOR_COUNTS = (4096,)
 SCENE_CPU_COUNTS = {"clutter": (4,)}  # one of each camera, of which each takes a second
 SCENE_ACCELERATOR_COUNTS = {"primitives": (8192,), "clutter": (8192,)}
 CAMERAS = {"clutter": 4}
-"""Cameras that a scene is seen by, from the first; one if not listed."""
+"""Number of cameras that view a scene, starting with its first; one if not listed."""
 OUTPUTS = ("rgbd", "rgbd8", "depth")
 MESH_OUTPUTS = ("rgbds", "rgbd", "depth")  # as the scenes of meshes that MuJoCo Warp publishes figures of: with labels
 _SAMPLE = 32  # number of poses over which the needed tests are averaged
@@ -62,7 +62,7 @@ class Case:
     Attributes:
         config: Entries of a record: scene, poses, textures, highlights, image_size, images; shadows and cameras if there are
             shadows, or several cameras.
-        mj_model: Model, seen by its first cameras.
+        mj_model: Model; its first cameras are used.
         batches: Two sets of poses, see `models.random_poses`; the first `worlds` of each are rendered.
     """
 
@@ -82,7 +82,7 @@ class Case:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Outputs to measure, of which a peer has the first. Depths alone have no shadows."""
+        """Outputs to measure; peers render the first. Depth alone is omitted with shadows, which it does not show."""
         outputs = MESH_OUTPUTS if self.config.get("scene") in models.MESH_SCENES else OUTPUTS
         return tuple(output for output in outputs if output != "depth" or not self.config.get("shadows"))
 
@@ -137,7 +137,7 @@ def draw_all(case: Case, scene: Scene, poses: dict[str, jax.Array], draw: Callab
         case: The case.
         scene: From `make_scene`.
         poses: Poses of the batch, [worlds, ...].
-        draw: Function from a scene and poses to arrays of one image.
+        draw: Function from a scene and the poses of one world to the arrays of one image.
 
     Returns:
         The arrays, [worlds, ...], or [worlds * cameras, ...] by pose and then by camera.

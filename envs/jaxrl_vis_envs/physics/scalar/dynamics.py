@@ -101,7 +101,7 @@ def child_pose(link: Link, joint: JointTransform, parent: Pose) -> Pose:
 
 
 def mass_matrix(links: list[Link], joints: list[JointTransform]) -> dict[tuple[int, int], Any]:
-    """Return the mass matrix (kg m^2, kg m, kg) between each joint and its ancestors: (joint, ancestor) -> entry."""
+    """Return the mass matrix (kg m^2, kg m, kg): (joint, ancestor) -> entry, for each joint with its ancestors and itself."""
     composite = [_CompositeInertia(link.mass, _vector(link.moment), _symmetric(link.inertia)) for link in links]
     matrix: dict[tuple[int, int], Any] = {}
     for index in reversed(range(len(links))):
@@ -162,7 +162,10 @@ def bias_forces(
 
 
 class _LinkMotion:
-    """Motion of a link in its own frame: angular velocity and acceleration, and the acceleration of the frame's origin."""
+    """Motion of a link in its own frame: angular velocity and acceleration, and the acceleration of the frame's origin.
+
+    Gravity is included as an upward acceleration of the world.
+    """
 
     def __init__(self, spin: Vector, change: Vector, lift: Vector) -> None:
         self._spin, self._change, self._lift = spin, change, lift

@@ -15,7 +15,7 @@ _IDENTITY = Pose(ZERO, tuple(floats(axis) for axis in np.eye(3)))  # type: ignor
 
 
 class MocapPose(NamedTuple):
-    """Pose of a mocap body in the world, which is constant during a step, and its quaternion."""
+    """Pose of a mocap body in the world, which is constant during a step, and its rotation as a unit quaternion."""
 
     pose: Pose
     quaternion: Quaternion
@@ -41,6 +41,12 @@ class LinkFrames:
 
     Frames of mocap bodies and their descendants are available only if the base is the world. Quaternions are relative to the
     world whatever the base is.
+
+    Args:
+        tree: Links of the model, one per joint.
+        joints: Transforms of the joints; `quaternion` needs the half turns of those above its link.
+        base: Link of the base frame, or `WORLD`; only its descendants have frames.
+        mocap: Poses of mocap bodies, by link.
     """
 
     def __init__(self, tree: list[Link], joints: list[JointTransform], base: int, mocap: dict[int, MocapPose]) -> None:

@@ -169,8 +169,9 @@ def supports(model: mjx.Model) -> bool:
     The subset of MuJoCo: concrete numbers, no tracers; up to 32 hinges and slides; up to 32 explicit contact pairs, each of two
     capsules or of a plane and a sphere, frictionless or with elliptic or pyramidal cones, the latter also with torsional
     friction; limits; dry friction of joints; fixed tendons; joint actuators without activation; mocap bodies; and welds of
-    bodies that are active from the start. Not supported: other equalities, sensors, fluids and gravity compensation. The solver
-    is Newton's; the integrator is Euler's, implicit in the damping, or RK4.
+    bodies that are active from the start. Exponents of impedances are integers up to 6. Not supported: other equalities,
+    sensors, fluids, gravity compensation, and limits of the actuator force on a joint. The solver is Newton's; the integrator
+    is Euler's, implicit in the damping, or RK4.
     """
     if not is_concrete(model):
         return False
@@ -319,7 +320,7 @@ def _actuator(model: mjx.Model, index: int) -> Actuator:
 
 
 def build_softness(model: mjx.Model, solref: object, solimp: object) -> Softness:
-    """Return the constants of a constraint of a model with these numbers of MuJoCo."""
+    """Return the softness of a constraint with MuJoCo's parameters ``solref`` [2] and ``solimp`` [5], in a model."""
     is_safe = not int(model.opt.disableflags) & _FLAG.mjDSBL_REFSAFE
     return constraint_softness.make_softness(np.asarray(solref), np.asarray(solimp), float(model.opt.timestep), is_safe)
 

@@ -58,12 +58,12 @@ def _solve_transposed(factors: list[Row], right: Column) -> Column:
 
 
 def add_square(matrix: Matrix, row: Row, weight: Any) -> None:
-    """Add the weighted outer product of a row with itself, on and below the diagonal."""
+    """Add the weighted outer product of a row with itself to ``matrix`` in place, on and below the diagonal."""
     add_product(matrix, row, row, weight)
 
 
 def add_product(matrix: Matrix, left: Row, right: Row, weight: Any) -> None:
-    """Add the weighted outer product of two rows, on and below the diagonal."""
+    """Add the weighted outer product of two rows to ``matrix`` in place, on and below the diagonal."""
     for row, entry in left.items():
         scaled = weight * entry
         for column, factor in right.items():

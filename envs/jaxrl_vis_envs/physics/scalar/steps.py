@@ -59,7 +59,7 @@ class StepInputs(NamedTuple):
 
 
 class ConstraintRow(NamedTuple):
-    """Row of a `scalar_newton.Problem`, with its fields; ``max_friction`` is None except for dry friction."""
+    """Row of a `scalar_newton.Problem`: ``jacobian`` entries, and its fields; ``max_friction`` is None unless dry friction."""
 
     entries: Row
     stiffness: Any
@@ -125,7 +125,7 @@ def simulate_arrays(
     exact: bool | None,
     mocap: jax.Array | None = None,
 ) -> JointState:
-    """Call `simulate` with arrays: [N] each for N joints, controls [nu], mocap bodies [M, 7] or None."""
+    """Call `simulate` with float32 arrays, outside of kernels: [N] each for N joints, controls [nu], mocap bodies [M, 7]."""
     start = JointState(*map(list, state))
     poses = [] if mocap is None else list(mocap.reshape(-1))
     end = simulate(constants, start, list(control), list(applied), timestep, count, bool(exact), mocap=poses)

@@ -22,8 +22,8 @@ def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky
 
     Args:
         rng: Random number generator.
-        indoors: Whether to draw a wall and a ceiling instead of the sky and a skyline.
-        photograph: Whether to use a photograph shipped with an installed package instead; takes precedence over ``indoors``.
+        indoors: Sample a wall and a ceiling instead of the sky and a skyline.
+        photograph: Use a photograph shipped with an installed package instead; takes precedence over ``indoors``.
         sky: Light of the sky on a white surface, which scales the radiance.
 
     Returns:
@@ -39,7 +39,7 @@ def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky
 
 
 def smooth_noise(rng: np.random.Generator, size: tuple[float, float], shape: tuple[int, int] = SHAPE) -> np.ndarray:
-    """Sample smooth noise [*shape], uniformly distributed in 0 to 1.
+    """Sample smooth noise, uniformly distributed in 0 to 1: [*shape] float64.
 
     Args:
         rng: Random number generator.

@@ -1,4 +1,4 @@
-"""Blades of grass over the ground of plots by day: upright strips, as stalks are, and no stalks. NumPy and Pillow only."""
+"""Blades of grass on the ground of plots by day: upright strips that resemble stalks. NumPy and Pillow only."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 from jaxrl_vis_envs.plants.rendering.surfaces import GROUND
 
 _NEAREST = 0.15
-"""Minimum depth of a blade that is drawn, m."""
+"""Minimum depth of a rendered blade, m."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,17 +48,17 @@ def cover_with_blades(
     blades: Blades,
     camera: tuple[np.ndarray, np.ndarray, float, tuple[float, float]],
 ) -> np.ndarray:
-    """Draw blades into an image, in front of what is farther away.
+    """Render blades into an image, where they occlude its surfaces.
 
     Args:
         radiance: [H, W, 3] float32, linear.
         instance: [H, W] int32, see `surfaces`.
         depth: [H, W] float32, planar, m.
         blades: Blades of the plot.
-        camera: Position [3] and rotation [3, 3] of the camera as of a `Pose`, focal length and principal point, pixels.
+        camera: Position [3] (m) and rotation [3, 3], as in a `Pose`; focal length and principal point, pixels.
 
     Returns:
-        Radiance [H, W, 3] float32 with the blades. Instances and depths are to remain those of the plot without blades.
+        Radiance [H, W, 3] float32 with the blades. Instance and depth images are not changed: blades are not in them.
     """
     position, rotation, focal, centre = camera
     seen = (blades.points - position) @ rotation.T
@@ -88,7 +88,7 @@ def cover_with_blades(
 
 
 def _ground_at(radiance: np.ndarray, instance: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the radiance [B, 3] of the ground at pixels [B, 2]; the median of the ground where something else is there."""
+    """Return the radiance [B, 3] of the ground at pixels (column, row) [B, 2]; its median where it is not visible."""
     ground = instance == GROUND
     median = np.median(radiance[ground], axis=0) if ground.any() else np.zeros(3)
     column, line = np.round(places).astype(int).T

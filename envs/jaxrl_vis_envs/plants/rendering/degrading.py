@@ -16,7 +16,7 @@ def degrade(image: np.ndarray, scene: Scene, rng: np.random.Generator) -> tuple[
 
     Args:
         image: [H, W, 3] uint8.
-        scene: Settled factors.
+        scene: Factors of the plot, after `settle`.
         rng: Random number generator; with equal seeds for both images of a pair, so that both are degraded alike.
 
     Returns:

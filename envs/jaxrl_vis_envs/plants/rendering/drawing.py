@@ -84,7 +84,7 @@ def _joiner(tile: int, width: int, height: int):
 
 @functools.cache
 def _program(samples: int, size: int, batch_size: int, surfaces: int):
-    """Return the compiled rendering of a list of tiles."""
+    """Return the compiled function that renders a list of tiles; ``surfaces`` are tested per loop iteration."""
 
     def program(tables: Tables, shot: Shot, tiles: jax.Array, cone_ranges: jax.Array, triangle_ranges: jax.Array):
         def one(tile: tuple[jax.Array, jax.Array, jax.Array]):
@@ -136,7 +136,7 @@ def _nearest(
     cone_range: jax.Array,
     triangle_range: jax.Array,
 ) -> Hit:
-    """Find the first hits of rays (x, y, 1), testing ``surfaces`` surfaces per loop iteration."""
+    """Find the first hits of rays (x, y, 1) [samples, size, size], testing ``surfaces`` surfaces per loop iteration."""
     up = shot.rotation[:, 2]
     falling = x * up[0] + y * up[1] + up[2]
     ground = jnp.where(falling < -1e-6, -shot.position[2] / jnp.minimum(falling, -1e-6), FAR)

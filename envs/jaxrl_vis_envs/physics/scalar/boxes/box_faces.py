@@ -30,7 +30,7 @@ _NONE = -1e30  # reach of a candidate outside of the overlap
 
 
 class _Box(NamedTuple):
-    """Position, axes (three vectors) and half-size of a box in the world."""
+    """Position (m), axes (three unit vectors) and half-size (m) of a box in the world."""
 
     position: Vector
     axes: tuple[Vector, Vector, Vector]
@@ -38,7 +38,7 @@ class _Box(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """Point of the other face, in its half edges, and True if it lies in the overlap of the faces."""
+    """Point of the other face, in units of its half edges, and True if it lies in the overlap of the faces."""
 
     x: Any
     y: Any
@@ -46,14 +46,14 @@ class _Candidate(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Position and axes (three vectors) of a box in the world."""
+    """Position (m) and axes (three unit vectors) of a box in the world."""
 
     position: Vector
     axes: tuple[Vector, Vector, Vector]
 
 
 def places(contacts: LaneContacts, frames: LinkFrames) -> list[list[Place]]:
-    """Return the places of the boxes that move, for each side."""
+    """Return the poses in the world (m) of the boxes that move, for each of the two sides."""
     return [[_place(frame, frames) for _, frame in side.moving] for side in contacts.sides]
 
 
@@ -63,7 +63,10 @@ def _place(frame: FixedFrame, frames: LinkFrames) -> Place:
 
 
 def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> ContactPoint:
-    """Return the contacts of all lanes, from the result of `places`; normals point from the first box to the second."""
+    """Return the contacts of all lanes (m, world), from the result of `places`; normals point from the first box to the second.
+
+    The distance of a contact that does not exist is `_FAR`.
+    """
     one, other = (_box(side, moving) for side, moving in zip(contacts.sides, places, strict=True))
     reference, other, is_first = _reference_first(one, other)
     offset = _into(reference.axes, subtract(other.position, reference.position))
@@ -100,10 +103,10 @@ def _into(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
 
 
 def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
-    """Order two boxes, and turn the axes of the first so that its face farthest from the other is across the last axis.
+    """Order two boxes, and permute the axes of the first so that its face farthest from the other is normal to the last axis.
 
     Returns:
-        The boxes in order, and True where the order is the given one.
+        The boxes in order, and True in lanes where that is the order of the arguments.
     """
     offset = subtract(other.position, one.position)
     turn = [[_abs(dot(axis, across)) for across in other.axes] for axis in one.axes]
@@ -119,12 +122,12 @@ def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
 
 
 def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
-    """Turn the axes of the other box so that its face nearest to the reference is across the last axis."""
+    """Permute the axes of the other box so that its face nearest to the reference is normal to the last axis."""
     return _turn_axes(other, _greatest([_abs(dot(reference.axes[2], axis)) for axis in other.axes]))
 
 
 def _greatest(numbers: list[Any]) -> Any:
-    """Return the index of the first of the greatest numbers, as float32."""
+    """Return the index of the maximum of ``numbers`` in each lane, as float32; the first index in a tie."""
     best, index = numbers[0], 0.0 * numbers[0]
     for place, number in enumerate(numbers[1:], start=1):
         is_greater = number > best
@@ -133,7 +136,7 @@ def _greatest(numbers: list[Any]) -> Any:
 
 
 def _choose_parts(condition: Any, one: Any, other: Any) -> Any:
-    """Select between two tuples of the same structure, part by part."""
+    """Select between two nested tuples of the same structure, leaf by leaf."""
     if isinstance(one, tuple):
         parts = [_choose_parts(condition, *pair) for pair in zip(one, other, strict=True)]
         return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
@@ -153,7 +156,13 @@ def _turn_axes(box: _Box, axis: Any) -> _Box:
 
 
 def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector) -> list[_Candidate]:
-    """Return 24 points: the corners of the other face, those of the reference, and the crossings of their edges."""
+    """Return 24 points of the other face: its corners, those of the reference face, and the intersections of their edges.
+
+    Args:
+        centre: Centre of the other face in the frame of the reference box, m.
+        edges: Half edges of the other face in that frame, m.
+        half_size: Half-size of the reference box, m.
+    """
     (a, c, _), (b, d, _) = edges
     inverse = 1.0 / (a * d - b * c)
     places: list[tuple[Any, Any]] = list(CORNERS)
@@ -184,7 +193,10 @@ def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector)
 
 
 def _farthest(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
-    """Return the candidate that reaches farthest towards each lane's corner, and 1 if no corner before has it, else 0."""
+    """Return coordinates x and y of the candidate in the overlap that reaches farthest towards each lane's corner.
+
+    The third result is 1.0 if there is one and no earlier corner of the pair selects it, else 0.0.
+    """
     like = 0.0 * (candidates[4].x + contacts.number)
     own, place_x, place_y, index = like + _NONE, like, like, like
     reaches, chosen = [like + _NONE] * (CONTACTS - 1), [like] * (CONTACTS - 1)

@@ -61,7 +61,7 @@ def simulate_arrays(
     count: int,
     mocap: jax.Array | None = None,
 ) -> JointState:
-    """Do the same as `simulate` in plain JAX."""
+    """Implement `simulate` in plain JAX."""
 
     def spread(numbers: jax.Array) -> list[jax.Array]:
         return [jnp.broadcast_to(number, (LANES,)) for number in numbers]

@@ -1,8 +1,8 @@
 """Newton's method for constraint forces with contacts in lanes: the iterations of `physics.newton`, for one episode per warp.
 
-A scalar of the episode is the same in all lanes. What all contacts contribute to a scalar is a sum over the lanes. An iteration
-that leaves the same constraints acting as before has reached the minimum, since the cost is a parabola as long as these are the
-same; the iterations end there, and so does a line search that has converged.
+A scalar of the episode is the same in all lanes; contributions of the contacts to it are summed over the lanes. The iterations
+end when a step leaves the set of acting constraints unchanged: the cost is quadratic within a set, so the step has reached the
+minimum. A line search ends when it has converged.
 """
 
 from typing import Any, NamedTuple
@@ -52,14 +52,14 @@ class LaneProblem(NamedTuple):
 
 
 class _Residual(NamedTuple):
-    """Residuals of the rows of welds and limits, and those of the contacts' four components."""
+    """Residuals of the rows of welds and limits, and of the contacts' four components (per lane)."""
 
     rows: Column
     parts: Column
 
 
 def sum_lanes(number: Any) -> Any:
-    """Add up the lanes, the last axis; return the sum in all of them."""
+    """Sum over the lanes, the last axis, and broadcast the sum to all of them."""
     return jnp.broadcast_to(jnp.sum(number, axis=-1, keepdims=number.ndim > 1), number.shape)
 
 
@@ -167,7 +167,7 @@ def _curvature(problem: LaneProblem, residual: _Residual) -> Matrix:
 
 
 def _improve(problem: LaneProblem, acceleration: Column) -> tuple[Column, Any]:
-    """Take a Newton step; return the accelerations and the number of rows that start or stop acting."""
+    """Take a Newton step; return the accelerations, and 1 if rows start or stop acting in it, else 0."""
     residual = _residual(problem, acceleration)
     inertial = [
         moved - force for moved, force in zip(symmetric_product(problem.mass, acceleration), problem.force, strict=True)
@@ -185,7 +185,7 @@ def _improve(problem: LaneProblem, acceleration: Column) -> tuple[Column, Any]:
 
 
 def _changes(problem: LaneProblem, before: _Residual, after: _Residual) -> Any:
-    """Return 1 if rows that can act start or stop acting, else 0: an int32 without lanes."""
+    """Return 1 if any row starts or stops acting between two residuals, else 0: an int32 without lanes."""
     changed: Any = 0.0
     for old, new in zip(_acting(problem, before.rows), _acting(problem, after.rows), strict=True):
         changed = changed + jnp.abs(old - new)

@@ -82,7 +82,7 @@ def solve(problem: Problem, iterations: int, exact: Any, in_kernel: bool = False
 
     Args:
         problem: The problem.
-        iterations: Newton steps with a line search.
+        iterations: Number of Newton steps with a line search.
         exact: Take one more, full Newton step where it reduces the gradient (see `mjx_model.step`): a bool, or an int32 scalar,
             1 or 0, that is known only at run time.
         in_kernel: Generate code for a GPU kernel: loops carry intermediate values, since registers are free, and the line
@@ -124,7 +124,7 @@ class _Iterate(NamedTuple):
 
     Attributes:
         acceleration: Accelerations of the joints.
-        residual: Difference of each row from its target.
+        residual: Residual of each row: its acceleration minus the reference acceleration.
         force: Constraint forces on the joints.
         gradient: Gradient of the cost.
     """
@@ -145,12 +145,12 @@ class _NewtonSolver:
         self._separate = [row for row in range(len(problem.jacobian)) if row not in in_cones]
 
     def residual(self, acceleration: Sequence[Any]) -> Column:
-        """Return the difference of each row from its target."""
+        """Return the residual of each row: its acceleration minus the reference acceleration."""
         rows = zip(self._problem.jacobian, self._problem.target, strict=True)
         return [row_product(entries, acceleration) - target for entries, target in rows]
 
     def cost(self, acceleration: Column, residual: Column, free: Column) -> Any:
-        """Return the cost, up to a constant."""
+        """Return the cost: that of the constraints, plus the inertial cost of deviating from the unconstrained ``free``."""
         problem = self._problem
         cost: Any = 0.0
         if acceleration is not free:
