@@ -305,7 +305,7 @@ def measure_as_process(timed: list[Timed], cycles: int) -> None:
     seconds = []
     for configuration in timed:
         configuration.compile()
-        distributed.meet("compiled")
+        distributed.sync_processes("compiled")
         seconds.append(configuration.run(cycles))
         configuration.loop = None
     print(json.dumps(seconds), flush=True)

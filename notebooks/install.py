@@ -19,7 +19,7 @@ _OLDEST_DRIVER = {"cuda13": 580, "cuda12": 525}
 _PLUGINS = {extra: f"jax-{extra}-plugin" for extra in _OLDEST_DRIVER}
 
 
-def driver() -> int | None:
+def find_driver_version() -> int | None:
     """Return the major version of the NVIDIA driver; None without a GPU."""
     try:
         answer = subprocess.run(
@@ -30,7 +30,7 @@ def driver() -> int | None:
         return None
 
 
-def versions(names: tuple[str, ...]) -> dict[str, str]:
+def installed_versions(names: tuple[str, ...]) -> dict[str, str]:
     """Return the versions of the installed ones among the distributions ``names``."""
     installed = {}
     for name in names:
@@ -71,11 +71,11 @@ def required_jax(source: Path) -> Requirement:
     return next(requirement for requirement in requirements if requirement.name == "jax")
 
 
-def loaded() -> dict[str, str]:
+def loaded_versions() -> dict[str, str]:
     """Return the versions on disk of the distributions from which this process has imported modules."""
     providers = importlib.metadata.packages_distributions()
     names = {name for module in list(sys.modules) for name in providers.get(module, ())}
-    return versions(tuple(sorted(names)))
+    return installed_versions(tuple(sorted(names)))
 
 
 def install(source: Path) -> str | None:
@@ -84,9 +84,9 @@ def install(source: Path) -> str | None:
     Returns:
         None, or a line with the reason why the notebook cannot continue.
     """
-    driver_version = driver()
+    driver_version = find_driver_version()
     extra = cuda_extra(
-        driver_version, versions(("jax", *(f"jax-{name}-plugin" for name in _OLDEST_DRIVER))), required_jax(source)
+        driver_version, installed_versions(("jax", *(f"jax-{name}-plugin" for name in _OLDEST_DRIVER))), required_jax(source)
     )
     usable = driver_version is not None and driver_version >= min(_OLDEST_DRIVER.values())
     if driver_version is not None and not usable:
@@ -95,7 +95,7 @@ def install(source: Path) -> str | None:
     limits = [] if usable else ["--constraint", str(source.resolve() / "requirements" / "cpu.in")]
     target = f"{source.resolve()}[{extra}]" if extra else str(source.resolve())
     print(f"installing {target}; this takes a minute or more", flush=True)
-    before = loaded()
+    before = loaded_versions()
     pip = subprocess.run(
         [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *limits, target],
         stdout=subprocess.PIPE,
@@ -106,7 +106,7 @@ def install(source: Path) -> str | None:
     importlib.invalidate_caches()
     if pip.returncode:
         return f"pip could not install {target}; what it says stands above"
-    replaced = [name for name, version in loaded().items() if before.get(name, version) != version]
+    replaced = [name for name, version in loaded_versions().items() if before.get(name, version) != version]
     if replaced:
         return (
             f"{', '.join(replaced)} was in use and has been replaced: restart the session, then run the notebook from the top"

@@ -29,7 +29,7 @@ BUSY_CORES = 0.3
 _SAMPLE_S, _CALIBRATION_S, _REPEATS = 0.4, 0.04, 5
 
 
-def machine() -> str:
+def machine_id() -> str:
     """Return an identifier of this machine: 12 hexadecimal digits, different for machines of the same name."""
     words = [platform.node()]
     for file in ("/etc/machine-id", "/var/lib/dbus/machine-id"):
@@ -131,7 +131,7 @@ class Watch:
         """Return the conditions of a record: machine, cores, load before the benchmark, and calibrations around it."""
         before, self._before = self._before, calibrate()
         return {
-            "machine": machine(),
+            "machine": machine_id(),
             "cores": self._cores,
             "busy_cores": self._busy,
             "calibration": {"before": before, "after": self._before},

@@ -32,7 +32,7 @@ def measure(settings: Settings) -> Iterator[Measurement]:
     """
     env = settings.make_env()
     steps = env.horizon if settings.on_accelerator else 10
-    counts = settings.counts(CPU_COUNTS, ACCELERATOR_COUNTS)
+    counts = settings.batch_sizes(CPU_COUNTS, ACCELERATOR_COUNTS)
     # One program creates all initial states; smaller batches use the first of them.
     states = start_states(env, max(counts))
 

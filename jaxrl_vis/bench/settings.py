@@ -57,7 +57,7 @@ class Settings:
             on_accelerator=accelerator,
         )
 
-    def counts(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
+    def batch_sizes(self, cpu: tuple[int, ...], accelerator: tuple[int, ...]) -> tuple[int, ...]:
         """Return the batch sizes to measure: the requested ones, or the defaults for this kind of device."""
         return self.envs or (accelerator if self.on_accelerator else cpu)
 

@@ -140,7 +140,7 @@ def single_device_config(config: Config) -> Config:
     )
 
 
-def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
+def _time_single_device(env: GoalEnv, config: Config, settings: Settings) -> float:
     """Time an iteration of `single_device_config`, in seconds."""
     config_of_one = single_device_config(config)
     return time_iterations(Programs(config_of_one, make_train_step(env, config_of_one), cache=False), settings.repeats)[
@@ -151,16 +151,16 @@ def _time_share(env: GoalEnv, config: Config, settings: Settings) -> float:
 def measure(settings: Settings) -> Iterator[Measurement]:
     """Yield the total environment steps and gradient steps per second of all seeds; print the time of each part."""
     env = settings.make_env()
-    for count in settings.counts((0,), (0,)):  # 0: the preset's number of environments
+    for count in settings.batch_sizes((0,), (0,)):  # 0: the preset's number of environments
         config = training_config(settings, **({"num_envs": count} if count else {}))
         program, started = make_train_step(env, config), time.perf_counter()
         programs = Programs(config, program, cache=False)
         loop, timing, seconds = time_iterations(programs, settings.repeats)
         parts = {**time_parts(programs, loop, settings.repeats), "host": seconds["host"]}
         del loop
-        efficiency = (
-            {} if config.run.devices == 1 else {"efficiency": round(_time_share(env, config, settings) / timing.median_s, 3)}
-        )
+        efficiency = {}
+        if config.run.devices > 1:
+            efficiency["efficiency"] = round(_time_single_device(env, config, settings) / timing.median_s, 3)
         episodes, _ = time_episodes(env, config.run.num_envs * config.run.seeds // config.run.devices, settings.repeats)
         predicted = episodes.median_s + parts["updates"]
         print(describe(timing.median_s, parts, predicted), flush=True)

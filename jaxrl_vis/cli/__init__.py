@@ -100,20 +100,20 @@ def _run_with_status(words: Sequence[str], ending: Ending) -> int:
         return _command(words)()
     except tuple(_STATUS) as error:
         if ending.signal is not None:  # which probably went to child processes as well
-            return _ended_by(ending.signal)
+            return _report_signal(ending.signal)
         print(f"{PROGRAM}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return next(status for kind, status in _STATUS.items() if isinstance(error, kind))
     except KeyboardInterrupt:
-        return 130 if ending.signal is None else _ended_by(ending.signal)
+        return 130 if ending.signal is None else _report_signal(ending.signal)
     except Terminated as stop:  # from `Interruption`, which has reported what is saved
-        return 128 + stop.signal if ending.signal is None else _ended_by(ending.signal)
+        return 128 + stop.signal if ending.signal is None else _report_signal(ending.signal)
     except Exception as error:
         if ending.signal is not None:
-            return _ended_by(ending.signal)
+            return _report_signal(ending.signal)
         if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:  # from wherever a path was first used
             print(f"{PROGRAM}: {str(error.filename)[:80]}... cannot be used ({error.strerror})", file=sys.stderr)
             return _STATUS[RequestError]
-        if not distributed.are_several():
+        if not distributed.is_multi_process():
             raise
         traceback.print_exc()
         print(
@@ -124,7 +124,7 @@ def _run_with_status(words: Sequence[str], ending: Ending) -> int:
         return 1
 
 
-def _ended_by(number: int) -> int:
+def _report_signal(number: int) -> int:
     print(f"{PROGRAM}: {signal_name(number)}: ended before it was done", file=sys.stderr)
     return 128 + number
 
@@ -147,11 +147,11 @@ def entry() -> None:
     second signal, are not waited for.
     """
     reserve_standard_files()
-    status = main(should_stop=lambda number: os._exit(_ended_by(number)))
+    status = main(should_stop=lambda number: os._exit(_report_signal(number)))
     detach_broken_streams()
     if status == _STATUS[RequestError]:
-        distributed.leave_together()
-    if status > 128 or (status and distributed.are_several()):
+        distributed.shut_down_together()
+    if status > 128 or (status and distributed.is_multi_process()):
         os._exit(status)  # failed processes must not wait for each other
     sys.exit(status)
 

@@ -27,7 +27,7 @@ from jaxrl_vis.errors import RequestError, nearest
 PROGRAM = "jaxrl-vis"
 
 # Options of brax, Stable-Baselines3, its zoo and CleanRL that users may try -> the equivalent here.
-_ELSEWHERE = {
+_FOREIGN_OPTIONS = {
     **dict.fromkeys(
         ("--cuda", "--no-cuda", "--device", "--gpu", "--cpu"),
         "JAX takes the accelerator that it finds; the environment variable JAX_PLATFORMS=cpu, cuda or tpu chooses",
@@ -177,8 +177,8 @@ def parse(command: type[T], words: Sequence[str], name: str = "") -> T:
         flags = [option.flag for option in options.values() if not option.positional]
         if word == "--version":
             raise RequestError(f"--version goes without a command: {PROGRAM} --version")
-        if word in _ELSEWHERE and word not in flags:
-            raise RequestError(f"unknown option {word}: {_ELSEWHERE[word]}")
+        if word in _FOREIGN_OPTIONS and word not in flags:
+            raise RequestError(f"unknown option {word}: {_FOREIGN_OPTIONS[word]}")
         raise RequestError(f"unknown option {word}{nearest(word, flags, f'see {program} --help')}")
     values: dict[str, Any] = {}
     for key, option in options.items():

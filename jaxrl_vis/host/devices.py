@@ -74,7 +74,7 @@ def check_devices() -> None:
             raise RequestError(f"JAX finds no device to compute on: {' '.join(str(error).split())}") from error
         available = _default_platform(requested)
         raise RequestError(
-            f"JAX_PLATFORMS={requested}, but JAX finds no such device here, only {available}{_mend(requested)}"
+            f"JAX_PLATFORMS={requested}, but JAX finds no such device here, only {available}{_hint(requested)}"
         ) from error
 
 
@@ -91,7 +91,7 @@ def enable_compilation_cache() -> str:
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
-    from jaxrl_vis.host.cache_entries import mend_damaged_entries
+    from jaxrl_vis.host.cache_entries import repair_damaged_entries
 
     default = default_cache()
     if not jax.config.jax_compilation_cache_dir and _write_fault(default) is None:
@@ -102,12 +102,12 @@ def enable_compilation_cache() -> str:
         compilation_cache.reset_cache()
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    hush_cache()
-    mend_damaged_entries()
+    silence_cache_warnings()
+    repair_damaged_entries()
     return str(jax.config.jax_compilation_cache_dir or "")
 
 
-def hush_cache() -> None:
+def silence_cache_warnings() -> None:
     """Suppress JAX's warnings about an unusable cache, one per program; the run reports it once."""
     import jax
 
@@ -178,7 +178,7 @@ class Device:
 
 
 # Run in a separate process: once initialised, JAX holds some of a GPU's memory until the process ends.
-_ASK = """
+_LIST_DEVICES = """
 import json, sys
 from jaxrl_vis.host.devices import check_devices
 from jaxrl_vis.errors import RequestError
@@ -198,7 +198,7 @@ def list_devices() -> list[Device]:
         RequestError: JAX finds no device.
     """
     environment = child_environment() | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    done = subprocess.run([sys.executable, "-c", _ASK], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", _LIST_DEVICES], env=environment, capture_output=True, text=True)
     lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
     if done.returncode or not lines:
         raise RequestError(lines[-1] if lines else "JAX finds no device to compute on")
@@ -250,7 +250,7 @@ def _default_platform(requested: str) -> str:
         clear_backends()  # otherwise the next call would return the backend initialised here
 
 
-def _mend(requested: str) -> str:
+def _hint(requested: str) -> str:
     wanted = {word.strip().lower() for word in requested.split(",")}
     if "cpu" in wanted:
         return "; write JAX_PLATFORMS=cpu"

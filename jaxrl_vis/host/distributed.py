@@ -132,7 +132,7 @@ def _wait_for(coordinator: str, seconds: float) -> None:
     )
 
 
-def are_several() -> bool:
+def is_multi_process() -> bool:
     """Return True if there are several processes."""
     return _count_and_index()[0] > 1
 
@@ -151,24 +151,24 @@ def _count_and_index() -> tuple[int, int]:
     return (jax.process_count(), jax.process_index()) if jax.distributed.is_initialized() else (1, 0)
 
 
-def meet(name: str) -> None:
+def sync_processes(name: str) -> None:
     """Wait until all processes have reached this point.
 
     Args:
         name: Name of the synchronisation point.
     """
-    if are_several():
+    if is_multi_process():
         from jax.experimental import multihost_utils
 
         multihost_utils.sync_global_devices(name)
 
 
-def leave_together() -> None:
+def shut_down_together() -> None:
     """Shut down together with the other processes, within a timeout, so that each can print its error before JAX ends it.
 
     Call it after an error in the request, which all processes will raise.
     """
-    if not are_several():
+    if not is_multi_process():
         return
     import jax
 
@@ -185,7 +185,7 @@ def any_process(answer: bool) -> bool:
 
 def max_over_processes(number: int) -> int:
     """Return the maximum of ``number`` over all processes; a collective call."""
-    if not are_several():
+    if not is_multi_process():
         return number
     import numpy as np
     from jax.experimental import multihost_utils

@@ -13,7 +13,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis_envs.documents import parse_json, read_text
 
 _TEMPORARY = re.compile(r"\.\d+-[0-9a-f]{16}\.tmp")
-_MOST_BYTES = 200_000_000  # maximum size of a JSON file: 100 times the records of the largest study
+_MAX_JSON_BYTES = 200_000_000  # maximum size of a JSON file: 100 times the records of the largest study
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
@@ -98,7 +98,7 @@ def read_json(path: Path, kind: type = dict, hint: str = "") -> Any:
     hint = f": {hint}" if hint else ""
     check_path(path)
     try:
-        text = read_text(path, _MOST_BYTES)
+        text = read_text(path, _MAX_JSON_BYTES)
     except OSError as error:
         raise RequestError(f"cannot read {path} ({error.strerror or type(error).__name__}){hint}") from error
     except ValueError as error:
@@ -150,7 +150,7 @@ def make_private(folder: Path) -> None:
         folder.chmod(0o700)
 
 
-def stranger_to(status: os.stat_result) -> str | None:
+def foreign_writer(status: os.stat_result) -> str | None:
     """Describe who else than this user and root may have written a file or folder; None if nobody, and on Windows.
 
     Args:
@@ -174,7 +174,7 @@ def read_private(path: Path) -> bytes | None:
     try:
         with os.fdopen(os.open(path, flags), "rb") as file:
             status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode) or stranger_to(status) is not None:
+            if not stat.S_ISREG(status.st_mode) or foreign_writer(status) is not None:
                 return None
             return file.read()
     except (OSError, ValueError):

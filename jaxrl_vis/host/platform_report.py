@@ -24,7 +24,7 @@ SCHEMA = 1
 _TASK = "VisualReacher"
 
 
-def driver() -> str | None:
+def driver_version() -> str | None:
     """Return the version of the NVIDIA driver; None if there is none."""
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
@@ -118,7 +118,7 @@ def to_record(findings: dict[str, Any], training: dict[str, Any] | None) -> dict
         "cores": os.cpu_count(),
         "accelerator": None if device["platform"] == "cpu" else f"{device['kind']} x{device['count']}",
         "backend": device["platform"],
-        "driver": driver(),
+        "driver": driver_version(),
         "versions": provenance.versions(),
         "revision": provenance.revision(12),
         "checks": {name: finding["passed"] for name, finding in findings.items()},

@@ -211,7 +211,7 @@ class RecordFile:
             RequestError: The file has other conditions, cannot be read, or holds a damaged record.
         """
         self.records: dict[int, Record] = {}
-        self._path, self._about, self._summary = path, json.loads(json.dumps(finite(about))), summary
+        self._path, self._about, self._summary = path, json.loads(json.dumps(replace_non_finite(about))), summary
         self._lines: dict[int, str] = {}
         if path is not None and path.exists():
             for record in _read(path, self._about):
@@ -236,7 +236,7 @@ class RecordFile:
         if self._path is None:
             return
         ordered = sorted(self.records)
-        figures = finite({**self._about, **self._summary([self.records[number] for number in ordered])})
+        figures = replace_non_finite({**self._about, **self._summary([self.records[number] for number in ordered])})
         head = json.dumps(figures, indent=2)
         lines = ",\n".join(f"    {self._lines[number]}" for number in ordered)
         write_atomically(self._path, f'{head[:-2]},\n  "each": [\n{lines}\n  ]\n}}\n')
@@ -251,18 +251,18 @@ class RecordFile:
             ) from error
 
     def _keep(self, number: int, record: Record) -> None:
-        record = finite(record)
+        record = replace_non_finite(record)
         # Results must not depend on whether a record was read from the file.
         line = json.dumps(record, allow_nan=False)
         self.records[number], self._lines[number] = json.loads(line), line
 
 
-def finite(value: Any) -> Any:
+def replace_non_finite(value: Any) -> Any:
     """Return a copy with non-finite numbers replaced by None, at any depth, for JSON; tuples become lists."""
     if isinstance(value, Mapping):
-        return {name: finite(item) for name, item in value.items()}
+        return {name: replace_non_finite(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
+        return [replace_non_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

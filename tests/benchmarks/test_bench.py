@@ -113,7 +113,7 @@ def test_what_a_machine_is_calibrated_with_is_computed_when_it_is_measured() -> 
 def test_the_machine_is_watched() -> None:
     watch = conditions.Watch()
     found = watch.conditions()
-    assert conditions.machine() == found["machine"] and len(found["machine"]) == 12
+    assert conditions.machine_id() == found["machine"] and len(found["machine"]) == 12
     assert found["busy_cores"] is None or 0.0 <= found["busy_cores"] <= 2 * found["cores"]
     for each in found["calibration"].values():
         assert set(each) == {"gflops", "gbytes_per_s"} and all(value > 0.0 for value in each.values())

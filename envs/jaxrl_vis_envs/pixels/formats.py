@@ -13,7 +13,7 @@ from jaxrl_vis_envs.pixels.observations import encode_depth
 Dtype = Literal["float32", "uint8"]
 Layout = Literal["dict", "images", "image"]
 PREFIX = "pixels/"
-GOAL = "/goal"
+GOAL_SUFFIX = "/goal"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Format:
 
         Args:
             views: Images from `Views`.
-            suffix: End of the names: `GOAL` for goal images.
+            suffix: End of the names: `GOAL_SUFFIX` for goal images.
 
         Returns:
             ``pixels/CAMERA`` for colours, ``pixels/CAMERA/OUTPUT`` for other outputs, each [H, W, C].
@@ -95,7 +95,7 @@ def image_names(outputs: Mapping[str, tuple[str, ...]]) -> list[str]:
         ValueError: Two images have the same name.
     """
     names = [_name(camera, output) for camera, chosen in outputs.items() for output in chosen]
-    if len(set(names)) < len(names) or any(name + GOAL in names for name in names):
+    if len(set(names)) < len(names) or any(name + GOAL_SUFFIX in names for name in names):
         raise ValueError(f"two images have the same name among {', '.join(names)}: name the cameras in a dictionary")
     return names
 

@@ -93,16 +93,16 @@ class ImageObserver:
         """
         scene = varied_scene(self.scene, domain)
         if self._config.frame_stack == 1 or history is None:
-            return jnp.tile(self._draw(scene, data), (self._config.frame_stack, 1, 1))
+            return jnp.tile(self._render(scene, data), (self._config.frame_stack, 1, 1))
 
-        def draw_at(qpos: jax.Array) -> jax.Array:
+        def render_at(qpos: jax.Array) -> jax.Array:
             with jax.default_matmul_precision("highest"):
-                return self._draw(scene, mjx_model.kinematics(self._model, data.replace(qpos=qpos)))
+                return self._render(scene, mjx_model.kinematics(self._model, data.replace(qpos=qpos)))
 
-        images = jax.vmap(draw_at)(jnp.concatenate([data.qpos[None], history]))
+        images = jax.vmap(render_at)(jnp.concatenate([data.qpos[None], history]))
         return images.reshape(-1, *images.shape[2:])
 
-    def _draw(self, scene: Scene, data: mjx.Data) -> jax.Array:
+    def _render(self, scene: Scene, data: mjx.Data) -> jax.Array:
         """Render one image [channels, H, W]."""
         wants_colour, wants_depth = self._config.pixels != "depth", self._config.pixels != "rgb"
         marks = self._marked is not None

@@ -66,7 +66,7 @@ def add_stalks(spec: mujoco.MjSpec, stalks: int, pushed_by: tuple[str, ...], kne
         stalks: Number of stalks.
         pushed_by: Names of geoms that push the upper segments.
         knees: If False, stalks are one straight segment that rotates about its foot: half the joints, and exact only for a push
-            at `SWAY_HEIGHT`. Not supported by `fit`.
+            at `SWAY_HEIGHT`. Not supported by `set_stalk_properties`.
     """
     segments = ((0, KNEE), (1, TOP - KNEE)) if knees else ((None, TOP),)
     for index in range(stalks):
@@ -138,7 +138,7 @@ def shapes(stands: Stands) -> Shape:
     return Shape(stands.foot, stands.knee, stands.top, stands.radius, stands.bending_radius)
 
 
-def fit(model: Any, layout: Layout, shape: Shape) -> Any:
+def set_stalk_properties(model: Any, layout: Layout, shape: Shape) -> Any:
     """Return ``model`` (an `mjx.Model`) with the lengths, radii, masses, stiffness and damping of the stalks in ``shape``.
 
     `place_stands` sets the positions of the feet and the directions of the lower segments. Stalks must have knees.
@@ -197,7 +197,7 @@ class Gusts(NamedTuple):
     phase: Any
 
 
-def gusts(key: jax.Array, strength: Any) -> Gusts:
+def sample_gusts(key: jax.Array, strength: Any) -> Gusts:
     """Sample the wind over one stand: its heading, and the frequencies and phases of its waves.
 
     Args:
@@ -246,19 +246,19 @@ def at_height(data: Any, layout: Layout, height: Any) -> jax.Array:
     return start + ((height - start[:, 2]) / axis[:, 2])[:, None] * axis
 
 
-def _properties(radius: Any, segment: int | None, numeric: Any) -> tuple[Any, Any, Any, Any]:
+def _properties(radius: Any, segment: int | None, xp: Any) -> tuple[Any, Any, Any, Any]:
     """Return spring (N m/rad) and damper (N m s/rad) of each hinge, mass (kg) and inertia (kg m^2) of a segment of a stalk.
 
     ``segment`` is 0 for the lower segment, 1 for the upper one, None for a stalk in one segment.
     """
     length = TOP if segment is None else (KNEE, TOP - KNEE)[segment]
     compliance = SWAY_HEIGHT / 3 if segment is None else _COMPLIANCE[segment]
-    stiffness = MODULUS * 0.25 * numeric.pi * radius**4 / compliance
-    mass = _LEAVES * DENSITY * numeric.pi * radius**2 * length
+    stiffness = MODULUS * 0.25 * xp.pi * radius**4 / compliance
+    mass = _LEAVES * DENSITY * xp.pi * radius**2 * length
     inertia = mass * length**2 / 12
     # The whole plant rotates about the ground, the part above the knee about the knee.
-    swung = _LEAVES * DENSITY * numeric.pi * radius**2 * ((TOP - KNEE) ** 3 if segment == 1 else TOP**3) / 3
-    return stiffness, 2 * _DAMPING_RATIO * numeric.sqrt(stiffness * swung), mass, inertia
+    swung = _LEAVES * DENSITY * xp.pi * radius**2 * ((TOP - KNEE) ** 3 if segment == 1 else TOP**3) / 3
+    return stiffness, 2 * _DAMPING_RATIO * xp.sqrt(stiffness * swung), mass, inertia
 
 
 def _segments(shape: Shape) -> tuple[jax.Array, jax.Array, jax.Array]:

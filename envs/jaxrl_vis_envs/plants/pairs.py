@@ -12,10 +12,10 @@ from jaxrl_vis_envs.plants.cameras import Drive, Pose, drive
 from jaxrl_vis_envs.plants.family import Family
 from jaxrl_vis_envs.plants.field import Plot, generator
 from jaxrl_vis_envs.plants.rendering import drawing, imaging, shading, tables
-from jaxrl_vis_envs.plants.rendering.backdrop import draw_backdrop
-from jaxrl_vis_envs.plants.rendering.blades import Blades, cover_with_blades, draw_blades
+from jaxrl_vis_envs.plants.rendering.backdrop import sample_backdrop
+from jaxrl_vis_envs.plants.rendering.blades import Blades, render_blades, sample_blades
 from jaxrl_vis_envs.plants.rendering.degrading import degrade
-from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, Surfaces, build
+from jaxrl_vis_envs.plants.rendering.surfaces import NOTHING, Surfaces, build_surfaces
 
 _FLASH = np.array([0.05, -0.10, -0.02])
 """Position of the flash in the left camera's frame, m: above the middle of the pair."""
@@ -36,7 +36,7 @@ def daylight(family: Family, seed: int) -> shading.Day | None:
     warm = np.array([1.0, rng.uniform(0.85, 1.0), rng.uniform(0.65, 0.95)])
     blue = np.array([rng.uniform(0.75, 1.0), rng.uniform(0.85, 1.0), 1.0])
     shadow = (scene.shadow[0], rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.4), rng.uniform(0.02, 0.1))
-    backdrop = draw_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
+    backdrop = sample_backdrop(rng, scene.indoors > 0, scene.photographs > 0, scene.sky[0] + 0.3 * strength)
     values = (sun, strength * warm, scene.sky[0] * blue, np.array(shadow), backdrop)
     return shading.Day(*(jnp.asarray(value, jnp.float32) for value in values))
 
@@ -47,7 +47,7 @@ def grass(family: Family, seed: int) -> Blades | None:
     rng = generator(family, seed, "grass")
     if family.scene.share <= 0 or family.scene.grass <= 0 or rng.random() < _MOWN:
         return None
-    return draw_blades(rng, family.layout.plot_length, family.rig.distance)
+    return sample_blades(rng, family.layout.plot_length, family.rig.distance)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Sequence:
     @classmethod
     def of(cls, plot: Plot) -> "Sequence":
         """Return the pairs of a plot as taken by its family's cameras."""
-        return cls(plot, build(plot), drive(plot.family, plot.seed))
+        return cls(plot, build_surfaces(plot), drive(plot.family, plot.seed))
 
     def __len__(self) -> int:
         return len(self.drive.poses)
@@ -106,16 +106,16 @@ class Sequence:
         if not 0 <= frame < len(self):
             raise IndexError(f"pair {frame} of {len(self)}")
         true = self.drive.true
-        left, instance, depth = self._take(frame, 0)
-        right, _, _ = self._take(frame, 1)
+        left, instance, depth = self._render(frame, 0)
+        right, _, _ = self._render(frame, 1)
         disparity = true.focal * true.baseline / depth
         return Pair(left, right, instance, depth, disparity, self.drive.poses[frame], frame)
 
     def left(self, frame: int) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Render the left image of one pair, with its instance and depth images; see `Pair`."""
-        return self._take(frame, 0)
+        return self._render(frame, 0)
 
-    def _take(self, frame: int, side: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def _render(self, frame: int, side: int) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Render one image, with its instance and depth images; side 0 is the left one."""
         family, drive = self.plot.family, self.drive
         pose, true = drive.poses[frame], drive.true
@@ -142,7 +142,7 @@ class Sequence:
         if blades is not None:
             camera = (pose.position + offset @ pose.rotation, pose.rotation, true.focal, true.centre)
             arrays = np.asarray(radiance), np.asarray(instance), np.asarray(depth)
-            radiance = jnp.asarray(cover_with_blades(*arrays, blades, camera))
+            radiance = jnp.asarray(render_blades(*arrays, blades, camera))
         gain = 2.0 * gains[frame, side]
         if shot.day is not None:
             gain *= 0.5 * family.scene.brightness[0] / max(float(radiance.mean()), 1e-4)

@@ -57,10 +57,10 @@ class MjxGoalEnv(GoalEnv):
         self.frame_stack = getattr(config, "frame_stack", 1)
         self.mj_model = mj_model
         self._model = mjx_model.put_model(mj_model)
-        self._draw = observer(mj_model) if observer is not None else None
-        self.marks_object = self._draw is not None and self.select_marked(config) is not None
+        self._observer = observer(mj_model) if observer is not None else None
+        self.marks_object = self._observer is not None and self.select_marked(config) is not None
         self._randomization: randomization.Randomization = getattr(config, "randomization", randomization.OFF)
-        self._scene: Scene | None = getattr(self._draw, "scene", None)
+        self._scene: Scene | None = getattr(self._observer, "scene", None)
         if self._randomization.varies_appearance and self._scene is None:
             raise ValueError("camera, lights and colours can only be randomized in a task that draws images")
 
@@ -146,8 +146,8 @@ class MjxGoalEnv(GoalEnv):
     @property
     def observation_spec(self) -> jax.ShapeDtypeStruct:
         """Shape and dtype of `observe`, without tracing physics or renderer."""
-        if isinstance(self._draw, ImageObserver):
-            return self._draw.spec
+        if isinstance(self._observer, ImageObserver):
+            return self._observer.spec
         shape = jax.eval_shape(
             lambda data: self._observe(data, start_history(data.qpos, self.frame_stack), None), self._data_shape
         )
@@ -175,9 +175,9 @@ class MjxGoalEnv(GoalEnv):
         return varied
 
     def _observe(self, data: mjx.Data, history: jax.Array | None, domain: randomization.Domain | None) -> jax.Array:
-        if self._draw is None:
+        if self._observer is None:
             return self.observe_state(data)
-        return self._draw(data, history) if self._scene is None else self._draw(data, history, domain)
+        return self._observer(data, history) if self._scene is None else self._observer(data, history, domain)
 
 
 def register_task(task: type[MjxGoalEnv], config_class: type, visual_config_class: type) -> None:

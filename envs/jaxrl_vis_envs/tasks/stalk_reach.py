@@ -144,7 +144,7 @@ class StalkReach(MjxGoalEnv):
     def sample_goal(self, key: jax.Array) -> mjx.Data:
         episode = self._sample(key)
         still = jnp.zeros((self.config.stalks, 2), jnp.float32)
-        position = _along(episode.foot, episode.turn, episode.height)[episode.wind[2].astype(int)]
+        position = _rest_points(episode.foot, episode.turn, episode.height)[episode.wind[2].astype(int)]
         return self.configuration(episode, position, still)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
@@ -182,7 +182,7 @@ class StalkReach(MjxGoalEnv):
         """Return the displacement of the target stalk from rest at the height of the grip: [3] float32, m."""
         stalk = data.mocap_pos[self._wind][2].astype(int)
         height = data.qpos[0]
-        rest = _along(data.mocap_pos[self._layout.mocap], data.mocap_quat[self._layout.mocap], height)
+        rest = _rest_points(data.mocap_pos[self._layout.mocap], data.mocap_quat[self._layout.mocap], height)
         return (bending.at_height(data, self._layout, height) - rest)[stalk]
 
     def _gusts(self, wind: jax.Array) -> bending.Gusts:
@@ -202,23 +202,23 @@ class StalkReach(MjxGoalEnv):
         along = along - 0.5 * along[-1]
         across = config.offset * jax.random.uniform(offset_key, (count,), jnp.float32, -1.0, 1.0)
         lean = math.radians(config.lean) * jax.random.uniform(lean_key, (count, 2), jnp.float32, -1.0, 1.0)
-        turn = jax.vmap(rotations.quat_mul)(_turn(0, lean[:, 0]), _turn(1, lean[:, 1]))
+        turn = jax.vmap(rotations.quat_mul)(_axis_quaternions(0, lean[:, 0]), _axis_quaternions(1, lean[:, 1]))
         # Stalks are at their sampled positions at `SWAY_HEIGHT`, where the arm works, and not at the ground.
         upright = jnp.stack([along, across, jnp.zeros(count)], axis=-1)
-        foot = upright.at[:, :2].add(-_along(jnp.zeros_like(upright), turn, bending.SWAY_HEIGHT)[:, :2])
+        foot = upright.at[:, :2].add(-_rest_points(jnp.zeros_like(upright), turn, bending.SWAY_HEIGHT)[:, :2])
         stalk = jax.random.randint(stalk_key, (), 0, count).astype(jnp.float32)
         angles = jax.random.uniform(wind_key, (2,), jnp.float32, 0.0, 2 * np.pi)
         height = jax.random.uniform(height_key, (), jnp.float32, *config.goal_heights)
         return _Episode(foot, turn, jnp.append(angles, stalk), height)
 
 
-def _turn(axis: int, angle: jax.Array) -> jax.Array:
+def _axis_quaternions(axis: int, angle: jax.Array) -> jax.Array:
     """Return quaternions [N, 4] (scalar first) of rotations by ``angle`` [N] (rad) about a coordinate axis."""
     quaternion = jnp.zeros((*angle.shape, 4), jnp.float32)
     return quaternion.at[:, 0].set(jnp.cos(0.5 * angle)).at[:, 1 + axis].set(jnp.sin(0.5 * angle))
 
 
-def _along(foot: jax.Array, turn: jax.Array, height: jax.Array | float) -> jax.Array:
+def _rest_points(foot: jax.Array, turn: jax.Array, height: jax.Array | float) -> jax.Array:
     """Return the points [N, 3] (m, world) of stalks at rest at a ``height`` (m)."""
     axis = jax.vmap(lambda quaternion: rotations.rotate(jnp.array([0.0, 0.0, 1.0]), quaternion))(turn)
     return foot + height / axis[:, 2:] * axis

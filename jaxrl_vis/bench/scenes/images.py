@@ -103,7 +103,7 @@ def cases(scene: str, settings: Settings, sizes: tuple[int, ...], min_poses: int
             continue
         spread = models.SPREADS[variant["poses"]]
         counts = (SCENE_CPU_COUNTS.get(scene, CPU_COUNTS), SCENE_ACCELERATOR_COUNTS.get(scene, ACCELERATOR_COUNTS))
-        for count in settings.counts(*counts):
+        for count in settings.batch_sizes(*counts):
             worlds = -(-count // cameras)
             batches = [models.random_poses(mj_model, max(worlds, min_poses), seed, spread) for seed in (1, 2)]
             for size in sizes:

@@ -68,7 +68,7 @@ def simulate(model: mjx.Model, data: mjx.Data, count: int, exact: bool | None = 
 def _simulate_boxes_with(take: Callable[..., JointState], model: mjx.Model, data: mjx.Data, count: int) -> mjx.Data:
     """Implement `simulate` of a model with boxes with ``take``, a function with the arguments of `box_kernel.simulate`."""
     constants = box_model.build_box_model(model)
-    return _replaced(model, data, count, constants.tree, functools.partial(take, constants))
+    return _replace_state(model, data, count, constants.tree, functools.partial(take, constants))
 
 
 def _simulate_with(
@@ -76,10 +76,10 @@ def _simulate_with(
 ) -> mjx.Data:
     """Implement `simulate` with ``take``, a function with the arguments of `steps.simulate_arrays`."""
     constants = scalar_model.build_scalar_model(model)
-    return _replaced(model, data, count, constants, functools.partial(take, constants, exact=exact))
+    return _replace_state(model, data, count, constants, functools.partial(take, constants, exact=exact))
 
 
-def _replaced(
+def _replace_state(
     model: mjx.Model, data: mjx.Data, count: int, constants: ScalarModel, take: Callable[..., JointState]
 ) -> mjx.Data:
     """Return ``data`` with the state after ``count`` steps of ``take``; ``constants`` are those of the tree."""

@@ -97,7 +97,7 @@ def simulate(
     Returns:
         The state after the steps.
     """
-    control = clipped_controls(constants, control)
+    control = clip_controls(constants, control)
     poses = link_frames.mocap_poses(tuple(links.mocap_link(index) for index in constants.mocaps), list(mocap))
     inputs = StepInputs(timestep, control, applied, poses)
 
@@ -109,7 +109,7 @@ def simulate(
     return jax.lax.fori_loop(0, count, advance, state)
 
 
-def clipped_controls(constants: ScalarModel, control: Column) -> Column:
+def clip_controls(constants: ScalarModel, control: Column) -> Column:
     """Clip the controls, one per actuator, to their bounds."""
     bounds = [actuator.control_bounds for actuator in constants.actuators]
     return [_clip(number, pair) for number, pair in zip(control, bounds, strict=True)]

@@ -17,7 +17,7 @@ _HORIZON = SHAPE[0] // 2
 _PHOTOGRAPHS = (("skimage", "data"), ("sklearn", "datasets/images"))
 
 
-def draw_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
+def sample_backdrop(rng: np.random.Generator, indoors: bool, photograph: bool, sky: float) -> np.ndarray:
     """Sample a backdrop.
 
     Args:

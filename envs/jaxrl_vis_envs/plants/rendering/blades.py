@@ -26,7 +26,7 @@ class Blades:
     tint: np.ndarray
 
 
-def draw_blades(rng: np.random.Generator, length: float, distance: float) -> Blades:
+def sample_blades(rng: np.random.Generator, length: float, distance: float) -> Blades:
     """Sample the blades around a row from x = 0 to ``length`` and y = 0, seen from y = -``distance`` (m)."""
     low, high = np.array([-2.0, -distance + 0.25]), np.array([length + 2.0, 3.0])
     count = int(np.exp(rng.uniform(np.log(50.0), np.log(500.0))) * np.prod(high - low))
@@ -41,7 +41,7 @@ def draw_blades(rng: np.random.Generator, length: float, distance: float) -> Bla
     return Blades(np.stack([base, middle, tip], axis=1), rng.uniform(0.002, 0.006, count), tint)
 
 
-def cover_with_blades(
+def render_blades(
     radiance: np.ndarray,
     instance: np.ndarray,
     depth: np.ndarray,

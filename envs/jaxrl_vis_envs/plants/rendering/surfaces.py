@@ -65,7 +65,7 @@ class Surfaces:
     materials: np.ndarray
 
 
-def build(plot: Plot) -> Surfaces:
+def build_surfaces(plot: Plot) -> Surfaces:
     """Build the surfaces of a plot, with materials sampled from its family's textures."""
     rng = generator(plot.family, plot.seed, "textures")
     textures = plot.family.textures

@@ -110,14 +110,14 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
         return fitted(data)
 
     def draw(shape: Shape, target: jax.Array) -> jax.Array:
-        model = bending.fit(arms.model, arms.layout, shape)
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
         data = bending.place_stands(arms.rest, arms.layout, shape)
         joints = stalk_arm.joints_at(target, 1.0)
         return image(model, mjx_model.kinematics(model, data.replace(qpos=data.qpos.at[: stalk_arm.ARM_JOINTS].set(joints))))
 
     def episode(shape: Shape, goal: jax.Array, key: jax.Array, wind: jax.Array) -> dict[str, jax.Array]:
-        scene = Scene(shape, bending.gusts(key, wind), jnp.float32(1.0))
-        model = bending.fit(arms.model, arms.layout, shape)
+        scene = Scene(shape, bending.sample_gusts(key, wind), jnp.float32(1.0))
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
 
         def step(moving: _Moving, _: None) -> tuple[_Moving, dict[str, jax.Array]]:
             reaching, place = moving

@@ -45,40 +45,45 @@ class _Candidate(NamedTuple):
     is_inside: Any
 
 
-class Place(NamedTuple):
+class BoxPose(NamedTuple):
     """Position (m) and axes (three unit vectors) of a box in the world."""
 
     position: Vector
     axes: tuple[Vector, Vector, Vector]
 
 
-def places(contacts: LaneContacts, frames: LinkFrames) -> list[list[Place]]:
+def moving_poses(contacts: LaneContacts, frames: LinkFrames) -> list[list[BoxPose]]:
     """Return the poses in the world (m) of the boxes that move, for each of the two sides."""
-    return [[_place(frame, frames) for _, frame in side.moving] for side in contacts.sides]
+    return [[_pose(frame, frames) for _, frame in side.moving] for side in contacts.sides]
 
 
-def _place(frame: FixedFrame, frames: LinkFrames) -> Place:
+def _pose(frame: FixedFrame, frames: LinkFrames) -> BoxPose:
     x, y, z = (frames.direction(frame.link, frame.rotation[:, axis]) for axis in range(3))
-    return Place(frames.point(frame.link, frame.position), (x, y, z))
+    return BoxPose(frames.point(frame.link, frame.position), (x, y, z))
 
 
-def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> ContactPoint:
-    """Return the contacts of all lanes (m, world), from the result of `places`; normals point from the first box to the second.
+def contact_points(contacts: LaneContacts, poses: list[list[BoxPose]]) -> ContactPoint:
+    """Return the contacts of all lanes, m in the world.
 
-    The distance of a contact that does not exist is `_FAR`.
+    Args:
+        contacts: Constants of the contacts.
+        poses: Result of `moving_poses`.
+
+    Returns:
+        Contacts, with normals from the first box to the second; the distance of one that does not exist is `_FAR`.
     """
-    one, other = (_box(side, moving) for side, moving in zip(contacts.sides, places, strict=True))
-    reference, other, is_first = _reference_first(one, other)
-    offset = _into(reference.axes, subtract(other.position, reference.position))
-    other = _nearest_face_last(reference, other)
-    columns = [_into(reference.axes, axis) for axis in other.axes]
+    one, other = (_box(side, moving) for side, moving in zip(contacts.sides, poses, strict=True))
+    reference, other, is_first = _order_boxes(one, other)
+    offset = _to_frame(reference.axes, subtract(other.position, reference.position))
+    other = _align_nearest_face(reference, other)
+    columns = [_to_frame(reference.axes, axis) for axis in other.axes]
     side = jnp.where(offset[2] >= 0, 1.0, -1.0)
     towards = jnp.where(columns[2][2] >= 0, 1.0, -1.0)
     centre = subtract(offset, scale(columns[2], side * towards * other.half_size[2]))
     edges = scale(columns[0], other.half_size[0]), scale(columns[1], other.half_size[1])
     zero = 0.0 * centre[0]
     x, y, exists = in_own_block(
-        lambda face: _farthest(contacts, _candidates(*face)), (centre, edges, reference.half_size), (zero, zero, zero)
+        lambda face: _select_candidate(contacts, _candidates(*face)), (centre, edges, reference.half_size), (zero, zero, zero)
     )
     point = add(centre, scale(edges[0], x), scale(edges[1], y))
     distance = minus(side * point[2], reference.half_size[2])
@@ -88,21 +93,21 @@ def contact_points(contacts: LaneContacts, places: list[list[Place]]) -> Contact
     return ContactPoint(jnp.where(exists > 0.5, distance, _FAR), position, normal)
 
 
-def _box(side: Side, moving: list[Place]) -> _Box:
+def _box(side: Side, moving: list[BoxPose]) -> _Box:
     """Return the box of a side in each lane."""
-    place = Place(side.position, side.axes)  # type: ignore[arg-type] - of three
+    place = BoxPose(side.position, side.axes)  # type: ignore[arg-type] - of three
     for (is_here, _), other in zip(side.moving, moving, strict=True):
         condition = is_here == 1.0 if isinstance(is_here, float) else is_here > 0.5
-        place = _choose_parts(condition, other, place)
+        place = _choose_tree(condition, other, place)
     return _Box(*place, side.half_size)  # type: ignore[arg-type] - of three
 
 
-def _into(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
+def _to_frame(axes: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
     """Express a vector in the frame with these axes."""
     return dot(axes[0], vector), dot(axes[1], vector), dot(axes[2], vector)
 
 
-def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
+def _order_boxes(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
     """Order two boxes, and permute the axes of the first so that its face farthest from the other is normal to the last axis.
 
     Returns:
@@ -115,18 +120,18 @@ def _reference_first(one: _Box, other: _Box) -> tuple[_Box, _Box, Any]:
         for axis, extent, row in zip(box.axes, box.half_size, rows, strict=True):
             reach = plus(*(times(*pair) for pair in zip(row, opposite.half_size, strict=True)))
             gaps.append(minus(minus(_abs(dot(axis, offset)), extent), reach))
-    face = _greatest(gaps)
+    face = _argmax(gaps)
     is_first = face < 3.0
     axis = jnp.where(is_first, face, face - 3.0)
-    return _turn_axes(_choose_parts(is_first, one, other), axis), _choose_parts(is_first, other, one), is_first
+    return _permute_axes(_choose_tree(is_first, one, other), axis), _choose_tree(is_first, other, one), is_first
 
 
-def _nearest_face_last(reference: _Box, other: _Box) -> _Box:
+def _align_nearest_face(reference: _Box, other: _Box) -> _Box:
     """Permute the axes of the other box so that its face nearest to the reference is normal to the last axis."""
-    return _turn_axes(other, _greatest([_abs(dot(reference.axes[2], axis)) for axis in other.axes]))
+    return _permute_axes(other, _argmax([_abs(dot(reference.axes[2], axis)) for axis in other.axes]))
 
 
-def _greatest(numbers: list[Any]) -> Any:
+def _argmax(numbers: list[Any]) -> Any:
     """Return the index of the maximum of ``numbers`` in each lane, as float32; the first index in a tie."""
     best, index = numbers[0], 0.0 * numbers[0]
     for place, number in enumerate(numbers[1:], start=1):
@@ -135,16 +140,16 @@ def _greatest(numbers: list[Any]) -> Any:
     return index
 
 
-def _choose_parts(condition: Any, one: Any, other: Any) -> Any:
+def _choose_tree(condition: Any, one: Any, other: Any) -> Any:
     """Select between two nested tuples of the same structure, leaf by leaf."""
     if isinstance(one, tuple):
-        parts = [_choose_parts(condition, *pair) for pair in zip(one, other, strict=True)]
+        parts = [_choose_tree(condition, *pair) for pair in zip(one, other, strict=True)]
         return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
     is_same = isinstance(one, float) and isinstance(other, float) and one == other
     return one if is_same else choose(condition, one, other)
 
 
-def _turn_axes(box: _Box, axis: Any) -> _Box:
+def _permute_axes(box: _Box, axis: Any) -> _Box:
     """Permute the axes of a box cyclically, so that ``axis`` is the last."""
     is_zero, is_one = axis < 0.5, (axis > 0.5) & (axis < 1.5)
 
@@ -192,7 +197,7 @@ def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector)
     return found
 
 
-def _farthest(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
+def _select_candidate(contacts: LaneContacts, candidates: list[_Candidate]) -> tuple[Any, Any, Any]:
     """Return coordinates x and y of the candidate in the overlap that reaches farthest towards each lane's corner.
 
     The third result is 1.0 if there is one and no earlier corner of the pair selects it, else 0.0.

@@ -22,7 +22,7 @@ CONTACTS = 4
 """Contacts of a pair of boxes."""
 CORNERS = ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0))
 """Direction in which each contact of a pair reaches farthest, in half edges of the face."""
-FREE_JOINTS = 6
+FREE_DOFS = 6
 """Degrees of freedom of the free body, the last of a model."""
 _NEVER = -1e6  # margin of lanes without a contact, m
 
@@ -193,12 +193,12 @@ def _as_rows(part: Any, table: list[np.ndarray]) -> Any:
 def _free_body(model: mjx.Model, tree: ScalarModel) -> FreeBody:
     body = int(model.jnt_bodyid[-1])
     mass, inertia = float(np.asarray(model.body_mass)[body]), floats(np.asarray(model.body_inertia)[body])
-    armature = np.asarray(model.dof_armature)[-FREE_JOINTS:]
+    armature = np.asarray(model.dof_armature)[-FREE_DOFS:]
     return FreeBody(
         mass=floats(np.array([mass] * 3 + list(inertia)) + armature),
         inertia=inertia,
         weight=floats(mass * tree.gravity),
-        damping=floats(np.asarray(model.dof_damping)[-FREE_JOINTS:]),
+        damping=floats(np.asarray(model.dof_damping)[-FREE_DOFS:]),
     )
 
 
@@ -250,7 +250,7 @@ def _side(model: mjx.Model, frames: list[FixedFrame], geoms: np.ndarray) -> Side
 
 def _signs(model: mjx.Model, tree: ScalarModel, frames: list[FixedFrame], geoms: tuple[np.ndarray, np.ndarray]) -> tuple:
     joints, free = len(tree.links), links.mocap_link(model.nmocap)
-    moves = np.zeros((2, joints + FREE_JOINTS, LANES))
+    moves = np.zeros((2, joints + FREE_DOFS, LANES))
     for side, lane in np.ndindex(2, LANES):
         link = frames[model.geom_bodyid[geoms[side][lane]]].link
         moves[side, joints:, lane] = link == free

@@ -43,7 +43,7 @@ def simulate(
     """
     contacts: LaneContacts = with_rows(model.contacts, table)
     tree = model.tree
-    control = steps.clipped_controls(tree, control)
+    control = steps.clip_controls(tree, control)
     poses = mocap_poses(tuple(links.mocap_link(index) for index in tree.mocaps), mocap)
     inputs = StepInputs(timestep, control, applied, poses)
 
@@ -87,7 +87,7 @@ def _step(model: BoxModel, contacts: LaneContacts, state: JointState, inputs: St
     damped = [*solve_positive(damped_mass, pushed[:joints]), *(f / m for f, m in zip(pushed[joints:], inertias, strict=True))]
     velocity = [rate + timestep * change for rate, change in zip(state.velocity, damped, strict=True)]
     moved = [start + timestep * rate for start, rate in zip(state.position, velocity[: joints + 3], strict=False)]
-    position = [*moved, *_turned(turn, velocity[joints + 3 :], timestep)]
+    position = [*moved, *_integrate_quaternion(turn, velocity[joints + 3 :], timestep)]
     return JointState(position, velocity, acceleration, constraint)
 
 
@@ -111,7 +111,7 @@ def _gyroscopic(body: FreeBody, spin: tuple, momentum: tuple) -> tuple:
     return cross(spin, momentum)
 
 
-def _turned(quaternion: Column, spin: Column, timestep: float) -> Column:
+def _integrate_quaternion(quaternion: Column, spin: Column, timestep: float) -> Column:
     """Return the quaternion a time step later, at a constant angular velocity (rad/s) about the body's own axes."""
     axis = (spin[0], spin[1], spin[2])
     square = dot(axis, axis)

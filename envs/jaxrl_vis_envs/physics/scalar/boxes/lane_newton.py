@@ -109,7 +109,7 @@ def _edges(problem: LaneProblem, parts: Column) -> list[tuple[Any, Any, Any, Any
     return edges
 
 
-def _acting(problem: LaneProblem, rows: Column) -> Column:
+def _acting_stiffness(problem: LaneProblem, rows: Column) -> Column:
     """Return the stiffness of the rows of welds and limits where they act, 0 elsewhere."""
     return [
         stiffness if row < problem.equalities else jnp.where(x < 0, stiffness, 0.0)
@@ -121,7 +121,7 @@ def _cost(problem: LaneProblem, acceleration: Column) -> Any:
     residual = _residual(problem, acceleration)
     inertial = symmetric_product(problem.mass, acceleration)
     cost = 0.5 * inner(acceleration, inertial) - inner(problem.force, acceleration)
-    cost = cost + 0.5 * total(d * x * x for d, x in zip(_acting(problem, residual.rows), residual.rows, strict=True))
+    cost = cost + 0.5 * total(d * x * x for d, x in zip(_acting_stiffness(problem, residual.rows), residual.rows, strict=True))
     edges = _edges(problem, residual.parts)
     return cost + 0.5 * sum_lanes(total(d * x * x + e * y * y for x, y, d, e in edges))
 
@@ -136,7 +136,7 @@ def _constraint_slope(problem: LaneProblem, residual: _Residual) -> Column:
         sum_lanes(total(p * g for p, g in zip(pulls, parts, strict=True) if not _is_known(g)))
         for parts in problem.contacts.jacobian
     ]
-    for entries, x, stiffness in zip(problem.jacobian, residual.rows, _acting(problem, residual.rows), strict=True):
+    for entries, x, stiffness in zip(problem.jacobian, residual.rows, _acting_stiffness(problem, residual.rows), strict=True):
         for joint, entry in entries.items():
             slope[joint] = slope[joint] + entry * (stiffness * x)
     return slope
@@ -148,7 +148,7 @@ def _is_known(number: Any) -> bool:
 
 def _curvature(problem: LaneProblem, residual: _Residual) -> Matrix:
     matrix: Matrix = dict(problem.mass)
-    for entries, stiffness in zip(problem.jacobian, _acting(problem, residual.rows), strict=True):
+    for entries, stiffness in zip(problem.jacobian, _acting_stiffness(problem, residual.rows), strict=True):
         add_square(matrix, entries, stiffness)
     edges = _edges(problem, residual.parts)
     both = [one + other for *_, one, other in edges]
@@ -187,7 +187,7 @@ def _improve(problem: LaneProblem, acceleration: Column) -> tuple[Column, Any]:
 def _changes(problem: LaneProblem, before: _Residual, after: _Residual) -> Any:
     """Return 1 if any row starts or stops acting between two residuals, else 0: an int32 without lanes."""
     changed: Any = 0.0
-    for old, new in zip(_acting(problem, before.rows), _acting(problem, after.rows), strict=True):
+    for old, new in zip(_acting_stiffness(problem, before.rows), _acting_stiffness(problem, after.rows), strict=True):
         changed = changed + jnp.abs(old - new)
     for old, new in zip(_edges(problem, before.parts), _edges(problem, after.parts), strict=True):
         changed = changed + jnp.abs(old[2] - new[2]) + jnp.abs(old[3] - new[3])
@@ -209,7 +209,7 @@ def _line_search(problem: LaneProblem, residual: _Residual, along: _Residual, fi
         rows = [x + length * v for x, v in zip(residual.rows, along.rows, strict=True)]
         parts = [x + length * v for x, v in zip(residual.parts, along.parts, strict=True)]
         slope, curvature = first + second * length, second
-        for x, v, stiffness in zip(rows, along.rows, _acting(problem, rows), strict=True):
+        for x, v, stiffness in zip(rows, along.rows, _acting_stiffness(problem, rows), strict=True):
             slope, curvature = slope + stiffness * x * v, curvature + stiffness * v * v
         lane_slope: Any = 0.0
         lane_curvature: Any = 0.0

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from jaxrl_vis_envs.physics.scalar import contacts as contact_frames
 from jaxrl_vis_envs.physics.scalar.boxes import box_faces
-from jaxrl_vis_envs.physics.scalar.boxes.box_model import FREE_JOINTS, BoxModel, LaneContacts
+from jaxrl_vis_envs.physics.scalar.boxes.box_model import FREE_DOFS, BoxModel, LaneContacts
 from jaxrl_vis_envs.physics.scalar.boxes.own_block import in_own_block
 from jaxrl_vis_envs.physics.scalar.contacts import ContactPoint
 from jaxrl_vis_envs.physics.scalar.link_frames import LinkFrames
@@ -53,8 +53,8 @@ def contact_rows(model: BoxModel, contacts: LaneContacts, frames: LinkFrames, ve
     """
     zero = 0.0 * velocity[0]
     point = in_own_block(
-        lambda places: box_faces.contact_points(contacts, places),
-        box_faces.places(contacts, frames),
+        lambda poses: box_faces.contact_points(contacts, poses),
+        box_faces.moving_poses(contacts, frames),
         ContactPoint(zero, (zero,) * 3, (zero,) * 3),
     )
     directions = contact_frames.contact_axes(point.normal)
@@ -121,7 +121,7 @@ def _free_jacobian(
     jacobian: list[tuple[Any, Any, Any, Any]] = [(*(direction[axis] for direction in directions), 0.0) for axis in range(3)]
     for axis in axes:
         jacobian.append((*(dot(axis, moment) for moment in moments), dot(axis, directions[0])))
-    assert len(jacobian) == FREE_JOINTS
+    assert len(jacobian) == FREE_DOFS
     return jacobian
 
 

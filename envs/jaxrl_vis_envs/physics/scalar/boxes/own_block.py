@@ -6,7 +6,7 @@ from typing import Any
 import jax
 
 
-def in_own_block(compute: Callable[[Any], Any], inputs: Any, nothing: Any) -> Any:
+def in_own_block(compute: Callable[[Any], Any], inputs: Any, initial: Any) -> Any:
     """Call a function inside a loop of one iteration, which does not remain in the machine code.
 
     For each selection, Triton visits all operations that the selection depends on, up to the arguments of its block. Without
@@ -16,7 +16,7 @@ def in_own_block(compute: Callable[[Any], Any], inputs: Any, nothing: Any) -> An
     Args:
         compute: The function; it must not capture traced arrays.
         inputs: Its argument, a tree of arrays and of constants.
-        nothing: Tree of zeros with the structure, shapes and dtypes of its result.
+        initial: Tree of zeros with the structure, shapes and dtypes of its result.
 
     Returns:
         The result of ``compute``.
@@ -33,4 +33,4 @@ def in_own_block(compute: Callable[[Any], Any], inputs: Any, nothing: Any) -> An
         values = [next(rest) if varies else leaf for leaf, varies in zip(leaves, is_array, strict=True)]
         return number + 1, zeros, compute(jax.tree.unflatten(structure, values))
 
-    return jax.lax.while_loop(lambda state: state[0] < 1, turn, (0, arrays, nothing))[2]
+    return jax.lax.while_loop(lambda state: state[0] < 1, turn, (0, arrays, initial))[2]
