@@ -28,11 +28,11 @@ def name_files_outside(markdown: str, depth: int = 0) -> str:
     """
     link_out_of_docs = re.compile(rf"(?<!!)\[([^\]]+)\]\((?:\.\./){{{depth + 1}}}([^)#]+)\)")
 
-    def named(link: re.Match[str]) -> str:
+    def replacement(link: re.Match[str]) -> str:
         text, path = link.group(1).strip("`"), link.group(2)
         return f"`{path}`" if text == path else f"{text} (`{path}`)"
 
-    return link_out_of_docs.sub(named, markdown)
+    return link_out_of_docs.sub(replacement, markdown)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

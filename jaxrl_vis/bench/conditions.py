@@ -124,17 +124,17 @@ class Watch:
     """Monitor of the machine during a benchmark: ask for the conditions after each measurement."""
 
     def __init__(self) -> None:
-        self._busy, self._before = busy_cores(), calibrate()
+        self._busy_cores, self._calibration = busy_cores(), calibrate()
         self._cores = num_cores()
 
     def conditions(self) -> dict[str, Any]:
         """Return the conditions of a record: machine, cores, load before the benchmark, and calibrations around it."""
-        before, self._before = self._before, calibrate()
+        before, self._calibration = self._calibration, calibrate()
         return {
             "machine": machine_id(),
             "cores": self._cores,
-            "busy_cores": self._busy,
-            "calibration": {"before": before, "after": self._before},
+            "busy_cores": self._busy_cores,
+            "calibration": {"before": before, "after": self._calibration},
         }
 
 

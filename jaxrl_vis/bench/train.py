@@ -119,10 +119,10 @@ def time_parts(programs: Programs, loop: LoopState, repeats: int) -> dict[str, f
     }
 
 
-def describe(iteration: float, parts: dict[str, float], predicted: float) -> str:
-    """Format a table of the parts: milliseconds, and percent of an iteration."""
-    total = parts["rollout"] + parts["insert"] + parts["updates"] + parts["host"]
-    rows = {**parts, "sum without evaluation": total, "iteration": iteration, "predicted": predicted}
+def describe(iteration: float, part_seconds: dict[str, float], predicted: float) -> str:
+    """Format a table of the parts of an iteration: milliseconds, and percent of an iteration."""
+    total = part_seconds["rollout"] + part_seconds["insert"] + part_seconds["updates"] + part_seconds["host"]
+    rows = {**part_seconds, "sum without evaluation": total, "iteration": iteration, "predicted": predicted}
     lines = [f"    {name:24}{1e3 * seconds:12,.2f} ms {seconds / iteration:8.1%}" for name, seconds in rows.items()]
     return "\n".join(lines)
 

@@ -69,10 +69,10 @@ class DefaultText:
     """Annotation of a field whose default is described by a function.
 
     Attributes:
-        words: Returns the description for the help.
+        describe: Function that returns the description for the help.
     """
 
-    words: Callable[[], str]
+    describe: Callable[[], str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,7 +275,7 @@ def _collect_options(command: type) -> list[_Option]:
             required = field.default is dataclasses.MISSING
             default = "required" if required else f"default: {field.default}" if field.default else ""
             for extra in field.extras:
-                default = extra.words() if isinstance(extra, DefaultText) else default
+                default = extra.describe() if isinstance(extra, DefaultText) else default
             if AlsoPositional() in field.extras:
                 options.append(_Option(field.name, field.hint, False, text, "" if required else default, False))
                 options.append(_Option(field.name, field.hint, True, text, default, required, twin=True))

@@ -134,12 +134,12 @@ def config_lines(config: Config, set_options: Collection[str]) -> list[str]:
             source = f"preset {name}, for {environment.env}"
         elif value != OPTIONS[option].default and option != "preset":
             source = f"preset {name}"
-        shown = " ".join(map(str, _words(value))) or "none"
+        shown = " ".join(map(str, _as_tuple(value))) or "none"
         lines.append(f"{option:27} {shown:24} {source}".rstrip())
     return lines[1:]
 
 
-def _words(value: Any) -> tuple[Any, ...]:
+def _as_tuple(value: Any) -> tuple[Any, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
@@ -165,7 +165,7 @@ def run(options: Train) -> int:
     run_dir = options.run_dir or default_folder(config)
     check_there(run_dir, options.resume)
     if options.resume and "env_folder" not in options.changes and (run_dir / "config.json").exists():
-        named = {options.env, *(word for value in options.changes.values() for word in _words(value))}
+        named = {options.env, *(word for value in options.changes.values() for word in _as_tuple(value))}
         if set(custom_names(config).values()) - named:
             may_run_code(run_dir, options.trust)  # the custom part is named by the run, not by the user
     check_env(config.environment.env, config.environment.env_folder)

@@ -141,17 +141,17 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 )
 
 
-def main(more: Sequence[tuple[str, Callable[[], str]]] = (), findings: dict[str, Any] | None = None) -> int:
+def main(further_checks: Sequence[tuple[str, Callable[[], str]]] = (), findings: dict[str, Any] | None = None) -> int:
     """Run all checks, even after failures, and print the results.
 
     Args:
-        more: Further checks, by name.
+        further_checks: Further checks, by name.
         findings: Filled with ``passed`` and ``text`` of each check, by name.
 
     Returns:
         0 if all checks pass; 1 if one fails; 2 if JAX is configured for a device that is not available, which stops the checks.
     """
-    failures, checks = 0, (*CHECKS, *more)
+    failures, checks = 0, (*CHECKS, *further_checks)
     for name, check in checks:
         try:
             verdict, text = "ok  ", check()

@@ -84,12 +84,12 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def read_json(path: Path, kind: type = dict, hint: str = "") -> Any:
+def read_json(path: Path, expected_type: type = dict, hint: str = "") -> Any:
     """Read a JSON file.
 
     Args:
         path: The file.
-        kind: Expected type of the value: dict, list, or object for any.
+        expected_type: Expected type of the value: dict, list, or object for any.
         hint: Hint on how to fix an unusable file, appended to the message.
 
     Raises:
@@ -107,8 +107,8 @@ def read_json(path: Path, kind: type = dict, hint: str = "") -> Any:
         value = parse_json(text)
     except ValueError as error:
         raise RequestError(f"{path} is not JSON ({' '.join(str(error).split())}){hint}") from error
-    if not isinstance(value, kind):
-        wanted = "a table" if kind is dict else "a list"
+    if not isinstance(value, expected_type):
+        wanted = "a table" if expected_type is dict else "a list"
         raise RequestError(f"{path} must hold {wanted}, not {type(value).__name__}{hint}")
     return value
 

@@ -38,7 +38,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC
 
 
 def evaluate_all(
-    evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, done: Callable[[int, Record], None]
+    evaluate: Callable[[int], Record], numbers: Iterable[int], workers: int, on_record: Callable[[int, Record], None]
 ) -> None:
     """Evaluate numbers in this process or in several.
 
@@ -47,7 +47,7 @@ def evaluate_all(
             `functools.partial` of one.
         numbers: Numbers to evaluate.
         workers: Number of processes; 1 for this one. They share the machine's GPUs and cores.
-        done: Called in this process with a number and its record, in order of completion.
+        on_record: Called in this process with a number and its record, in order of completion.
 
     Raises:
         WorkerError: A process was killed from outside, most likely because memory ran out.
@@ -55,7 +55,7 @@ def evaluate_all(
     numbers = list(numbers)
     with worker_pool(min(workers, len(numbers))) as unordered_map:
         for number, record in unordered_map(functools.partial(_numbered, evaluate), numbers):
-            done(number, record)
+            on_record(number, record)
 
 
 def _numbered(evaluate: Callable[[int], Record], number: int) -> tuple[int, Record]:

@@ -74,8 +74,8 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         curvature = mass + _weighted_square(jacobian, acting)
         direction = -solve_positive(curvature, slope)
         along = _product(jacobian, direction)
-        first, second = jnp.sum(direction * inertial), jnp.sum(direction * _product(mass, direction))
-        return acceleration + _line_search(residual, along, stiffness, is_equality, first, second) * direction, None
+        linear, quadratic = jnp.sum(direction * inertial), jnp.sum(direction * _product(mass, direction))
+        return acceleration + _line_search(residual, along, stiffness, is_equality, linear, quadratic) * direction, None
 
     start = data.qacc_smooth
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART:
@@ -110,29 +110,29 @@ def damped_accelerations(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 
 def _line_search(
-    residual: jax.Array, along: jax.Array, stiffness: jax.Array, is_equality: np.ndarray, first: jax.Array, second: jax.Array
+    residual: jax.Array, rate: jax.Array, stiffness: jax.Array, is_equality: np.ndarray, linear: jax.Array, quadratic: jax.Array
 ) -> jax.Array:
     """Return the step length of minimum cost, between 0 and `_MAX_STEP`.
 
     Args:
         residual: [R], residuals of the constraints at the start; equalities and negative residuals act.
-        along: [R], change of the residuals per unit of step length.
+        rate: [R], change of the residuals per unit of step length.
         stiffness: [R], stiffness of the constraints.
         is_equality: [R] bool, True for equalities.
-        first: Linear coefficient of the remaining cost, ``first * length + second * length**2 / 2``.
-        second: Quadratic coefficient, not negative.
+        linear: Linear coefficient of the remaining cost, ``linear * length + quadratic * length**2 / 2``.
+        quadratic: Quadratic coefficient, not negative.
     """
 
     def slope_at(length: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return slope and curvature of the cost."""
-        moved = residual + length * along
-        acting = jnp.where(is_equality | (moved < 0), stiffness, 0.0) * along
-        return first + second * length + jnp.sum(acting * moved), second + jnp.sum(acting * along)
+        moved = residual + length * rate
+        acting = jnp.where(is_equality | (moved < 0), stiffness, 0.0) * rate
+        return linear + quadratic * length + jnp.sum(acting * moved), quadratic + jnp.sum(acting * rate)
 
     if len(residual) > _MAX_CORNERS:
         return jnp.clip(_bracketed_root(slope_at), 0.0, _MAX_STEP)
     # The slope increases along the line and is linear between the corners where a constraint starts or stops acting.
-    corners = jnp.where(is_equality | (along == 0), -1.0, -residual / jnp.where(along == 0, 1.0, along))
+    corners = jnp.where(is_equality | (rate == 0), -1.0, -residual / jnp.where(rate == 0, 1.0, rate))
     slopes = jax.vmap(slope_at)(corners)[0]
     is_before = (corners > 0) & (slopes <= 0)
     is_after = (corners > 0) & (slopes > 0)

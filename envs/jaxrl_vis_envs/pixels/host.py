@@ -50,7 +50,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         gymnasium.utils.RecordConstructorArgs.__init__(self, goal_image=goal_image, form=form, **options)
         gymnasium.Wrapper.__init__(self, env)
         self.views = views = Views(poses.find_model(env), **options)
-        self._inner: Any = env.unwrapped
+        self._unwrapped_env: Any = env.unwrapped
         self._form, self._goal_image = Format(**form), goal_image
         self._names = formats.image_names(views.outputs)
         self._posed_data = mujoco.MjData(views.mj_model)
@@ -71,7 +71,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         own, reward, terminated, truncated, info = self.env.step(action)
         return self._observe(own), reward, terminated, truncated, info
 
-    def _observe(self, own: Any) -> Any:
+    def _observe(self, observation: Any) -> Any:
         # Copy the goal images: callers may keep and modify the arrays of an observation.
         images = self._render() | {name: image.copy() for name, image in self._goals.items()}
         layout = self._form.layout
@@ -79,7 +79,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             return np.array(self._form.concatenate_images(images))  # type: ignore[arg-type]
         if layout == "images":
             return images
-        return (dict(own) if isinstance(own, Mapping) else {"state": own}) | images
+        return (dict(observation) if isinstance(observation, Mapping) else {"state": observation}) | images
 
     def _render(self, qpos: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Render the images at joint positions ``qpos`` [nq] (None for the current ones) and the current mocap poses."""
@@ -101,7 +101,7 @@ class GymnasiumPixels(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
         Gymnasium-Robotics moves sites and bodies of targets only in a callback of its ``render``. The callback also computes
         poses, on which the next action depends, so it is called with a copy of the data.
         """
-        inner, own, model = self._inner, self._inner.data, self.views.mj_model
+        inner, own, model = self._unwrapped_env, self._unwrapped_env.data, self.views.mj_model
         if not hasattr(inner, "_render_callback"):
             yield own
             return

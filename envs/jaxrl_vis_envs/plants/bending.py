@@ -145,8 +145,8 @@ def set_stalk_properties(model: Any, layout: Layout, shape: Shape) -> Any:
     """
     lower_axis, up, upper_axis = _segments(shape)
     lengths = jnp.stack([jnp.linalg.norm(lower_axis, axis=-1), jnp.linalg.norm(upper_axis, axis=-1)], axis=-1)
-    from_lower = jax.vmap(rotations.quat_inv)(_between(up, lower_axis))
-    rotation = _between(up, jax.vmap(rotations.rotate)(upper_axis, from_lower))
+    from_lower = jax.vmap(rotations.quat_inv)(_shortest_rotation(up, lower_axis))
+    rotation = _shortest_rotation(up, jax.vmap(rotations.rotate)(upper_axis, from_lower))
     bodies, geoms = (layout.lower, layout.upper), (layout.lower_geom, layout.upper_geom)
     changes = {
         name: getattr(model, name)
@@ -177,7 +177,7 @@ def place_stands(data: Any, layout: Layout, shape: Shape) -> Any:
     lower_axis, up, _ = _segments(shape)
     return data.replace(
         mocap_pos=data.mocap_pos.at[layout.mocap].set(jnp.asarray(shape.foot, jnp.float32)),
-        mocap_quat=data.mocap_quat.at[layout.mocap].set(_between(up, lower_axis)),
+        mocap_quat=data.mocap_quat.at[layout.mocap].set(_shortest_rotation(up, lower_axis)),
     )
 
 
@@ -271,11 +271,11 @@ def _upward(length: jax.Array) -> jax.Array:
     return jnp.zeros((*length.shape, 3), jnp.float32).at[..., 2].set(length)
 
 
-def _between(one: jax.Array, other: jax.Array) -> jax.Array:
-    """Return quaternions [N, 4] of the shortest rotations from directions ``one`` to ``other`` [N, 3], less than half a turn
+def _shortest_rotation(start: jax.Array, end: jax.Array) -> jax.Array:
+    """Return quaternions [N, 4] of the shortest rotations from directions ``start`` to ``end`` [N, 3], less than half a turn
     apart.
     """
-    one = one / jnp.linalg.norm(one, axis=-1, keepdims=True)
-    other = other / jnp.linalg.norm(other, axis=-1, keepdims=True)
-    quaternion = jnp.concatenate([1.0 + jnp.sum(one * other, axis=-1, keepdims=True), jnp.cross(one, other)], axis=-1)
+    start = start / jnp.linalg.norm(start, axis=-1, keepdims=True)
+    end = end / jnp.linalg.norm(end, axis=-1, keepdims=True)
+    quaternion = jnp.concatenate([1.0 + jnp.sum(start * end, axis=-1, keepdims=True), jnp.cross(start, end)], axis=-1)
     return quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)

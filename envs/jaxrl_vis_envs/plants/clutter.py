@@ -33,7 +33,7 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
         paint = material(rng)
         if kind == "pole":
             top = foot + [*rng.normal(0.0, 0.04, 2), 0.0] + _UP * rng.uniform(0.3, 2.6)
-            round_things.append((_tube([foot, top], _thickness(rng, 0.003, 0.05)), paint))
+            round_things.append((_tube([foot, top], _sample_log_uniform(rng, 0.003, 0.05)), paint))
         elif kind == "legs":
             for side in (-0.09, 0.09):
                 start = foot + [side, rng.uniform(0.1, 0.8), 0.0]
@@ -43,7 +43,7 @@ def objects(plot: Plot) -> tuple[list[tuple[Stalk, list[float]]], list[tuple[Lea
             across = rng.normal(0.0, 1.0 if kind == "tube" else 0.05, 3) + [1.0, 0.0, 0.0]
             across *= rng.uniform(0.5, 2.5) / np.linalg.norm(across)
             start = foot + high * _UP
-            radius = _thickness(rng, 0.005, 0.04) if kind == "tube" else rng.uniform(0.001, 0.005)
+            radius = _sample_log_uniform(rng, 0.005, 0.04) if kind == "tube" else rng.uniform(0.001, 0.005)
             round_things.append((_tube([start, start + across], radius), paint))
     if scene.potted:
         round_things += _pots(rng, plot)
@@ -57,7 +57,7 @@ def _offset_from_row(rng: np.random.Generator, family: Family) -> float:
     return rng.uniform(-0.3 * family.rig.distance, 0.0) if rng.random() < 0.25 else rng.uniform(0.0, 1.5)
 
 
-def _thickness(rng: np.random.Generator, low: float, high: float) -> float:
+def _sample_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return low * (high / low) ** rng.random()
 
 
@@ -84,7 +84,7 @@ def _ribbon(rng: np.random.Generator, foot: np.ndarray, kind: str) -> Leaf:
     middle = foot + np.concatenate([sideways, (along * tall)[:, None]], axis=1)
     turn = rng.uniform(-0.8, 0.8)
     across = np.tile([math.cos(turn), math.sin(turn), 0.0], (knots + 1, 1))
-    half = _thickness(rng, 0.004, 0.03) * (np.ones(knots + 1) if kind == "strip" else np.maximum(1.0 - along**2, 0.05))
+    half = _sample_log_uniform(rng, 0.004, 0.03) * (np.ones(knots + 1) if kind == "strip" else np.maximum(1.0 - along**2, 0.05))
     return Leaf(-1, middle, across, half, kind == "strip")
 
 
@@ -123,7 +123,7 @@ def material(rng: np.random.Generator, green: bool = False) -> list[float]:
         )
     kind = rng.choice(["grey", "wood", "paint", "straw"], p=[0.45, 0.25, 0.15, 0.15])
     if kind == "grey":
-        return plain_material(rng, [_thickness(rng, 0.03, 0.85)] * 3)
+        return plain_material(rng, [_sample_log_uniform(rng, 0.03, 0.85)] * 3)
     hue, saturation = {
         "wood": (rng.uniform(0.05, 0.1), rng.uniform(0.2, 0.6)),
         "paint": (rng.random(), rng.uniform(0.4, 0.9)),

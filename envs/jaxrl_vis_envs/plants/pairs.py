@@ -115,18 +115,18 @@ class Sequence:
         """Render the left image of one pair, with its instance and depth images; see `Pair`."""
         return self._render(frame, 0)
 
-    def _render(self, frame: int, side: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Render one image, with its instance and depth images; side 0 is the left one."""
+    def _render(self, frame: int, camera_index: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Render one image, with its instance and depth images; ``camera_index`` 0 is the left camera."""
         family, drive = self.plot.family, self.drive
         pose, true = drive.poses[frame], drive.true
-        shift = side * true.baseline
+        shift = camera_index * true.baseline
         view = tables.build_view(self.surfaces, pose, true, shift)
         offset = np.array([shift, 0.0, 0.0])
         rng = generator(family, self.plot.seed, "flash")
         settings = family.imaging
         flash, blur = rng.uniform(*settings.flash), rng.uniform(*settings.blur, 2)
         gains = np.exp(settings.exposure_spread * rng.normal(size=(len(self), 1)) + 0.01 * rng.normal(size=(len(self), 2)))
-        lines = np.array([drive.line_offset, drive.line_slope]) * side
+        lines = np.array([drive.line_offset, drive.line_slope]) * camera_index
         values = (
             true.focal,
             true.centre,
@@ -143,17 +143,17 @@ class Sequence:
             camera = (pose.position + offset @ pose.rotation, pose.rotation, true.focal, true.centre)
             arrays = np.asarray(radiance), np.asarray(instance), np.asarray(depth)
             radiance = jnp.asarray(render_blades(*arrays, blades, camera))
-        gain = 2.0 * gains[frame, side]
+        gain = 2.0 * gains[frame, camera_index]
         if shot.day is not None:
             gain *= 0.5 * family.scene.brightness[0] / max(float(radiance.mean()), 1e-4)
         exposure = imaging.Exposure(
             gain=gain,
-            blur=blur[side] * true.width / 3376,
+            blur=blur[camera_index] * true.width / 3376,
             vignetting=settings.vignetting,
             full_well=settings.full_well,
             read_noise=settings.read_noise,
             noise=settings.noise,
-            seed=int(generator(family, self.plot.seed, f"noise {frame} {side}").integers(1 << 32)),
+            seed=int(generator(family, self.plot.seed, f"noise {frame} {camera_index}").integers(1 << 32)),
         )
         image = imaging.expose(radiance, exposure)
         if shot.day is None:

@@ -123,10 +123,10 @@ def stand_of_lines(
     return Stands(stalk.astype(np.int32)[None], *arrays)
 
 
-def concatenate_stands(parts: Sequence[Stands]) -> Stands:
+def concatenate_stands(batches: Sequence[Stands]) -> Stands:
     """Concatenate one or more batches of stands with the same number of stalks each."""
     names = [field.name for field in dataclasses.fields(Stands)]
-    return Stands(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return Stands(*(np.concatenate([getattr(batch, name) for batch in batches]) for name in names))
 
 
 def _empty(stalks: int) -> list[np.ndarray]:

@@ -75,32 +75,32 @@ def planar_position(angles: Any, xp: Any = jnp) -> Any:
     return xp.stack([x, UPPER_ARM * xp.cos(first) + FOREARM * xp.cos(both)], axis=-1)
 
 
-def angles_at(position: Any, side: Any, xp: Any = jnp) -> Any:
+def angles_at(position: Any, elbow_sign: Any, xp: Any = jnp) -> Any:
     """Return shoulder and elbow angles [..., 2] (rad) that bring the grip to ``position``.
 
     Args:
         position: [..., 2], m relative to the first joint. If it is out of reach, the arm points at it, stretched or folded.
-        side: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
+        elbow_sign: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
         xp: `jax.numpy` or `numpy`.
     """
     distance = xp.linalg.norm(position, axis=-1)
     cosine = (distance**2 - UPPER_ARM**2 - FOREARM**2) / (2 * UPPER_ARM * FOREARM)
-    elbow = side * xp.arccos(xp.clip(cosine, -1.0, 1.0))
+    elbow = elbow_sign * xp.arccos(xp.clip(cosine, -1.0, 1.0))
     bearing = xp.arctan2(-position[..., 0], position[..., 1])
     between = xp.arctan2(FOREARM * xp.sin(elbow), UPPER_ARM + FOREARM * xp.cos(elbow))
     return xp.stack([bearing - between, elbow], axis=-1)
 
 
-def joints_at(target: Any, side: Any, xp: Any = jnp) -> Any:
+def joints_at(target: Any, elbow_sign: Any, xp: Any = jnp) -> Any:
     """Return slide, shoulder and elbow positions [..., 3] (m, rad, rad) with the grip at ``target``.
 
     Args:
         target: [..., 3], m in the frame of a stand; for positions out of reach see `angles_at`.
-        side: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
+        elbow_sign: [...], sign of the elbow angle, 1 or -1, which selects one of two solutions.
         xp: `jax.numpy` or `numpy`.
     """
     position = target[..., :2] - xp.asarray(SHOULDER, dtype=target.dtype)
-    return xp.concatenate([target[..., 2:], angles_at(position, side, xp)], axis=-1)
+    return xp.concatenate([target[..., 2:], angles_at(position, elbow_sign, xp)], axis=-1)
 
 
 def grip_at(joints: Any, xp: Any = jnp) -> Any:

@@ -179,13 +179,13 @@ def measure_output(case: Case, output: str, repeats: int) -> Measurement:
     batches = [{name: jnp.asarray(rows[: case.worlds]) for name, rows in batch.items()} for batch in case.batches]
 
     # Tables of thousands of triangles are no constants of a program, unlike all that a scene without them has.
-    given = None if scene.hierarchies is None else scene
+    scene_argument = None if scene.hierarchies is None else scene
 
-    def draw(given: Scene | None, poses: dict[str, jax.Array]) -> Any:
-        return draw_all(case, given or scene, poses, lambda scene, poses: _image(scene, poses, output))
+    def draw(scene_argument: Scene | None, poses: dict[str, jax.Array]) -> Any:
+        return draw_all(case, scene_argument or scene, poses, lambda scene, poses: _image(scene, poses, output))
 
-    program, compile_s = compile_timed(jaxrl_vis_envs.jit(draw), given, batches[0])
-    compiled = functools.partial(program, given)
+    program, compile_s = compile_timed(jaxrl_vis_envs.jit(draw), scene_argument, batches[0])
+    compiled = functools.partial(program, scene_argument)
     assert_new_images(compiled, batches)
     timing = measure_time(alternate(compiled, batches), repeats)
     sample = {name: rows[:_SAMPLE] for name, rows in case.batches[0].items()}

@@ -21,16 +21,16 @@ class MocapPose(NamedTuple):
     quaternion: Quaternion
 
 
-def mocap_poses(links: tuple[int, ...], numbers: Column) -> dict[int, MocapPose]:
+def mocap_poses(links: tuple[int, ...], coordinates: Column) -> dict[int, MocapPose]:
     """Return the poses of mocap bodies by link.
 
     Args:
         links: Links of the mocap bodies (`links.mocap_link`).
-        numbers: Seven scalars per body: position, m, and a quaternion of any norm.
+        coordinates: Seven scalars per body: position, m, and a quaternion of any norm.
     """
     poses = {}
     for index, link in enumerate(links):
-        x, y, z, *quaternion = numbers[7 * index : 7 * (index + 1)]
+        x, y, z, *quaternion = coordinates[7 * index : 7 * (index + 1)]
         quaternion = quaternions.normalize(quaternion)
         poses[link] = MocapPose(Pose((x, y, z), quaternions.rotation_axes(quaternion)), quaternion)
     return poses

@@ -394,13 +394,13 @@ def _welds(model: mjx.Model, tree: list[Link], frames: list[FixedFrame]) -> list
     return constraints
 
 
-def fingerprint(part: Any) -> Hashable:
+def fingerprint(value: Any) -> Hashable:
     """Convert a `ScalarModel` or a part of it to a hashable value that is equal for equal contents."""
-    if isinstance(part, np.ndarray):
-        return part.shape, part.tobytes()
-    if isinstance(part, dict):
-        return tuple((key, fingerprint(value)) for key, value in part.items())
-    return tuple(map(fingerprint, part)) if isinstance(part, list | tuple) else part
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return tuple((key, fingerprint(item)) for key, item in value.items())
+    return tuple(map(fingerprint, value)) if isinstance(value, list | tuple) else value
 
 
 def base_link(constants: ScalarModel) -> int:

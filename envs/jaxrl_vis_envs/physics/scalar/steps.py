@@ -280,8 +280,8 @@ def elimination_order(size: int, mass: list[tuple[int, int]], rows: list[tuple[i
     return backwards[::-1]
 
 
-def _below_diagonal(one: int, other: int) -> tuple[int, int]:
-    return (one, other) if one > other else (other, one)
+def _below_diagonal(row: int, column: int) -> tuple[int, int]:
+    return (row, column) if row > column else (column, row)
 
 
 def _add_tendon(mass: Matrix, coefficients: dict[int, float], armature: float) -> None:

@@ -72,10 +72,10 @@ def _outdoors(rng: np.random.Generator) -> np.ndarray:
     return picture
 
 
-def _skyline(rng: np.random.Generator, high: float, roughness: tuple[float, float]) -> np.ndarray:
-    """Sample a mask [*SHAPE] bool from the horizon up to an uneven skyline with a mean tangent of about ``high``."""
+def _skyline(rng: np.random.Generator, height: float, roughness: tuple[float, float]) -> np.ndarray:
+    """Sample a mask [*SHAPE] bool from the horizon up to an uneven skyline with a mean tangent of about ``height``."""
     line = sum(smooth_noise(rng, (1, size), (1, SHAPE[1]))[0] * weight for size, weight in zip((8, 60), roughness))
-    top = _HORIZON * (1.0 - high * (0.5 + line) / REACH[0])
+    top = _HORIZON * (1.0 - height * (0.5 + line) / REACH[0])
     lines = np.arange(SHAPE[0])[:, None]
     return (lines >= top) & (lines < _HORIZON + 12)
 

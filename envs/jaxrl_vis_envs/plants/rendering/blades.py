@@ -87,11 +87,11 @@ def render_blades(
     return covered
 
 
-def _ground_at(radiance: np.ndarray, instance: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _ground_at(radiance: np.ndarray, instance: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Return the radiance [B, 3] of the ground at pixels (column, row) [B, 2]; its median where it is not visible."""
     ground = instance == GROUND
     median = np.median(radiance[ground], axis=0) if ground.any() else np.zeros(3)
-    column, line = np.round(places).astype(int).T
+    column, line = np.round(pixels).astype(int).T
     height, width = instance.shape
     inside = (line >= 0) & (line < height) & (column >= 0) & (column < width)
     line, column = np.clip(line, 0, height - 1), np.clip(column, 0, width - 1)

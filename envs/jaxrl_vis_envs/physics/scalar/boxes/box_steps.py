@@ -57,9 +57,9 @@ def _step(model: BoxModel, contacts: LaneContacts, state: JointState, inputs: St
     """Take one step of Euler's method, semi-implicit in the velocity and implicit in the damping."""
     tree, body, timestep = model.tree, model.body, inputs.timestep
     joints = len(tree.links)
-    place, turn = state.position[joints : joints + 3], state.position[joints + 3 :]
+    origin, quaternion = state.position[joints : joints + 3], state.position[joints + 3 :]
     free = links.mocap_link(model.free_index)
-    pose = _free_pose(place, turn)
+    pose = _free_pose(origin, quaternion)
     own = StepInputs(timestep, inputs.control, inputs.applied[:joints], {**inputs.mocap, free: pose})
     before = JointState(*(part[:joints] for part in state))
     dynamics = steps.tree_state(tree, before, own)
@@ -87,13 +87,13 @@ def _step(model: BoxModel, contacts: LaneContacts, state: JointState, inputs: St
     damped = [*solve_positive(damped_mass, pushed[:joints]), *(f / m for f, m in zip(pushed[joints:], inertias, strict=True))]
     velocity = [rate + timestep * change for rate, change in zip(state.velocity, damped, strict=True)]
     moved = [start + timestep * rate for start, rate in zip(state.position, velocity[: joints + 3], strict=False)]
-    position = [*moved, *_integrate_quaternion(turn, velocity[joints + 3 :], timestep)]
+    position = [*moved, *_integrate_quaternion(quaternion, velocity[joints + 3 :], timestep)]
     return JointState(position, velocity, acceleration, constraint)
 
 
-def _free_pose(place: Column, turn: Column) -> MocapPose:
-    quaternion = quaternions.normalize(turn)
-    return MocapPose(Pose((place[0], place[1], place[2]), quaternions.rotation_axes(quaternion)), quaternion)
+def _free_pose(position: Column, quaternion: Column) -> MocapPose:
+    unit_quaternion = quaternions.normalize(quaternion)
+    return MocapPose(Pose((position[0], position[1], position[2]), quaternions.rotation_axes(unit_quaternion)), unit_quaternion)
 
 
 def _free_forces(body: FreeBody, velocity: Column, applied: Column) -> Column:

@@ -174,12 +174,12 @@ def _improve(problem: LaneProblem, acceleration: Column) -> tuple[Column, Any]:
     ]
     slope = [one + other for one, other in zip(inertial, _constraint_slope(problem, residual), strict=True)]
     direction = [-part for part in solve_positive(_curvature(problem, residual), slope)]
-    along = _Residual(
+    rate = _Residual(
         [row_product(entries, direction) for entries in problem.jacobian], components(problem.contacts.jacobian, direction)
     )
-    first, second = inner(direction, inertial), inner(direction, symmetric_product(problem.mass, direction))
-    length = _line_search(problem, residual, along, first, second)
-    moved = _Residual(*([x + length * v for x, v in zip(*pair, strict=True)] for pair in zip(residual, along, strict=True)))
+    linear, quadratic = inner(direction, inertial), inner(direction, symmetric_product(problem.mass, direction))
+    length = _line_search(problem, residual, rate, linear, quadratic)
+    moved = _Residual(*([x + length * v for x, v in zip(*pair, strict=True)] for pair in zip(residual, rate, strict=True)))
     after = [start + length * part for start, part in zip(acceleration, direction, strict=True)]
     return after, _changes(problem, residual, moved)
 
@@ -194,28 +194,28 @@ def _changes(problem: LaneProblem, before: _Residual, after: _Residual) -> Any:
     return jnp.max(jnp.where(changed > 0, 1, 0))
 
 
-def _line_search(problem: LaneProblem, residual: _Residual, along: _Residual, first: Any, second: Any) -> Any:
+def _line_search(problem: LaneProblem, residual: _Residual, rate: _Residual, linear: Any, quadratic: Any) -> Any:
     """Return the step length of minimum cost, between 0 and `_MAX_STEP`, by Newton's method within a bracket.
 
     Args:
         problem: The problem.
         residual: Residuals at the start.
-        along: Their change per unit of step length.
-        first: Linear coefficient of the remaining cost, ``first * length + second * length**2 / 2``.
-        second: Quadratic coefficient, not negative.
+        rate: Their change per unit of step length.
+        linear: Linear coefficient of the remaining cost, ``linear * length + quadratic * length**2 / 2``.
+        quadratic: Quadratic coefficient, not negative.
     """
 
     def slope_at(length: Any) -> tuple[Any, Any]:
-        rows = [x + length * v for x, v in zip(residual.rows, along.rows, strict=True)]
-        parts = [x + length * v for x, v in zip(residual.parts, along.parts, strict=True)]
-        slope, curvature = first + second * length, second
-        for x, v, stiffness in zip(rows, along.rows, _acting_stiffness(problem, rows), strict=True):
+        rows = [x + length * v for x, v in zip(residual.rows, rate.rows, strict=True)]
+        parts = [x + length * v for x, v in zip(residual.parts, rate.parts, strict=True)]
+        slope, curvature = linear + quadratic * length, quadratic
+        for x, v, stiffness in zip(rows, rate.rows, _acting_stiffness(problem, rows), strict=True):
             slope, curvature = slope + stiffness * x * v, curvature + stiffness * v * v
         lane_slope: Any = 0.0
         lane_curvature: Any = 0.0
-        normal = along.parts[0]
+        normal = rate.parts[0]
         for row, (ahead, back, one, other) in enumerate(_edges(problem, parts), start=1):
-            faster, slower = normal + along.parts[row], normal - along.parts[row]
+            faster, slower = normal + rate.parts[row], normal - rate.parts[row]
             lane_slope = lane_slope + one * ahead * faster + other * back * slower
             lane_curvature = lane_curvature + one * faster * faster + other * slower * slower
         return slope + sum_lanes(lane_slope), curvature + sum_lanes(lane_curvature)
@@ -233,6 +233,6 @@ def _line_search(problem: LaneProblem, residual: _Residual, along: _Residual, fi
         is_moving = jnp.abs(after - length) > _RESOLUTION * jnp.abs(length)
         return step + 1, jnp.max(jnp.where(is_moving, 1, 0)), low, high, after
 
-    zero = 0.0 * first
+    zero = 0.0 * linear
     state = (0, jnp.int32(1), zero, zero + _MAX_STEP, zero + 1.0)
     return jnp.minimum(jnp.maximum(jax.lax.while_loop(continues, narrow, state)[4], 0.0), _MAX_STEP)

@@ -27,10 +27,10 @@ def in_own_block(compute: Callable[[Any], Any], inputs: Any, initial: Any) -> An
     # Values that a loop does not change would not remain arguments of its block.
     zeros = [0.0 * array for array in arrays]
 
-    def turn(state: tuple[Any, list[Any], Any]) -> tuple[Any, list[Any], Any]:
+    def iterate(state: tuple[Any, list[Any], Any]) -> tuple[Any, list[Any], Any]:
         number, arrays, _ = state
         rest = iter(arrays)
         values = [next(rest) if varies else leaf for leaf, varies in zip(leaves, is_array, strict=True)]
         return number + 1, zeros, compute(jax.tree.unflatten(structure, values))
 
-    return jax.lax.while_loop(lambda state: state[0] < 1, turn, (0, arrays, initial))[2]
+    return jax.lax.while_loop(lambda state: state[0] < 1, iterate, (0, arrays, initial))[2]
