@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from jaxrl_vis.bench.conditions import Watch
+from jaxrl_vis.bench.conditions import ConditionMonitor
 from jaxrl_vis.bench.record import Measurement, compare_and_keep, load, results_path, write_json
 from jaxrl_vis.bench.settings import Settings
 
@@ -59,10 +59,10 @@ def keep_records(
     """
     load(results_path(benchmark, results))  # fail before measuring if records cannot be stored
     measurements, records = [], []
-    device_settings, watch = settings.for_this_device(), Watch()
+    device_settings, monitor = settings.for_this_device(), ConditionMonitor()
     for measurement in measure(device_settings):
         measurements.append(measurement)
-        records.append(compare_and_keep(benchmark, measurement, results, watch.conditions()))
+        records.append(compare_and_keep(benchmark, measurement, results, monitor.conditions()))
     if json is not None:
         write_json(json, records)
     if records:

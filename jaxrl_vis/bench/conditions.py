@@ -120,7 +120,7 @@ def _seconds(call: Callable[[], Any]) -> float:
     return statistics.median(seconds_per_call(calls) for _ in range(_REPEATS))
 
 
-class Watch:
+class ConditionMonitor:
     """Monitor of the machine during a benchmark: ask for the conditions after each measurement."""
 
     def __init__(self) -> None:
@@ -142,7 +142,7 @@ def comparison_fault(new: dict[str, Any] | None, old: dict[str, Any] | None) -> 
     """Return the reason why two results are not comparable, in words; None if they are.
 
     Args:
-        new, old: Conditions from `Watch`; None for a record without conditions.
+        new, old: Conditions from `ConditionMonitor`; None for a record without conditions.
     """
     if old is None or new is None:
         return "it does not say how fast its machine was"

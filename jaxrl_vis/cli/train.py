@@ -11,7 +11,7 @@ from jaxrl_vis.cli.parsing import AlsoPositional, DefaultText, FieldsOf
 from jaxrl_vis.config import OPTIONS, PRESETS, Config, preset, validate
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host import distributed, streams
-from jaxrl_vis.host.devices import check_devices, claim_memory, count_devices, guess_accelerator, start_devices
+from jaxrl_vis.host.devices import check_devices, claim_memory, guess_accelerator, parse_device_count, start_devices
 from jaxrl_vis.host.plugins import custom_names
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.run.loggers import group
@@ -91,7 +91,7 @@ def training_config(options: Train) -> Config:
         from jaxrl_vis.run.signals import shielded_children
 
         with shielded_children():
-            changes["devices"] = count_devices(options.devices)
+            changes["devices"] = parse_device_count(options.devices)
     name = options.preset
     if name not in ("auto", *PRESETS):
         raise RequestError(f"unknown preset {name!r}{nearest(name, ['auto', *PRESETS])}")

@@ -150,7 +150,7 @@ def _write_fault(folder: Path) -> str | None:
     return None
 
 
-def count_devices(requested: str) -> int:
+def parse_device_count(requested: str) -> int:
     """Parse a number of devices: a number, or ``all`` for the devices of all processes.
 
     Raises:

@@ -54,7 +54,7 @@ def find_rank(
     options = {"--coordinator": coordinator, "--num-processes": count, "--process-id": index}
     missing = [name for name, value in options.items() if value is None]
     if len(missing) == len(options):
-        return _by_launcher(variables)
+        return _find_launcher_rank(variables)
     if missing:
         raise RequestError(f"{', '.join(options)} belong together: {' and '.join(missing)} is missing")
     assert coordinator is not None and count is not None and index is not None
@@ -68,7 +68,7 @@ def find_rank(
     return Rank(coordinator, count, index) if count > 1 else None
 
 
-def _by_launcher(variables: Mapping[str, str]) -> Rank | None:
+def _find_launcher_rank(variables: Mapping[str, str]) -> Rank | None:
     launchers = (
         ("SLURM_STEP_NUM_TASKS", "SLURM_PROCID", "SLURM_STEP_NODELIST"),
         ("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK", "OMPI_MCA_orte_hnp_uri"),

@@ -129,12 +129,12 @@ def check_path(path: Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         return
     except OSError as error:
-        raise RequestError(f"{_short(path)} cannot be used ({error.strerror or type(error).__name__})") from error
+        raise RequestError(f"{_shorten(path)} cannot be used ({error.strerror or type(error).__name__})") from error
     except ValueError as error:
-        raise RequestError(f"{_short(path)!r} cannot be used ({error})") from error
+        raise RequestError(f"{_shorten(path)!r} cannot be used ({error})") from error
 
 
-def _short(path: Path) -> str:
+def _shorten(path: Path) -> str:
     text = str(path)
     return text if len(text) <= 120 else f"{text[:80]}...{text[-30:]}"
 

@@ -33,15 +33,15 @@ def to_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = No
 def escape_cell(value: Any) -> Any:
     """Return the value of a cell, with an apostrophe before text that a spreadsheet would evaluate; see `unescape_cell`."""
     # Text that already has one gets another, so that `unescape_cell` is exact.
-    return f"'{value}" if isinstance(value, str) and _needs_mark(value) else value
+    return f"'{value}" if isinstance(value, str) and _needs_escape(value) else value
 
 
 def unescape_cell(written: str) -> str:
     """Return the text of which ``written`` is the result of `escape_cell`."""
-    return written[1:] if written.startswith("'") and _needs_mark(written[1:]) else written
+    return written[1:] if written.startswith("'") and _needs_escape(written[1:]) else written
 
 
-def _needs_mark(text: str) -> bool:
+def _needs_escape(text: str) -> bool:
     begin = text.lstrip("' ")
     return begin.startswith(_SIGNS) and not _is_number(text)
 

@@ -283,8 +283,8 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     if other:
         name = other[0]
         raise RequestError(
-            f"{path} holds records of another evaluation ({name}: {_short(contents.get(name))}, not {_short(about[name])}): "
-            "name another file with --json"
+            f"{path} holds records of another evaluation "
+            f"({name}: {_shorten(contents.get(name))}, not {_shorten(about[name])}): name another file with --json"
         )
     numbers = [record["number"] for record in records]
     if twice := sorted({number for number in numbers if numbers.count(number) > 1}):
@@ -292,6 +292,6 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Record]:
     return records
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) < 60 else f"{text[:57]}..."

@@ -137,7 +137,7 @@ class Sequence:
             (flash, settings.ambient, family.rig.distance),
         )
         shot = shading.Shot(*(jnp.asarray(value, jnp.float32) for value in values), day=daylight(family, self.plot.seed))
-        radiance, instance, depth = drawing.draw(view, shot, true.width, true.height, settings.samples)
+        radiance, instance, depth = drawing.render_view(view, shot, true.width, true.height, settings.samples)
         blades = grass(family, self.plot.seed)
         if blades is not None:
             camera = (pose.position + offset @ pose.rotation, pose.rotation, true.focal, true.centre)

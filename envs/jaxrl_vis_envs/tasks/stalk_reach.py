@@ -148,7 +148,7 @@ class StalkReach(MjxGoalEnv):
         return self.configuration(episode, position, still)
 
     def act(self, data: mjx.Data, action: jax.Array) -> mjx.Data:
-        position = within_reach(stalk_arm.grip_at(data.ctrl) + self.config.action_scale * action)
+        position = clamp_to_workspace(stalk_arm.grip_at(data.ctrl) + self.config.action_scale * action)
         gusts = self._gusts(data.mocap_pos[self._wind])
         foot = data.mocap_pos[self._layout.mocap]
         wind = bending.wind_torque(self._model, self._layout, gusts, foot, data.time)
@@ -224,7 +224,7 @@ def _rest_points(foot: jax.Array, rotation: jax.Array, height: jax.Array | float
     return foot + height / axis[:, 2:] * axis
 
 
-def within_reach(position: jax.Array) -> jax.Array:
+def clamp_to_workspace(position: jax.Array) -> jax.Array:
     """Clamp a position [3] (m, world) to the grip's workspace, in radius and bearing around the shoulder and in height."""
     shoulder = jnp.asarray(stalk_arm.SHOULDER, jnp.float32)
     offset = position[:2] - shoulder

@@ -191,12 +191,12 @@ def measure_output(case: Case, output: str, repeats: int) -> Measurement:
     sample = {name: rows[:_SAMPLE] for name, rows in case.batches[0].items()}
     tests = models.needed_tests(mj_model, sample, size)
     pixel_operations = operations.operations_per_pixel(scene, tests, coloured=output != "depth")
-    details = _effort(program, count * size * size, timing.median_s, float(np.sum(tests)), pixel_operations)
+    details = _cost_details(program, count * size * size, timing.median_s, float(np.sum(tests)), pixel_operations)
     details["drawn"] = len(scene.object_ids)
     return Measurement("render/scene", count / timing.median_s, "images/s", config, timing.details(compile_s, **details))
 
 
-def _effort(compiled: Any, pixels: int, seconds: float, tests: float, pixel_operations: float | None) -> dict[str, Any]:
+def _cost_details(compiled: Any, pixels: int, seconds: float, tests: float, pixel_operations: float | None) -> dict[str, Any]:
     """Return the details of a measurement's cost: ray-geom tests, operations, and memory.
 
     Args:

@@ -33,7 +33,7 @@ _TILES_PER_BATCH = 256  # on an accelerator
 _SURFACES_PER_STEP = 8
 
 
-def draw(
+def render_view(
     view: View, shot: Shot, width: int, height: int, samples: int, batch_size: int | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Render a view.

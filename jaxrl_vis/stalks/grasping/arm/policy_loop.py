@@ -26,7 +26,7 @@ from jaxrl_vis_envs.plants import bending
 from jaxrl_vis_envs.plants.bending import Shape
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
-from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, within_reach
+from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, clamp_to_workspace
 
 STALKS = 4
 """Number of stalks in a stand, the default of the task."""
@@ -122,7 +122,7 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
         def step(moving: _Moving, _: None) -> tuple[_Moving, dict[str, jax.Array]]:
             reaching, place = moving
             action = jnp.clip(policy(image(model, reaching.data), goal), -1.0, 1.0)
-            wanted = within_reach(place + env.config.action_scale * action)
+            wanted = clamp_to_workspace(place + env.config.action_scale * action)
             is_closing = reaching.data.time > timing.reach - 0.5 / control.RATE
 
             def one(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:

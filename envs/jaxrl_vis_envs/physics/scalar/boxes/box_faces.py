@@ -38,7 +38,7 @@ class _Box(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """Point of the other face, in units of its half edges, and True if it lies in the overlap of the faces."""
+    """Point of the incident face, in units of its half edges, and True if it lies in the overlap of the faces."""
 
     x: Any
     y: Any
@@ -127,7 +127,7 @@ def _order_boxes(first: _Box, second: _Box) -> tuple[_Box, _Box, Any]:
 
 
 def _align_nearest_face(reference: _Box, incident: _Box) -> _Box:
-    """Permute the axes of the other box so that its face nearest to the reference is normal to the last axis."""
+    """Permute the axes of the incident box so that its face nearest to the reference is normal to the last axis."""
     return _permute_axes(incident, _argmax([_abs(dot(reference.axes[2], axis)) for axis in incident.axes]))
 
 
@@ -161,11 +161,11 @@ def _permute_axes(box: _Box, axis: Any) -> _Box:
 
 
 def _candidates(centre: Vector, edges: tuple[Vector, Vector], half_size: Vector) -> list[_Candidate]:
-    """Return 24 points of the other face: its corners, those of the reference face, and the intersections of their edges.
+    """Return 24 points of the incident face: its corners, those of the reference face, and the intersections of their edges.
 
     Args:
-        centre: Centre of the other face in the frame of the reference box, m.
-        edges: Half edges of the other face in that frame, m.
+        centre: Centre of the incident face in the frame of the reference box, m.
+        edges: Half edges of the incident face in that frame, m.
         half_size: Half-size of the reference box, m.
     """
     (a, c, _), (b, d, _) = edges

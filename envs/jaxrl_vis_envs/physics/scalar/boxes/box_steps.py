@@ -98,22 +98,22 @@ def _free_pose(position: Column, quaternion: Column) -> MocapPose:
 
 def _free_forces(body: FreeBody, velocity: Column, applied: Column) -> Column:
     """Return the forces on the free body without constraints, in the world, and torques, about its own axes."""
-    spin = (velocity[3], velocity[4], velocity[5])
-    x, y, z = (times(inertia, rate) for inertia, rate in zip(body.inertia, spin, strict=True))
-    loads = [*body.weight, *(minus(0.0, part) for part in _gyroscopic(body, spin, (x, y, z)))]
+    omega = (velocity[3], velocity[4], velocity[5])
+    x, y, z = (times(inertia, rate) for inertia, rate in zip(body.inertia, omega, strict=True))
+    loads = [*body.weight, *(minus(0.0, part) for part in _gyroscopic(body, omega, (x, y, z)))]
     drags = [times(damping, rate) for damping, rate in zip(body.damping, velocity, strict=True)]
     return [minus(plus(load, push), drag) for load, push, drag in zip(loads, applied, drags, strict=True)]
 
 
-def _gyroscopic(body: FreeBody, spin: tuple, momentum: tuple) -> tuple:
+def _gyroscopic(body: FreeBody, omega: tuple, momentum: tuple) -> tuple:
     if len(set(body.inertia)) == 1:
         return 0.0, 0.0, 0.0
-    return cross(spin, momentum)
+    return cross(omega, momentum)
 
 
-def _integrate_quaternion(quaternion: Column, spin: Column, timestep: float) -> Column:
+def _integrate_quaternion(quaternion: Column, omega: Column, timestep: float) -> Column:
     """Return the quaternion a time step later, at a constant angular velocity (rad/s) about the body's own axes."""
-    axis = (spin[0], spin[1], spin[2])
+    axis = (omega[0], omega[1], omega[2])
     square = dot(axis, axis)
     norm = jnp.sqrt(square)
     inverse = 1.0 / jnp.where(norm > 0, norm, 1.0)
