@@ -109,7 +109,10 @@ _WORKER = """if (location.protocol === "file:") {
 
 
 def on_post_build(config: Any, **_: Any) -> None:
-    """Write the text of the search worker, and copy the data of the playable page, if it exists (hook of mkdocs)."""
+    """Write a script that embeds the search worker, for pages opened from files (hook of mkdocs).
+
+    Also copy the data of the playable page, if they exist.
+    """
     assets = Path(config.site_dir) / "assets"
     (worker,) = (assets / "javascripts" / "workers").glob("search.*.min.js")
     (assets / "local-iframe-worker.js").write_text(_WORKER % json.dumps(worker.read_text(encoding="utf-8")), encoding="utf-8")

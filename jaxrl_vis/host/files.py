@@ -151,7 +151,7 @@ def make_private(folder: Path) -> None:
 
 
 def foreign_writer(status: os.stat_result) -> str | None:
-    """Describe who else than this user and root may have written a file or folder; None if nobody, and on Windows.
+    """Describe who other than this user and root may have written a file or folder; None if nobody, and on Windows.
 
     Args:
         status: Result of `os.stat`, or of `os.fstat` for an open file.
@@ -166,9 +166,12 @@ def foreign_writer(status: os.stat_result) -> str | None:
 
 
 def read_private(path: Path) -> bytes | None:
-    """Read a file that only this user or root can have written; return None if it is missing or may be another user's.
+    """Read a file that only this user or root can have written.
 
     Symbolic links are not followed.
+
+    Returns:
+        The contents; None if the file cannot be read, or another user may have written it.
     """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:

@@ -37,7 +37,7 @@ def escape_cell(value: Any) -> Any:
 
 
 def unescape_cell(written: str) -> str:
-    """Return the text of which ``written`` is the result of `escape_cell`."""
+    """Return the text that `escape_cell` converts to ``written``."""
     return written[1:] if written.startswith("'") and _needs_escape(written[1:]) else written
 
 

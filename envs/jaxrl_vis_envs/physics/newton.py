@@ -73,9 +73,9 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         slope = inertial + _product(jacobian.T, acting * residual)
         curvature = mass + _weighted_square(jacobian, acting)
         direction = -solve_positive(curvature, slope)
-        along = _product(jacobian, direction)
+        rate = _product(jacobian, direction)
         linear, quadratic = jnp.sum(direction * inertial), jnp.sum(direction * _product(mass, direction))
-        return acceleration + _line_search(residual, along, stiffness, is_equality, linear, quadratic) * direction, None
+        return acceleration + _line_search(residual, rate, stiffness, is_equality, linear, quadratic) * direction, None
 
     start = data.qacc_smooth
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART:

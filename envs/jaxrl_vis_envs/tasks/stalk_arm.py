@@ -116,7 +116,7 @@ def is_reachable(target: np.ndarray) -> np.ndarray:
         target: [..., 3], m in the frame of a stand.
 
     Returns:
-        [..., 2] bool, for the elbow on side 1 and on side -1.
+        [..., 2] bool, for elbow signs 1 and -1.
     """
     target = np.asarray(target, float)
     distance = np.linalg.norm(target[..., :2] - np.array(SHOULDER), axis=-1)
