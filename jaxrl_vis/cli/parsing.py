@@ -87,7 +87,7 @@ class _Option:
         default: Description of its default in the help; empty if obvious.
         required: True if it must be given.
         changes: Field of the command that collects it; None if it is a field of the command itself.
-        twin: True for the positional form of a field that is also an option.
+        is_positional_form: True for the positional form of a field that is also an option.
     """
 
     name: str
@@ -97,12 +97,12 @@ class _Option:
     default: str
     required: bool
     changes: str | None = None
-    twin: bool = False
+    is_positional_form: bool = False
 
     @property
     def key(self) -> str:
         """Key of the option for tyro."""
-        return f"{self.name}_by_place" if self.twin else self.name
+        return f"{self.name}_by_place" if self.is_positional_form else self.name
 
     @property
     def flag(self) -> str:
@@ -278,7 +278,7 @@ def _collect_options(command: type) -> list[_Option]:
                 default = extra.describe() if isinstance(extra, DefaultText) else default
             if AlsoPositional() in field.extras:
                 options.append(_Option(field.name, field.hint, False, text, "" if required else default, False))
-                options.append(_Option(field.name, field.hint, True, text, default, required, twin=True))
+                options.append(_Option(field.name, field.hint, True, text, default, required, is_positional_form=True))
                 continue
             positional = tyro.conf.Positional in field.extras
             options.append(_Option(field.name, field.hint, positional, text, default, required))

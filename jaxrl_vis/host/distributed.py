@@ -17,8 +17,8 @@ from jaxrl_vis.errors import RequestError
 START_S = 120
 """Time that a process waits for the others at startup, s."""
 _HEARTBEAT_S = 20  # a process without heartbeat for this long is considered dead, and the others are ended
-_SHUTDOWN_S = 30
-_LEAVE_S = 10
+_SHUTDOWN_TIMEOUT_S = 30
+_EXIT_TIMEOUT_S = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +100,7 @@ def start(rank: Rank, seconds: int = START_S) -> None:
             process_id=rank.index,
             initialization_timeout=seconds,
             heartbeat_timeout_seconds=_HEARTBEAT_S,
-            shutdown_timeout_seconds=_SHUTDOWN_S,
+            shutdown_timeout_seconds=_SHUTDOWN_TIMEOUT_S,
         )
     except (RuntimeError, ValueError, OSError) as error:
         reason = " ".join(str(error).split())[:200]
@@ -175,7 +175,7 @@ def shut_down_together() -> None:
     # In a thread, because JAX ends a process when its shutdown barrier fails.
     leaving = threading.Thread(target=jax.distributed.shutdown, daemon=True)
     leaving.start()
-    leaving.join(_LEAVE_S)
+    leaving.join(_EXIT_TIMEOUT_S)
 
 
 def any_process(answer: bool) -> bool:

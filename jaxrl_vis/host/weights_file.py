@@ -202,8 +202,8 @@ def check_range(path: Path, name: str, values: tuple[float, ...], low: float, hi
         raise RequestError(f"{path}: {name} of its network must be {kind}from {low:g} to {high:g}, 16 at most, not {shown}")
 
 
-def _other_network(path: Path, why: str, command: str) -> str:
-    return f"{path} holds weights of another network ({why}): train them again with `{command}`"
+def _other_network(path: Path, reason: str, command: str) -> str:
+    return f"{path} holds weights of another network ({reason}): train them again with `{command}`"
 
 
 def convert(old: Path, new: Path) -> None:

@@ -153,11 +153,11 @@ class Environments:
         """Build the environment and its compiled functions, or reuse those with the same settings."""
         self.env = _find_or_make(*self._env_arguments)
         self.programs = _programs(self.env)
-        self._camera = None if self._render_size is None else _render_program(self.env, self._render_size)
+        self._render_images = None if self._render_size is None else _render_program(self.env, self._render_size)
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled programs cannot be pickled: the receiver builds them again. Episodes continue from their current state.
-        return {name: value for name, value in vars(self).items() if name not in ("env", "programs", "_camera")}
+        return {name: value for name, value in vars(self).items() if name not in ("env", "programs", "_render_images")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -219,11 +219,11 @@ class Environments:
         Raises:
             gymnasium.error.ResetNeeded: `reset` has not been called.
         """
-        if self._camera is None:
+        if self._render_images is None:
             return None
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
-        return np.array(self._camera(self._state.data, self._state.domain))
+        return np.array(self._render_images(self._state.data, self._state.domain))
 
 
 def _planar(observations: Observations) -> np.ndarray:

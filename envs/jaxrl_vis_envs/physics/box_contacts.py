@@ -99,8 +99,8 @@ def _contact_points(
     return jnp.where(is_new & is_inside[chosen], distance, _FAR), middle + points @ rotation.T, normal
 
 
-def _select(condition: jax.Array, yes: tuple, no: tuple) -> tuple[jax.Array, ...]:
-    return tuple(jnp.where(condition, one, other) for one, other in zip(yes, no, strict=True))
+def _select(condition: jax.Array, if_true: tuple, if_false: tuple) -> tuple[jax.Array, ...]:
+    return tuple(jnp.where(condition, one, other) for one, other in zip(if_true, if_false, strict=True))
 
 
 def _move_axis_last(axis: jax.Array, rotation: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -188,15 +188,15 @@ def _differentiate(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Arra
 
 
 @custom_vmap
-def _eliminate(matrices: jax.Array, rights: jax.Array) -> jax.Array:
-    """Solve a batch of systems, matrices [B, N, N] and right sides [B, N], by Gauss-Jordan elimination: [B, N].
+def _eliminate(matrices: jax.Array, rhs: jax.Array) -> jax.Array:
+    """Solve a batch of systems, matrices [B, N, N] and right-hand sides ``rhs`` [B, N], by Gauss-Jordan elimination: [B, N].
 
     The batch comes last in memory, so that arithmetic is vectorized along it. Positive definite matrices need no pivoting. An
     unrolled Cholesky factorization has fewer operations but takes longer to compile and, for 16 episodes, to run.
     """
-    size = rights.shape[-1]
-    # Rows with their right sides appended, without the columns that have become those of the identity.
-    rows = jnp.moveaxis(jnp.concatenate([matrices, rights[:, :, None]], axis=2), 0, 2)
+    size = rhs.shape[-1]
+    # Rows with their right-hand sides appended, without the columns that have become those of the identity.
+    rows = jnp.moveaxis(jnp.concatenate([matrices, rhs[:, :, None]], axis=2), 0, 2)
     for pivot in range(size):
         row = rows[pivot, 1:] / rows[pivot, 0]
         rows = (rows[:, 1:] - rows[:, :1] * row).at[pivot].set(row)
@@ -204,10 +204,10 @@ def _eliminate(matrices: jax.Array, rights: jax.Array) -> jax.Array:
 
 
 @_eliminate.def_vmap
-def _(size: int, in_batched: list[bool], matrices: jax.Array, rights: jax.Array) -> tuple[jax.Array, bool]:
+def _(size: int, in_batched: list[bool], matrices: jax.Array, rhs: jax.Array) -> tuple[jax.Array, bool]:
     def flat(array: jax.Array, is_batched: bool) -> jax.Array:
         batch = array if is_batched else jnp.broadcast_to(array, (size, *array.shape))
         return batch.reshape(-1, *batch.shape[2:])
 
-    solved = _eliminate(*map(flat, (matrices, rights), in_batched))
+    solved = _eliminate(*map(flat, (matrices, rhs), in_batched))
     return solved.reshape(size, -1, solved.shape[-1]), True

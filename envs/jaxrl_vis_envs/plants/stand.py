@@ -21,7 +21,7 @@ MAST_DISTANCE = 0.55
 STALKS = 6
 """Default number of stalks in a stand."""
 _PARKING_DISTANCE = 4.0  # m, distance of absent stalks behind the row
-_FIT = 0.1  # m, the upper segment is the secant of the stalk over this distance below and above the arm's height
+_SECANT_HALF_LENGTH = 0.1  # m, the upper segment is the secant of the stalk over this distance below and above the arm's height
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _empty(stalks: int) -> list[np.ndarray]:
 
 def _stand(plot: Plot, x: float, target: np.ndarray, stalks: int) -> tuple[np.ndarray, ...]:
     origin = stand_origin(x)
-    height = float(np.clip(target[2], KNEE + _FIT, TOP - _FIT))
+    height = float(np.clip(target[2], KNEE + _SECANT_HALF_LENGTH, TOP - _SECANT_HALF_LENGTH))
     positions = np.array([stalk.at_height(height)[0] for stalk in plot.measured]).reshape(-1, 3) - origin
     order = np.argsort(_distance_to_line(positions[:, :2], (target - origin)[:2]), kind="stable")[:stalks]
     stalk = np.full(stalks, -1)
@@ -146,7 +146,9 @@ def _stand(plot: Plot, x: float, target: np.ndarray, stalks: int) -> tuple[np.nd
     radius, bending_radius = np.full((stalks, 2), 0.007), np.full((stalks, 2), 0.007)
     for slot, index in enumerate(order):
         measured = plot.measured[index]
-        middle, below, above = (measured.at_height(height + step)[0] - origin for step in (0.0, -_FIT, _FIT))
+        middle, below, above = (
+            measured.at_height(height + step)[0] - origin for step in (0.0, -_SECANT_HALF_LENGTH, _SECANT_HALF_LENGTH)
+        )
         slope = (above - below) / (above - below)[2]
         foot[slot] = measured.points[0] - origin
         knee[slot], top[slot] = middle + (KNEE - height) * slope, middle + (TOP - height) * slope

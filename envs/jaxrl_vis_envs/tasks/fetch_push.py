@@ -36,12 +36,16 @@ _START_BOX, _START_BOX_VELOCITY = (1.25, 0.53, 0.4247021), (0.0, 0.0, 0.0011707)
 _FINGER_HALF_SIZE = (0.0385, 0.007, 0.0135)  # m
 # The original's mixtures of the softness and friction of two shapes. MuJoCo up to 3.2 took half the distance between two boxes
 # for their distance: twice the margin and width, and a damping ratio that halves the stiffness, make up for that.
-_SOFTER = 2**0.5
+_DAMPING_RATIO = 2**0.5
 _FINGER_CONTACT = dict(
-    condim=4, friction=(1, 1, 0.05, 0.01, 0.01), solref=(0.015, _SOFTER), solimp=(0.945, 0.97, 0.011, 0.5, 2), margin=0.002
+    condim=4,
+    friction=(1, 1, 0.05, 0.01, 0.01),
+    solref=(0.015, _DAMPING_RATIO),
+    solimp=(0.945, 0.97, 0.011, 0.5, 2),
+    margin=0.002,
 )
 _BOX_ON_TABLE = dict(
-    condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, _SOFTER), solimp=(0.9, 0.95, 0.002, 0.5, 2)
+    condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, _DAMPING_RATIO), solimp=(0.9, 0.95, 0.002, 0.5, 2)
 )
 _BOX_ON_FLOOR = dict(condim=3, friction=(1, 1, 0.005, 0.0001, 0.0001), solref=(0.02, 1), solimp=(0.9, 0.95, 0.001, 0.5, 2))
 _MOVE_THRESHOLD = 0.001  # displacement in a control step that counts as a move of the box, m; it settles by less

@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw
 
 from jaxrl_vis_envs.plants.rendering.surfaces import GROUND
 
-_NEAREST = 0.15
+_MIN_DEPTH = 0.15
 """Minimum depth of a rendered blade, m."""
 
 
@@ -62,7 +62,7 @@ def render_blades(
     """
     position, rotation, focal, centre = camera
     seen = (blades.points - position) @ rotation.T
-    there = np.flatnonzero(seen[:, :, 2].min(axis=1) > _NEAREST)
+    there = np.flatnonzero(seen[:, :, 2].min(axis=1) > _MIN_DEPTH)
     there = there[np.argsort(-seen[there, 0, 2])]
     across = seen[there, :, :2] / seen[there, :, 2:] * focal + np.array(centre)
     half = np.maximum(0.5 * focal * blades.width[there] / seen[there, 0, 2], 0.3)
