@@ -24,7 +24,7 @@ import jax  # noqa: E402
 
 from benchmarks.ledger.records import RESULTS  # noqa: E402
 from benchmarks.pixels import gallery, playground, speed  # noqa: E402
-from jaxrl_vis.bench.conditions import Watch  # noqa: E402
+from jaxrl_vis.bench.conditions import ConditionMonitor  # noqa: E402
 from jaxrl_vis.bench.record import compare_and_keep  # noqa: E402
 from jaxrl_vis.errors import RequestError  # noqa: E402
 from jaxrl_vis.host.provenance import versions  # noqa: E402
@@ -64,10 +64,10 @@ def measure_speed(tasks: Sequence[str], results: pathlib.Path, envs: int | None,
     """Measure all tasks, and store the records."""
     on_cpu = jax.default_backend() == "cpu"
     count, length = envs or (16 if on_cpu else 1024), steps or (10 if on_cpu else 50)
-    watch = Watch()
+    monitor = ConditionMonitor()
     for task in tasks:
         for measurement in speed.measure(task, count, length, IMAGE_SIZE, repeats):
-            compare_and_keep("pixels", measurement, results, watch.conditions())
+            compare_and_keep("pixels", measurement, results, monitor.conditions())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxrl_vis import preset
-from jaxrl_vis.bench.update import seed_keys, start
+from jaxrl_vis.bench.update import init_with_full_replay, seed_keys
 from jaxrl_vis.config import Config, fields
 from jaxrl_vis.errors import RequestError, nearest
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
@@ -81,7 +81,7 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
 def measure(program: TrainStep, options: argparse.Namespace) -> None:
     """Compile the parts and report each."""
     parts: list[str] = options.parts
-    loop, keys = start(program), seed_keys(program, 2)
+    loop, keys = init_with_full_replay(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)
     playing = train, keys, jnp.int32(0), program.exploration
     rolled = jax.eval_shape(program.play, *playing)[0]

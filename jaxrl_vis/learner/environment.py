@@ -11,7 +11,7 @@ from jaxrl_vis.host import plugins
 from jaxrl_vis_envs.base import GoalEnv
 from jaxrl_vis_envs.randomization import typical
 from jaxrl_vis_envs.registry import config_class, load
-from jaxrl_vis_envs.task_modules import import_folder
+from jaxrl_vis_envs.task_modules import import_root
 
 
 def _option_of_environment(name: str) -> str | None:
@@ -36,9 +36,9 @@ def locate_env(config: Config) -> Config:
         folders = {config.environment.env: load(config.environment.env, config.environment.env_folder)}
     except ValueError as error:
         raise RequestError(str(error)) from error
-    for kind, name in plugins.own_names(config).items():
+    for kind, name in plugins.custom_names(config).items():
         if kind != "task":
-            folders[name] = import_folder(plugins.load(name, config.environment.env_folder)[0])
+            folders[name] = import_root(plugins.load(name, config.environment.env_folder)[0])
     names = {folder: name for name, folder in folders.items() if folder is not None}
     if len(names) > 1:
         where = " and ".join(f"{name} in {folder}" for folder, name in names.items())

@@ -113,7 +113,7 @@ class RunLoop:
         shapes, layout = self._programs.shapes, self._programs.layout
         stacked = self._program.replay.frame_stack
         memory = check_memory(self._config, shapes, self._program.replay_bytes, steps, layout, stacked)
-        distributed.meet("checked")  # before the first process writes anything that the others would detect
+        distributed.sync_processes("checked")  # before the first process writes anything that the others would detect
         if is_resumed:
             self._checkpoints.run_id = read_run_id(self._folder.path)
         with run_lock(self._folder.path, self._echo) if self._writes else contextlib.nullcontext() as self._lock, self._console:
@@ -179,7 +179,7 @@ class RunLoop:
         self._console.stop()
         if not self.has_begun:  # nothing was learned since the last checkpoint, and the folder may belong to another run
             return
-        if distributed.are_several():
+        if distributed.is_multi_process():
             self._is_left_alone = True  # the other processes may have ended, and saving would wait for them
             return
         with contextlib.suppress(Exception):
@@ -220,7 +220,7 @@ class RunLoop:
             self._open(is_resumed, overwrite)
             if trust.is_own(self._config):  # and here it runs
                 trust.trust(self._folder.path, self._config, was_trained_here=True)
-        distributed.meet("opened")
+        distributed.sync_processes("opened")
         self._checkpoints.run_id = read_run_id(self._folder.path)
         self.has_begun = True
         self._on_begun()
@@ -232,7 +232,7 @@ class RunLoop:
                 self._checkpoints.recent.resume_from(self._recent_at)
                 self._goodput.begin(self._done, self._replay_lost)
                 self._begin_log(is_resumed, damaged, foreign)
-        distributed.meet("begun")
+        distributed.sync_processes("begun")
         if self._loop is None:
             self._loop = self._programs.init(self._programs.run_keys)
         self._console.start(self._total, self._done)
@@ -312,7 +312,7 @@ class RunLoop:
             evaluation = self._is_due(config.run.eval_interval) or self._done == self._total
             light, full = self._is_due(config.run.checkpoint_interval), self._is_due(config.run.full_checkpoint_interval)
             recent = self._saver.is_recent_due(light)
-            if not (evaluation or light or full or recent or (interruption and not distributed.are_several())):
+            if not (evaluation or light or full or recent or (interruption and not distributed.is_multi_process())):
                 continue
             # Before the metrics are read, so that the device does not wait for the host.
             outcome = self._begin_evaluation() if evaluation and self._evaluates_ahead else None

@@ -223,7 +223,7 @@ class Saver:
         leaves = [name.removeprefix("train.") for name in leaves if name.startswith("train.")]
         file = self._folder.nonfinite / f"iteration_{iteration}.npz"
         simulated, dumped = None, "the state is distributed over several processes and is not dumped"
-        if not distributed.are_several():
+        if not distributed.is_multi_process():
             try:
                 dump(file, loop, values, leaves)
                 dumped = f"state dumped to {file}"

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import NonFiniteError, RequestError, Terminated
-from jaxrl_vis.host.devices import check_devices, enable_compilation_cache, hush_cache, start_devices
-from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.devices import check_devices, enable_compilation_cache, silence_cache_warnings, start_devices
+from jaxrl_vis.host.plugins import custom_names
 from jaxrl_vis.host.streams import safe_streams
 from jaxrl_vis.learner.environment import locate_env, make_env
 from jaxrl_vis.learner.train_step import make_train_step
@@ -203,10 +203,10 @@ def make_trainer(
     if run_dir is not None:
         RunFolder(Path(run_dir)).check(config, resume, overwrite)  # building an environment takes a while: refuse before
     with safe_streams():  # libraries that print, or warn, as they are imported and compile
-        hush_cache()
+        silence_cache_warnings()
         with shielded_children():  # threads that JAX starts with its first use of a device never see signals
             start_devices()
-            if is_built_in(config.environment.env) and not own_names(config):
+            if is_built_in(config.environment.env) and not custom_names(config):
                 locate_env(config)  # imports MuJoCo, meanwhile
             check_devices()
         config = locate_env(config)

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from jaxrl_vis.config import Config
 from jaxrl_vis.errors import RequestError
-from jaxrl_vis.host.files import make_private, read_private, replacing, stranger_to, user_cache
-from jaxrl_vis.host.plugins import own_names
+from jaxrl_vis.host.files import foreign_writer, make_private, read_private, replacing, user_cache
+from jaxrl_vis.host.plugins import custom_names
 from jaxrl_vis.run.storage.folder import read_run_id
 from jaxrl_vis_envs import task_modules
 
@@ -27,7 +27,7 @@ _trusted_here: set[str] = set()  # by this process, if the cache is not writable
 
 def is_own(config: Config) -> bool:
     """Return True if a part of a configuration is custom code."""
-    return bool(own_names(config))
+    return bool(custom_names(config))
 
 
 def is_trusted(run_dir: Path, config: Config) -> bool:
@@ -83,7 +83,7 @@ def check(run_dir: Path, config: Config, is_permitted: bool, hint: str = "pass t
 def describe_code(run_dir: Path, config: Config) -> str:
     """Return the clause of messages that lists the custom code of a run, and the files that it is imported from."""
     files = _files(config)
-    reasons = [f"its {kind} {name} is imported from {files[name]}" for kind, name in own_names(config).items()]
+    reasons = [f"its {kind} {name} is imported from {files[name]}" for kind, name in custom_names(config).items()]
     return f"the run in {run_dir} runs code that is not of this project: {', '.join(reasons)}"
 
 
@@ -93,7 +93,7 @@ def _folder() -> Path:
 
 def _is_stored(name: str) -> bool:
     try:
-        return stranger_to(_folder().stat()) is None and read_private(_folder() / name) is not None
+        return foreign_writer(_folder().stat()) is None and read_private(_folder() / name) is not None
     except OSError:
         return False
 
@@ -105,7 +105,7 @@ def _files(config: Config) -> dict[str, Path | None]:
         RequestError: A name is not of the form ``module:Name``, or the folder of modules is invalid.
     """
     files = {}
-    for kind, name in own_names(config).items():
+    for kind, name in custom_names(config).items():
         try:
             files[name] = task_modules.find(task_modules.split(name)[0], config.environment.env_folder)
         except (ValueError, OSError) as error:  # not of this form, or an invalid folder

@@ -230,7 +230,7 @@ def test_mlir_finds_the_dialect_of_triton(monkeypatch):
     monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.raises(ImportError):
         importlib.import_module(name)
-    compilation._name_triton_dialect.cache_clear()
+    compilation._register_triton_dialect.cache_clear()
     with tracing_for("cuda"), kernels(True):
         assert use_gpu_kernels()
     assert importlib.import_module(name) is importlib.import_module("jaxlib.triton.dialect")

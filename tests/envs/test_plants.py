@@ -375,7 +375,7 @@ def test_batched_and_sequential_tiles_agree(sequence):
     view = tables.build_view(sequence.surfaces, pose, true)
     numbers = (true.focal, true.centre, (0.0, 0.0), pose.rotation, pose.position, (0.05, -0.1, 0.0), (1.0, 0.01, 0.8))
     shot = shading.Shot(*(jnp.asarray(number, jnp.float32) for number in numbers))
-    one, many = (drawing.draw(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
+    one, many = (drawing.render_view(view, shot, true.width, true.height, 1, at_once) for at_once in (1, 20))
     for left, right in zip(one, many):
         assert np.isclose(np.asarray(left), np.asarray(right), atol=1e-4).mean() > 0.999
 

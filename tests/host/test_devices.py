@@ -96,7 +96,7 @@ def test_the_guess_follows_what_is_asked_for_installed_and_there(
 def test_a_gpu_without_its_packages_is_mended_by_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(devices, "_is_installed", lambda _: False)
     monkeypatch.setattr(devices, "_exists", lambda _: True)
-    assert devices._mend("cuda") == "; install this project with the extra cuda12 or cuda13"
+    assert devices._hint("cuda") == "; install this project with the extra cuda12 or cuda13"
 
 
 def test_sizes_are_all_in_one_unit() -> None:

@@ -178,14 +178,14 @@ def test_what_pip_says_is_shown_where_it_fails(fake_pip, checkout, capsys):
 
 def test_a_replaced_package_that_was_in_use_asks_for_a_restart(fake_pip, checkout, monkeypatch):
     answers = iter([{"numpy": "1.26.0"}, {"numpy": "2.3.0", "jax": "0.10.1"}])
-    monkeypatch.setitem(INSTALL["install"].__globals__, "loaded", lambda: next(answers))
+    monkeypatch.setitem(INSTALL["install"].__globals__, "loaded_versions", lambda: next(answers))
     problem = INSTALL["install"](checkout)
     assert "numpy" in problem and "jax" not in problem.split(":")[0] and "restart" in problem
 
 
 def test_an_installation_that_went_well_says_nothing_more(fake_pip, checkout):
     assert INSTALL["install"](checkout) is None
-    assert {"numpy", "pytest"} <= set(INSTALL["loaded"]())
+    assert {"numpy", "pytest"} <= set(INSTALL["loaded_versions"]())
 
 
 @pytest.mark.parametrize(("driver", "is_limited"), [(None, True), (470, True), (580, False)])
@@ -196,7 +196,7 @@ def test_without_a_usable_gpu_versions_that_are_slow_on_a_cpu_are_left_out(drive
         calls.append(words)
         return subprocess.CompletedProcess(words, 0, stdout="")
 
-    monkeypatch.setitem(INSTALL["install"].__globals__, "driver", lambda: driver)
+    monkeypatch.setitem(INSTALL["install"].__globals__, "find_driver_version", lambda: driver)
     monkeypatch.setattr(subprocess, "run", run)
     assert INSTALL["install"](FOLDER.parent) is None
     (words,) = calls

@@ -197,7 +197,7 @@ def test_a_stalk_gives_way_like_a_beam():
     arms, radius = arms_among(4), 0.006
     model = arms.mj_model.__copy__()
     shape = jax.tree.map(lambda part: part[0], bending.shapes(stands()))
-    fitted = bending.fit(arms.model, arms.layout, shape)
+    fitted = bending.set_stalk_properties(arms.model, arms.layout, shape)
     for name in ("body_pos", "body_ipos", "body_mass", "body_inertia", "jnt_stiffness", "dof_damping"):
         getattr(model, name)[:] = getattr(fitted, name)
     rigidity = bending.MODULUS * np.pi * radius**4 / 4
@@ -218,7 +218,7 @@ def test_a_stalk_gives_way_like_a_beam():
 
 def test_stalks_sway_as_far_as_they_are_said_to():
     foot = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]], np.float32)
-    gusts = jax.vmap(lambda key: bending.gusts(key, 0.02))(jax.random.split(jax.random.key(0), 64))
+    gusts = jax.vmap(lambda key: bending.sample_gusts(key, 0.02))(jax.random.split(jax.random.key(0), 64))
     times = jnp.linspace(0.0, 60.0, 400)
     sway = jax.vmap(lambda gust: jax.vmap(lambda time: bending.displacement(gust, foot, time))(times))(gusts)
     distance = np.linalg.norm(np.asarray(sway), axis=-1)

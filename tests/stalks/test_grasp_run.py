@@ -11,7 +11,7 @@ from phenotype_plots import table
 from PIL import Image
 
 from jaxrl_vis import cli
-from jaxrl_vis.host.worker_pool import finite
+from jaxrl_vis.host.worker_pool import replace_non_finite
 from jaxrl_vis.stalks.cli.options import PlantOptions
 from jaxrl_vis.stalks.grasping.evaluation.records import Conditions, evaluate_run
 from jaxrl_vis.stalks.grasping.evaluation.scoring import draw_scene, score_scene, summary
@@ -164,7 +164,7 @@ def test_eval_of_rows_and_of_an_empty_one(spec, tmp_path, capsys):
     assert "simulated runs of family few" in said and "the arm, again, wind 5 mm:" in said
     # A run is the same in this process, and is not evaluated again.
     family = PlantOptions(spec=spec, width=256, frames=3).read_family("grasping")
-    here = json.loads(json.dumps(finite(evaluate_run(Conditions(family), 1))))
+    here = json.loads(json.dumps(replace_non_finite(evaluate_run(Conditions(family), 1))))
     there = figures["each"][1]
     assert here["plan"]["stalks"] == there["plan"]["stalks"] and here["hits"] == there["hits"]
     np.testing.assert_allclose(here["plan"]["targets"], there["plan"]["targets"], atol=2e-6)

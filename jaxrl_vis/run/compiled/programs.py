@@ -32,7 +32,7 @@ from jaxrl_vis.run.compiled.trace_cache import TraceCache, fingerprint
 from jaxrl_vis.run.signals import shield_this_thread
 from jaxrl_vis.run.storage.arrays import to_host
 from jaxrl_vis.types import LoopState, Metrics, TrainState
-from jaxrl_vis_envs.compiling.compilation import assume_kernels_compile, failed_kernels, tracing_for_default_device
+from jaxrl_vis_envs.compiling.compilation import any_kernel_failed, assume_kernels_compile, tracing_for_default_device
 
 # Seed of the evaluation key, which is the same at every evaluation and for every seed.
 _EVALUATION_SEED = 2**31 - 1
@@ -163,7 +163,7 @@ class Programs:
                 if traces is not None:  # the fault may lie in the cached programs, or in their kernels: retry without the cache
                     traces.forget()
                     traces, self._may_keep = None, False
-                elif trusting and failed_kernels():
+                elif trusting and any_kernel_failed():
                     trusting = False
                 else:
                     raise
@@ -179,7 +179,7 @@ class Programs:
 
     def _finish(self, names: Sequence[str], concurrent_work: Callable[[], None]) -> None:
         """Do all work that can overlap with XLA's compilation."""
-        if "init" in names and not distributed.are_several():
+        if "init" in names and not distributed.is_multi_process():
             # Extracting the data of keys, as in saving, is also a compiled program.
             to_host({"keys": self.run_keys, "evaluation": self.evaluation_key}, copy=True)
         concurrent_work()

@@ -53,14 +53,14 @@ def _checksum(array: np.ndarray) -> int:
 
 def describe(arrays: dict[str, Any]) -> dict[str, list]:
     """Describe arrays for a manifest: shape, dtype and checksum, by name."""
-    if distributed.are_several():
+    if distributed.is_multi_process():
         return _describe_parts(arrays)
     return {name: [list(array.shape), str(array.dtype), _checksum(array)] for name, array in arrays.items()}
 
 
 def saved_leaves(tree: Any, copy: bool) -> Arrays | dict[str, jax.Array]:
     """Return the leaves of a pytree by name, as saved by orbax; with several processes, each writes its own parts."""
-    if not distributed.are_several():
+    if not distributed.is_multi_process():
         return to_host(tree, copy)
     return {
         name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf

@@ -102,7 +102,7 @@ class Checkpoints:
             # waits for its own disk indefinitely; with several, one that hangs must be detected.
             patient = AsyncOptions(timeout_secs=_TIMEOUT_S, create_directories_asynchronously=False)
             options = ocp.CheckpointManagerOptions(
-                async_options=None if distributed.are_several() else patient,
+                async_options=None if distributed.is_multi_process() else patient,
                 # The best one may be older than the one that it replaces, see `save_best`.
                 preservation_policy=None if self._read_only or tier == BEST else LatestN(_KEPT),
                 cleanup_tmp_directories=not self._read_only,
@@ -174,7 +174,7 @@ class Checkpoints:
         manifest = {"schema": SCHEMA, RUN_ID: self.run_id, "iteration": iteration, "items": described, "progress": progress}
         arguments: dict[str, Any] = {name: ocp.args.StandardSave(arrays) for name, arrays in items.items()}
         arguments["manifest"] = ocp.args.JsonSave(manifest)
-        if distributed.are_several():
+        if distributed.is_multi_process():
             self.wait()  # with two tiers written concurrently, processes would confuse one with the other
         with self._storage_errors(tier):
             manager = self._manager(tier)
@@ -206,13 +206,13 @@ class Checkpoints:
 
     def _put_aside(self, tier: str, iteration: int) -> None:
         """Move a checkpoint aside, where `_recover` finds it if the process is killed before the replacement is complete."""
-        distributed.meet("replacing")
+        distributed.sync_processes("replacing")
         if distributed.is_first():
             aside = self._replaced_path(tier, iteration)
             aside.parent.mkdir(exist_ok=True)
             shutil.rmtree(aside, ignore_errors=True)
             (self._folder / tier / str(iteration)).rename(aside)
-        distributed.meet("replaced")
+        distributed.sync_processes("replaced")
 
     def _recover(self) -> None:
         """Move checkpoints back whose replacement was not completed, and delete those that were replaced."""
@@ -225,7 +225,7 @@ class Checkpoints:
                 shutil.rmtree(aside, ignore_errors=True)
             else:
                 aside.rename(place)
-        distributed.meet("recovered")
+        distributed.sync_processes("recovered")
 
     @contextlib.contextmanager
     def _storage_errors(self, tier: str) -> Iterator[None]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from jaxrl_vis.cli.checks import check_counts
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.devices import check_devices, enable_compilation_cache
-from jaxrl_vis.host.worker_pool import Record, finite, share_accelerator
+from jaxrl_vis.host.worker_pool import Record, replace_non_finite, share_accelerator
 from jaxrl_vis.report.outputs import check_writable
 from jaxrl_vis.stalks.cli.options import EvaluationOptions, check_extra, check_masks
 
@@ -118,7 +118,7 @@ def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]
     from jaxrl_vis.host.files import write_atomically
 
     if options.json is not None:
-        about = {"synthetic": True, "finder": name, "method": options.method, "factors": finite(figures)}
+        about = {"synthetic": True, "finder": name, "method": options.method, "factors": replace_non_finite(figures)}
         write_atomically(options.json, json.dumps(about, indent=2) + "\n")
     print(f"\nsynthetic plots, {options.plots} each, {name}, {options.method}\n")
     print("| shifted | " + " | ".join(_COLUMNS) + " |")

@@ -40,7 +40,7 @@ def _with_errors_named(name: str, reward: Reward) -> Reward:
             raise
         except Exception as error:  # noqa: BLE001 - somebody else's code may raise anything
             file = getattr(getattr(reward, "__code__", None), "co_filename", None)
-            raise RequestError(f"reward {name} cannot be computed: {task_modules.blame(error, file)}") from error
+            raise RequestError(f"reward {name} cannot be computed: {task_modules.describe_error(error, file)}") from error
 
     return call
 

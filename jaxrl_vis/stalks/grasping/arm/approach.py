@@ -31,7 +31,7 @@ def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
     far_enough = distance >= FOLDED + stalk_arm.TIPS + _FOLDED_ROOM
     start = local.copy()
     start[..., :2] = stalk_arm.SHOULDER + place * (FOLDED / np.maximum(distance, 1e-9))[..., None]
-    both = stalk_arm.is_within(local) & stalk_arm.is_within(start)
+    both = stalk_arm.is_reachable(local) & stalk_arm.is_reachable(start)
     return both.any(axis=-1) & far_enough & (place[..., 1] > 0)
 
 

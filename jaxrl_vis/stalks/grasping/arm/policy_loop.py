@@ -26,7 +26,7 @@ from jaxrl_vis_envs.plants import bending
 from jaxrl_vis_envs.plants.bending import Shape
 from jaxrl_vis_envs.plants.stand import Stands
 from jaxrl_vis_envs.tasks import stalk_arm
-from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, within_reach
+from jaxrl_vis_envs.tasks.stalk_reach import HOME, StalkReach, clamp_to_workspace
 
 STALKS = 4
 """Number of stalks in a stand, the default of the task."""
@@ -110,19 +110,19 @@ def _programs(policy: Policy) -> tuple[Any, Any]:
         return fitted(data)
 
     def draw(shape: Shape, target: jax.Array) -> jax.Array:
-        model = bending.fit(arms.model, arms.layout, shape)
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
         data = bending.place_stands(arms.rest, arms.layout, shape)
         joints = stalk_arm.joints_at(target, 1.0)
         return image(model, mjx_model.kinematics(model, data.replace(qpos=data.qpos.at[: stalk_arm.ARM_JOINTS].set(joints))))
 
     def episode(shape: Shape, goal: jax.Array, key: jax.Array, wind: jax.Array) -> dict[str, jax.Array]:
-        scene = Scene(shape, bending.gusts(key, wind), jnp.float32(1.0))
-        model = bending.fit(arms.model, arms.layout, shape)
+        scene = Scene(shape, bending.sample_gusts(key, wind), jnp.float32(1.0))
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
 
         def step(moving: _Moving, _: None) -> tuple[_Moving, dict[str, jax.Array]]:
             reaching, place = moving
             action = jnp.clip(policy(image(model, reaching.data), goal), -1.0, 1.0)
-            wanted = within_reach(place + env.config.action_scale * action)
+            wanted = clamp_to_workspace(place + env.config.action_scale * action)
             is_closing = reaching.data.time > timing.reach - 0.5 / control.RATE
 
             def one(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:

@@ -250,7 +250,7 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
     arms = arms_among(stalks)
 
     def start(shape: Shape, key: jax.Array, wind: jax.Array, side: jax.Array) -> tuple[Scene, Reaching]:
-        scene = Scene(jax.tree.map(jnp.asarray, shape), bending.gusts(key, wind), side)
+        scene = Scene(jax.tree.map(jnp.asarray, shape), bending.sample_gusts(key, wind), side)
         return scene, begin(arms, scene)
 
     def advance(scene: Scene, reaching: Reaching, target: jax.Array) -> tuple[Reaching, dict[str, jax.Array]]:
@@ -261,7 +261,7 @@ def _programs(stalks: int, timing: Timing, gains: Gains) -> tuple[Any, Any]:
 
 def begin(arms: Arms, scene: Scene, home: tuple[float, float, float] = control.HOME) -> Reaching:
     """Return the initial state of an arm with its grip at ``home`` (m, frame of the stand) among swaying stalks."""
-    model = bending.fit(arms.model, arms.layout, scene.shape)
+    model = bending.set_stalk_properties(arms.model, arms.layout, scene.shape)
     data = bending.place_stands(arms.rest, arms.layout, scene.shape)
     swayed = bending.hinge_angles(arms.layout, model.nv, bending.displacement(scene.gusts, scene.shape.foot, 0.0))
     joints = stalk_arm.joints_at(jnp.asarray(home, jnp.float32), scene.side)
@@ -279,7 +279,7 @@ def _advance(
         The new state, and a report: path, actual positions and poses at each point, held and touched stalks, and the positions
         of the stalks at the target's height.
     """
-    model = bending.fit(arms.model, arms.layout, scene.shape)
+    model = bending.set_stalk_properties(arms.model, arms.layout, scene.shape)
 
     def step(reaching: Reaching, _: None) -> tuple[Reaching, None]:
         time = reaching.data.time
@@ -311,7 +311,7 @@ def period(
 
     Args:
         arms: Model with its lookup tables.
-        model: Model with the stalks of the scene (`bending.fit`).
+        model: Model with the stalks of the scene (`bending.set_stalk_properties`).
         scene: Constants of the reach.
         reaching: State of the arm.
         targets: [3], setpoint of the grip, m in the frame of the stand.

@@ -69,7 +69,7 @@ def _program(stalks: int, size: int) -> Any:
     geoms = np.concatenate([arms.layout.lower_geom, arms.layout.upper_geom])
 
     def draw(shape: Shape, pose: jax.Array) -> jax.Array:
-        model = bending.fit(arms.model, arms.layout, shape)
+        model = bending.set_stalk_properties(arms.model, arms.layout, shape)
         data = mjx_model.kinematics(model, bending.place_stands(arms.rest, arms.layout, shape).replace(qpos=pose))
         fitted = scene.replace(size=scene.size.at[geoms].set(model.geom_size[geoms]))
         rgb = render_planes(fitted, data, depth=False, quantized=True).rgb
