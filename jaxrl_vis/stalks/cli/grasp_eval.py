@@ -80,7 +80,11 @@ def _check(options: Eval) -> None:
 
 
 def evaluate(options: Eval) -> int:
-    """Evaluate the runs, print their scores, and return the exit status."""
+    """Evaluate the runs, print their scores, and return the exit status.
+
+    Raises:
+        RequestError: An option, the weights or the policy is invalid, a package is missing, or no device works.
+    """
     _check(options)
     if options.policy is not None:
         check_run(options.policy)
@@ -117,7 +121,7 @@ def evaluate(options: Eval) -> int:
 
 
 def _reach(options: Eval, table: RecordFile, numbers: range) -> None:
-    """Run the simulated arm for each loop and wind, and print the scores of its grasps."""
+    """Run the simulated arm for each loop and wind, add its reaches to ``table``, and print the scores of its grasps."""
     from jaxrl_vis.stalks.grasping.evaluation import records
 
     policy, name = _policy(options)

@@ -34,7 +34,12 @@ class Run(CameraOptions):
 
 
 def run(options: Run) -> int:
-    """Process the runs, write tables and overlays, and return the exit status: 3 if pairs were skipped."""
+    """Process the runs, write tables and overlays, and return the exit status: 3 if pairs were skipped, 0 otherwise.
+
+    Raises:
+        RequestError: An option, a folder, a calibration or the weights are invalid, a package is missing, or no device works.
+        StorageError: The results cannot be written.
+    """
     check_speed(options.speed)
     if not 0.05 <= options.height <= 3.0:
         raise RequestError(f"--height must be from 0.05 to 3 m, not {options.height:g}")

@@ -236,7 +236,7 @@ class CameraOptions:
         return None if self.left is None or self.right is None else Patterns(self.left, self.right)
 
     def find_plots(self, folder: Path, out: Path) -> list[PlotFolder]:
-        """Return the plots in a folder or a recording, which is extracted to the folder ``recording`` in ``out``.
+        """Find the plots in a folder, or in a recording, whose images are extracted to the folder ``recording`` in ``out``.
 
         Raises:
             RequestError: There are none, they are ambiguous, or the recording cannot be read.

@@ -37,7 +37,11 @@ class Eval(EvaluationOptions):
 
 
 def evaluate(options: Eval) -> int:
-    """Evaluate the plots, print their scores, and return the exit status."""
+    """Evaluate the plots, print their scores, and return the exit status.
+
+    Raises:
+        RequestError: An option or the file of weights is invalid, a package is missing, or no device works.
+    """
     check_counts(plots=options.plots)
     options.check()
     if not 0.0 <= options.min_score <= 1.0:
@@ -106,7 +110,7 @@ def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | N
 
 
 def _path(path: Path | None, factor: str) -> Path | None:
-    """Return the file of one factor, beside that of the table; None without a file."""
+    """Return the file of one factor, beside the table's ``path``; ``path`` itself if it is None or the factor is ""."""
     return path.with_name(f"{path.stem}-{factor}.json") if path and factor else path
 
 
@@ -114,7 +118,7 @@ _COLUMNS = ("count_r2", "count_mae", "count_bias", "width_mae_mm", "width_bias_m
 
 
 def _write_table(options: Eval, name: str, figures: Mapping[str, dict[str, Any]]) -> None:
-    """Print a Markdown table with one row per shifted factor, and write it as JSON if a file is given."""
+    """Print a Markdown table with one row per key of ``figures``, and write all figures to ``--json``, if given."""
     from jaxrl_vis.host.files import write_atomically
 
     if options.json is not None:

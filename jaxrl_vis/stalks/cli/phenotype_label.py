@@ -27,7 +27,12 @@ class Label:
 
 
 def label(options: Label) -> int:
-    """Write the proposals, and return the exit status: 3 if images were skipped."""
+    """Write the proposals, and return the exit status: 3 if images were skipped, 0 otherwise.
+
+    Raises:
+        RequestError: An option, the folder or the file of weights is invalid, there are annotations in COCO format already, a
+            package is missing, or no device works.
+    """
     if not 0.0 <= options.min_score <= 1.0:
         raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_extra("phenotyping")

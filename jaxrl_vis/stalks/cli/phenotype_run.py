@@ -52,7 +52,13 @@ class Run(CameraOptions):
 
 
 def run(options: Run) -> int:
-    """Process the plots, write tables, the page and overlays, and return the exit status: 3 if pairs were skipped."""
+    """Process the plots, write tables, the page and overlays, and return the exit status: 3 if pairs were skipped, else 0.
+
+    Raises:
+        RequestError: An option, a folder, a calibration, the field plan or the weights are invalid, a package is missing, or no
+            device works.
+        StorageError: The results cannot be written.
+    """
     if not 0.0 <= options.min_score <= 1.0:
         raise RequestError(f"--min-score must be from 0 to 1, not {options.min_score:g}")
     check_speed(options.speed)

@@ -103,7 +103,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
         runs: Folders of pairs.
         find: Function that returns the mask of a pair.
         request: Request, with the folder of the results.
-        done: Called after each run with its row.
+        done: Called after each run with its row of runs.csv, also if the run was up to date.
 
     Returns:
         A row for each pair that was skipped: run, pair, and reason.
@@ -146,7 +146,7 @@ def run(runs: list[PlotFolder], find: Find, request: Request, done: Callable[[Ro
 
 
 def _sources(folder: PlotFolder) -> dict[str, Any]:
-    """Return the state of the files that the record of a run depends on."""
+    """Return the state of the files that the record of a run depends on: its odometry and the images of each pair."""
     return {
         "odometry": file_state(folder.folder / "odometry.csv"),
         "pairs": {pair.name: pair_state(pair) for pair in folder.pairs},
@@ -203,7 +203,7 @@ def _can_reach(request: Request, perception: Perception) -> np.ndarray | None:
 
 
 def _row(folder: PlotFolder, request: Request, skipped: int, perception: Perception | None, views: list[View]) -> Row:
-    """Return the row of a run; ``perception`` is None if none of its pairs was usable."""
+    """Return the row of runs.csv for a run; ``perception`` is None if none of its pairs was usable."""
     row: Row = dict.fromkeys(RUN_COLUMNS, "")
     row |= {"run": folder.name, "pairs": len(views), "pairs_skipped": skipped, "grasp_points": 0}
     row |= {"method": request.method, "version": jaxrl_vis.__version__}
@@ -228,7 +228,7 @@ def _row(folder: PlotFolder, request: Request, skipped: int, perception: Percept
 
 
 def _points(folder: PlotFolder, request: Request, perception: Perception) -> list[Row]:
-    """Return the rows of the grasp points of a run, in the robot frame of its last pair."""
+    """Return the rows of points.csv for the grasp points of a run, in the robot frame of its last pair."""
     can = _can_reach(request, perception)
     rows = []
     for index, point in enumerate(perception.points):

@@ -15,11 +15,14 @@ _FOLDED_ROOM = 0.02  # m, minimum distance between the tips of the folded arm's 
 
 
 def reachable(rail_pose: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return True where a target is within the arm's lengths and joint limits; obstacles are ignored.
+    """Return True where the arm can reach a target in front of it, with obstacles ignored.
+
+    The target and the point on the way to it at which the arm is folded must be within the arm's lengths and joint limits, with
+    one solution of the inverse kinematics, and the jaws of the folded arm must not yet reach the target.
 
     Args:
         rail_pose: [..., 3], `Stands.origin`: point of the row's line that the arm faces, m in the plot's frame.
-        target: [..., 3], target of the grip, m in the plot's frame.
+        target: [..., 3], target of the grip, m in the plot's frame; broadcast with ``rail_pose``.
 
     Returns:
         [...] bool.
@@ -43,7 +46,7 @@ def room(target: np.ndarray, others: np.ndarray, radii: np.ndarray, whole_way: b
         others: [B, M, 2], centres of other stalks at the target's height, m in the frame of the stand; NaN for absent ones.
         radii: [B, M], radii of these stalks, m.
         whole_way: Whether to include the forearm and the whole path, on which the folded arm turns and then extends; if not,
-            only the open jaws at the target. Stalks are assumed vertical, although the arm turns at other heights.
+            only the open gripper at the target. Stalks are assumed vertical, although the arm turns at other heights.
 
     Returns:
         [B, 2] float64, for the solutions 1 and -1: minimum distance between a stalk and the gripper, m. Negative if they
@@ -101,6 +104,9 @@ def best_approach(
         others: [M, 2], centres of the other known stalks at the target's height, m in the plot's frame.
         radii: [M], radii of these stalks, m.
         enough: Room above which more is no better, m.
+
+    Returns:
+        The approach; its stop is -1 and its room -inf if the target is out of reach from all stops.
     """
     origins, target = np.asarray(origins, float).reshape(-1, 3), np.asarray(target, float)
     local = target - origins
@@ -119,7 +125,8 @@ def best_approach(
 def _to_box(offset: np.ndarray, ahead: np.ndarray, half_width: float, back: float, front: float) -> np.ndarray:
     """Return signed distances (m) of points from a rectangle, negative inside.
 
-    Points are ``offset`` of the rectangle's centre line and ``ahead`` along it, on which it extends from ``back`` to ``front``.
+    Points lie at a distance ``offset`` from the rectangle's centre line and at ``ahead`` along it; the rectangle extends along
+    it from ``back`` to ``front``. All are in m, and arrays have the same shape.
     """
     outside = np.stack([offset - half_width, np.maximum(back - ahead, ahead - front)])
     return np.linalg.norm(np.maximum(outside, 0.0), axis=0) + np.minimum(outside.max(axis=0), 0.0)

@@ -44,12 +44,17 @@ class Choice(NamedTuple):
 
 
 def choose(points: Sequence[GraspPoint], stops: np.ndarray, heights: tuple[float, float] = HEIGHTS) -> list[Choice]:
-    """Choose an approach to each of the detected stalks.
+    """Choose an approach to each of the detected stalks, by maximum room at heights up to 0.3 m from the grasp point.
+
+    Room beyond 20 mm counts no more, and 5 mm of room are deducted for each metre from the height of the grasp point.
 
     Args:
         points: Grasp points, in one robot frame.
         stops: [S, 3], `Stands.origin` of each possible stop, in the same frame, m.
         heights: Minimum and maximum height of a grasp, m above the ground.
+
+    Returns:
+        One choice for each point, in order; with stop -1 and the grasp point itself for points that are out of reach.
     """
     chosen = []
     for point in points:
@@ -71,6 +76,9 @@ def choose_nearest(points: Sequence[GraspPoint], stops: np.ndarray, heights: tup
 
     Args:
         points, stops, heights: See `choose`.
+
+    Returns:
+        One choice for each point, in order; its stop is -1 if the point is out of reach from the nearest stop.
     """
     chosen = []
     for point in points:
@@ -92,7 +100,7 @@ def _approach_at(point: GraspPoint, points: Sequence[GraspPoint], stops: np.ndar
 
 
 def stalk_radii(points: Sequence[GraspPoint], height: float | None = None) -> np.ndarray:
-    """Return the radii [B] of stalks, m; a default for unknown thickness.
+    """Return the radii [B] of stalks as float64, m; 7 mm for stalks of unknown thickness.
 
     Args:
         points: Grasp points of B stalks.

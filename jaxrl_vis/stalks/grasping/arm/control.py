@@ -62,7 +62,7 @@ class Drive(NamedTuple):
     """State of the controllers.
 
     Attributes:
-        integral: [3] float32, integrated errors of slide, shoulder and elbow, m s and rad s.
+        integral: [3] float32, integrated errors of slide, shoulder and elbow, m s and rad s, clipped to -0.05 to 0.05.
         motor: [2] float32, angles of the motors behind the springs of shoulder and elbow, rad.
         error: [2] float32, last errors of shoulder and elbow, rad.
     """
@@ -73,7 +73,7 @@ class Drive(NamedTuple):
 
 
 def smooth(fraction: Any) -> Any:
-    """Return the fraction of a minimum-jerk movement done after a ``fraction`` of its time, clipped to 0 to 1."""
+    """Return the fraction of a minimum-jerk movement that is completed after a ``fraction`` of its time, clipped to 0 to 1."""
     fraction = jnp.clip(fraction, 0.0, 1.0)
     return fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)
 
@@ -125,7 +125,7 @@ def drive(state: Drive, joints: jax.Array, velocity: jax.Array, targets: jax.Arr
         gains: Gains of the controllers.
 
     Returns:
-        The new state, and the generalised forces [3] on the joints, N and N m.
+        The new state, and the generalised forces [3] float32 on slide, shoulder and elbow, N and N m.
     """
     period = 1.0 / RATE
     error = targets - joints

@@ -34,7 +34,7 @@ _POINTS_A_CALL = 5
 INTERVAL = _STEPS_A_POINT / control.RATE
 """Time between two points of a path, s."""
 LOOK = _POINTS_A_CALL * INTERVAL
-"""Time between two calls of ``observer``, s."""
+"""Time between two calls of the ``observer`` of `reach`, s."""
 _MIN_ARMS = 8  # minimum batch size of a compiled program
 _TOUCH = 0.0015  # m, a jaw nearer to a stalk presses on it: soft contacts give way by some tenths of a millimetre
 
@@ -67,7 +67,7 @@ class ReachResult:
 
 
 class ArmView(NamedTuple):
-    """True state of B reaches at one time, from which a ``observer`` function may simulate detections.
+    """True state of B reaches at one time, from which an ``observer`` may simulate detections.
 
     Attributes:
         time: Time since the start, s.
@@ -162,13 +162,13 @@ def reach(
         sides: [B], 1 or -1, solution of the inverse kinematics of each arm (see `approach.room`); None for
             `control.better_side`.
         observer: Function called every `LOOK` s during the reach and while the jaws close, which returns new targets [B, 3],
-            m in the plot's frame, with NaN to keep the old one; None for an open loop.
+            m in the plot's frame; those that are NaN or out of reach leave the old one. None for an open loop.
 
     Returns:
         Results of the reaches. Arms whose target is out of reach are not sent: they hold and touch nothing.
 
     Raises:
-        ValueError: Shapes differ, a target is not finite, or the wind is negative.
+        ValueError: A shape is wrong, a target is not finite, the wind is negative, or a side is neither 1 nor -1.
     """
     timing, gains = timing or Timing(), gains or Gains()
     count, targets = len(stands), np.array(targets, np.float32)
@@ -222,7 +222,11 @@ def reach(
 def _observe_targets(
     observer: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
 ) -> np.ndarray:
-    """Return the targets [B, 3] after another look, unchanged where it gives none or one that is out of reach."""
+    """Return the targets [B, 3] after a call of the observer, unchanged where its target is not finite or out of reach.
+
+    Raises:
+        ValueError: The observer returns targets of another shape.
+    """
     places = np.where(stands.is_present[..., None], report["stalks"], np.nan) + stands.origin[:, None]
     updated = np.asarray(observer(ArmView(time, report["taken"][:, -1] + stands.origin, places)), np.float32)
     if updated.shape != targets.shape:
@@ -237,7 +241,7 @@ def _calls(seconds: float) -> int:
 
 
 def _empty(stands: Stands, timing: Timing) -> ReachResult:
-    """Return the result of an empty batch."""
+    """Return the result of no reaches: arrays with B = 0."""
     points, stalks = _POINTS_A_CALL * (_calls(timing.reach) + _calls(timing.close)), stands.stalk.shape[1]
     none, path = np.zeros((0, stalks), bool), np.zeros((0, points, 3), np.float32)
     poses = np.zeros((0, points, arms_among(stalks).mj_model.nq), np.float32)
@@ -317,6 +321,9 @@ def period(
         targets: [3], setpoint of the grip, m in the frame of the stand.
         is_closing: [] bool, whether the jaws close.
         gains: Gains of the controllers.
+
+    Returns:
+        The new state of the arm; positions of bodies and geoms in its physics are stale until `mjx_model.kinematics`.
     """
     data = reaching.data
     memory, forces = control.drive(

@@ -218,6 +218,9 @@ def execute_plans(
 
     Returns:
         One attempt for each target, in the order of the plans; refused ones hold and touch nothing.
+
+    Raises:
+        RequestError: The policy is not one of VisualStalkReach, or does not observe single images.
     """
     attempts: list[Attempt] = []
     for block in _blocks(list(plans)):
@@ -241,7 +244,13 @@ def execute_plans(
 
 
 def wind_keys(runs: np.ndarray, places: np.ndarray, seed: int = 0) -> jax.Array:
-    """Return typed keys [B] for sampling the wind of attempts number ``places`` [B] int of runs ``runs`` [B] int."""
+    """Return typed keys [B] for sampling the wind, derived from each attempt's run, its index within the run, and the seed.
+
+    Args:
+        runs: [B] int, numbers of the runs.
+        places: [B] int, indices of the attempts within their runs.
+        seed: Seed of the wind.
+    """
     of_runs = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), runs)
     return jax.vmap(jax.random.fold_in)(of_runs, places)
 
@@ -276,12 +285,12 @@ def to_attempts(
 
 
 def follow(stands: Stands, stalks: np.ndarray, redetected: np.ndarray) -> Callable[[ArmView], np.ndarray]:
-    """Return a ``look`` function for `reach` that simulates detecting the targets [B, 3] again on the way.
+    """Return an ``observer`` for `reach` that simulates detecting the targets [B, 3] again on the way.
 
     The pair at the stop does not move. It detects the stalk at its true position plus the error that the pair alone makes with
-    this stalk at rest; stalks that it does not show at rest are not detected. A detection is available one look later, and the
-    position is extrapolated linearly from the last two. Occlusion by the arm itself is not modelled. The function keeps the
-    history of one batch of reaches: do not reuse it for another.
+    this stalk at rest; stalks that it does not show at rest are not detected. A detection is available one call later, and the
+    position is extrapolated linearly from the last two, so that the first two calls return NaN. Occlusion by the arm itself is
+    not modelled. The function keeps the history of one batch of reaches: do not reuse it for another.
 
     Args:
         stands: True stalks around each arm.

@@ -175,7 +175,7 @@ class Score:
 
 
 def wilson(count: int, total: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the Wilson interval of a proportion ``count / of``; (NaN, NaN) if ``total`` is 0.
+    """Return the Wilson score interval of a proportion ``count / total``; (NaN, NaN) if ``total`` is 0.
 
     Args:
         count: Number of hits.
@@ -285,7 +285,10 @@ def score(attempts: Iterable[Attempt], stalks: Iterable[Standing], tolerance: fl
 
 
 def thesis_ratio(attempts: Iterable[Attempt]) -> tuple[float, int]:
-    """Return the thesis's metric, averaged over the runs in which the arm was sent (NaN for none), and their number."""
+    """Return the thesis's metric 1 - |grasped - attempted| / attempted, averaged over runs, and the number of runs.
+
+    Only runs in which the arm was sent count; the metric is NaN if there are none.
+    """
     sent: Counter[int] = Counter()
     held: Counter[int] = Counter()
     for attempt in attempts:

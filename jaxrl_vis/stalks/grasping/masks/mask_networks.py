@@ -15,7 +15,7 @@ class Generator(nn.Module):
     """U-Net from images [N, H, W, 3] to [N, H, W, outputs] float32. H and W must be multiples of 2^len(channels).
 
     Attributes:
-        channels: Channels of each level; all but the first must be multiples of 8.
+        channels: Channels of each level, multiples of 8.
         outputs: Number of output channels: 3 for painted images in -1 to 1, 1 for logits of the mask.
         dtype: Compute dtype of the convolutions.
     """
@@ -26,7 +26,7 @@ class Generator(nn.Module):
 
     @nn.compact
     def __call__(self, images: jax.Array) -> jax.Array:
-        """Return painted images, or logits of masks, depending on ``outputs``."""
+        """Return painted images or logits of masks, depending on ``outputs``, as [N, H, W, outputs] float32."""
         x = images.astype(self.dtype)
         levels = []
         for depth, channels in enumerate(self.channels):
@@ -43,7 +43,7 @@ class Generator(nn.Module):
 
 
 class Discriminator(nn.Module):
-    """PatchGAN discriminator: scores for each patch of 70 x 70 pixels whether a painted image is a true one.
+    """PatchGAN discriminator: classifies each patch of 70 x 70 pixels of a painted image as true or generated.
 
     Attributes:
         channels: Channels of the hidden layers; the last of these and the output layer keep the resolution.

@@ -37,7 +37,7 @@ class Settings:
 
     @property
     def multiple(self) -> int:
-        """Number of which height and width of an image must be multiples, pixels."""
+        """Divisor that the network requires of height and width of an image, pixels."""
         return 2 ** len(self.channels)
 
     def generator(self, dtype: Any) -> Generator:
@@ -50,7 +50,7 @@ _MAX_LEVELS = 10  # each level halves height and width
 
 
 def normalise(images: jax.Array) -> jax.Array:
-    """Convert images from uint8 to float32 in -1 to 1."""
+    """Convert images of any shape from uint8 to float32 in -1 to 1."""
     return images.astype(jnp.float32) / 127.5 - 1.0
 
 
@@ -86,7 +86,10 @@ class Painter:
         self._paint = jax.jit(paint)
 
     def paint(self, image: np.ndarray) -> np.ndarray:
-        """Return a copy of an image [H, W, 3] uint8 with the stalks of the near row in red."""
+        """Return a copy of an image [H, W, 3] uint8 with the stalks of the near row in red.
+
+        With loss ``gan`` the copy is the generator's output, which also differs slightly beside the stalks.
+        """
         result = self._run(image)
         if self.settings.loss == "gan":
             return result

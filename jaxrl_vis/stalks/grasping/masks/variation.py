@@ -43,7 +43,14 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
 
 
 def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Scale, stretch, shear and mirror crops and masks about their centres, with edge pixels repeated beyond the edges."""
+    """Scale, stretch and shear crops and masks about their centres, and mirror half; edge pixels are repeated beyond the edges.
+
+    Args:
+        values: [N, H, W, 3] float32, crops.
+        masks: [N, H, W] bool.
+        strength: [N] float32, 0 to 1.
+        key: Typed key, [].
+    """
     count, height, width = masks.shape
     draws = jax.random.uniform(key, (4, count), minval=-1.0, maxval=1.0)
     size, wide, shear = jnp.exp(0.3 * strength * draws[0]), jnp.exp(0.25 * strength * draws[1]), 0.2 * strength * draws[2]
@@ -101,7 +108,7 @@ def _shift_colours(values: jax.Array, strength: jax.Array, key: jax.Array) -> ja
 
 
 def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Vary gain, gamma, contrast and black level, and add an illumination gradient towards a side or corner."""
+    """Vary gain, gamma, contrast and black level, and apply an illumination gradient towards a side or corner."""
     count = len(values)
     gain, gamma, contrast, black, amount, ramp = jax.random.split(key, 6)
 

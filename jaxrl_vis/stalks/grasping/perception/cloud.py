@@ -143,7 +143,7 @@ def subsample(points: np.ndarray, size: float) -> np.ndarray:
         size: Edge of a voxel, m.
 
     Returns:
-        [V, 3], m.
+        [V, 3] float64, m.
     """
     if not len(points):
         return points

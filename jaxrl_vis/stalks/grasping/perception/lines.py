@@ -81,7 +81,7 @@ class _Line(NamedTuple):
 
 
 def grasp_points(segments: StalkSegments, visibility: Visibility, heights: tuple[float, float] = HEIGHTS) -> list[GraspPoint]:
-    """Detect stalks and return their grasp points, from left to right.
+    """Detect stalks and return their grasp points, in ascending order of x.
 
     Args:
         segments: Segments of all pairs, in the robot frame of the last one.
@@ -137,7 +137,7 @@ def _fit(points: np.ndarray, weights: np.ndarray, bent: bool) -> tuple[np.ndarra
 
 
 def _offsets(points: np.ndarray, coefficients: np.ndarray, middle: float) -> np.ndarray:
-    """Return the horizontal distances [N] of points [N, 3] from a line, m."""
+    """Return the horizontal distances [N] of points [N, 3] from a line fitted by `_fit`, m."""
     height = points[:, 2] - middle
     powers = np.stack([np.ones_like(height), height, height**2][: len(coefficients)], axis=1)
     return np.linalg.norm(points[:, :2] - powers @ coefficients, axis=1)
@@ -183,7 +183,7 @@ def _support(segments: StalkSegments, members: np.ndarray) -> tuple[float, int]:
 
 
 def _grasp(segments: StalkSegments, members: np.ndarray, least_frames: int, heights: tuple[float, float]) -> GraspPoint | None:
-    """Return the grasp point of a stalk; None if the pairs show too little of it."""
+    """Return the grasp point of a stalk; None if the pairs show too little of it, or fewer than ``least_frames`` show it."""
     length, frames = _support(segments, members)
     if length < _MIN_SUPPORT or frames < least_frames:
         return None
@@ -215,7 +215,10 @@ def _grasp(segments: StalkSegments, members: np.ndarray, least_frames: int, heig
 
 
 def _taper(heights: np.ndarray, thickness: np.ndarray) -> float:
-    """Estimate the change of the diameter per m of height from the medians of the lower and the upper half of the heights."""
+    """Estimate the change of the diameter per m of height, from the medians of the lower and the upper half of the heights.
+
+    Return a default if the heights span less than 0.3 m, which does not suffice.
+    """
     if np.ptp(heights) < _BENT_LENGTH:
         return _USUAL_TAPER
     upper = heights > 0.5 * (heights.min() + heights.max())

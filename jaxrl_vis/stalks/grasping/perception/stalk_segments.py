@@ -45,7 +45,7 @@ class StalkSegments:
 
 
 def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> StalkSegments:
-    """Return the chords of one pair, in its own robot frame; ``frame`` is the index of the pair."""
+    """Return the chords of every `STEP`-th row of one pair, in its own robot frame; ``frame`` is the index of the pair."""
     red, depth = cloud.red[::STEP], cloud.depth[::STEP]
     with np.errstate(invalid="ignore"):
         jump = np.abs(np.diff(depth, axis=1)) > _JUMP
@@ -95,7 +95,12 @@ def _nothing() -> StalkSegments:
 
 
 def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return the median depth of the inner half of each chord; NaN where less than half of it has a depth."""
+    """Return the median depth [C] float64 of the inner half of each chord, m; NaN where less than half of that has a depth.
+
+    Args:
+        depth: [P], depths of the masked pixels in row-major order, m; NaN where there is none.
+        first, last: [C] int, indices of the first and last pixel of each chord, both inclusive.
+    """
     count = last - first + 1
     inner = np.maximum(count // 4, 0)
     begin, end = first + inner, last - inner + 1
@@ -109,7 +114,13 @@ def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.
 
 
 def _pieces(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Return the number of the piece of each chord [N]: connected components over neighbouring rows."""
+    """Return the number [N] of the piece of each chord: connected components over neighbouring rows.
+
+    Args:
+        line: [N] int, index of the processed row of each chord, ascending.
+        positions: [N], column of the middle of each chord, pixels.
+        depth: [N], depth of each chord, m.
+    """
     count = len(line)
     ends = np.searchsorted(line, np.arange(line.max() + 3))
     one, other = [], []

@@ -116,7 +116,7 @@ class Thinned:
     """Cloud downsampled on the grid of a method.
 
     Attributes:
-        points: [N, 3], m.
+        points: [N, 3] float64, m.
     """
 
     def __init__(self, points: np.ndarray, method: Method = DEFAULT) -> None:
@@ -147,6 +147,10 @@ def stitch(source: Thinned, target: Thinned, distance: float, method: Method = D
         source, target: Clouds of the pair and the next one, each in its own robot frame.
         distance: Distance that the robot drove along the row between the pairs by its odometry, m.
         method: Method of stitching.
+
+    Returns:
+        The motion between the pairs' robot frames; that of the odometry if the result is refused or a cloud has fewer than 10
+        points.
     """
     prior = Motion.along(-distance)
     start = prior if method.from_odometry else Motion.along(0.0)
@@ -187,7 +191,7 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
 
     Returns:
         The motion, the root mean square distance of corresponding points (m; NaN for fewer than 6), and the fraction of points
-        with a correspondence.
+        with a correspondence within the last gate that was applied.
     """
     motion, residual, overlap = start, math.nan, 0.0
     for gate, max_points in zip(method.gates, method.max_points):
@@ -211,7 +215,10 @@ def closest_points(source: np.ndarray, target: Thinned, start: Motion, method: M
 
 
 def rigid(source: np.ndarray, target: np.ndarray, weight: np.ndarray) -> Motion:
-    """Return the rigid motion from points [N, 3] to corresponding ones [N, 3], by least squares with weights [N]."""
+    """Fit the rigid motion from points [N, 3] to corresponding ones [N, 3], by least squares with weights [N].
+
+    Source: Kabsch (1976).
+    """
     weights = weight / weight.sum()
     here, there = weights @ source, weights @ target
     left, _, right = np.linalg.svd(((source - here) * weights[:, None]).T @ (target - there))

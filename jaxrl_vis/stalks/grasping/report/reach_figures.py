@@ -97,7 +97,7 @@ def draw_grasps(out: Path, records: Sequence[Record], name: str, score: Score, t
     Args:
         out: Path of the figure.
         records: Records of the runs.
-        name: Kind of reaches, as named in the records.
+        name: Name of the reaches in the records, the string of their `Reaches`.
         score: Score of these reaches.
         title: Description of the simulation, below the heading.
 

@@ -80,7 +80,7 @@ def _program(stalks: int, size: int) -> Any:
 
 
 def _outcome_caption(time: float, held_stalks: set[int], is_alone: bool) -> str:
-    """Return a caption of the arm's action at a time, s."""
+    """Return a caption of the arm's phase at a ``time`` (s), or of the outcome once the jaws are closed."""
     timing = Timing()
     if time < timing.turn:
         return "turns"

@@ -32,7 +32,10 @@ def make_anchors(shape: tuple[int, int], heights: float, widths: tuple[float, ..
 
 
 def encode(stalks: jax.Array, anchors: jax.Array) -> jax.Array:
-    """Encode stalks [..., 6] as box offsets [..., 6] relative to the reference boxes ``anchors`` [..., 6]."""
+    """Encode stalks [..., 6] as box offsets [..., 6] relative to the reference boxes ``anchors`` [..., 6].
+
+    Offsets are divided by their approximate standard deviations, so that the losses weight all six alike.
+    """
     middle, size = _middle_and_size(anchors)
     own_middle, own_size = _middle_and_size(stalks)
     axis = (stalks[..., 4:] - anchors[..., 4:]) / size[..., :1]
