@@ -168,7 +168,17 @@ def clip_to_image(stalks: jax.Array, shape: tuple[int, int]) -> jax.Array:
 def heads(
     network: Detector, params: Any, features: jax.Array, method: Literal["propose", "classify"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Apply one of the heads of the detector and return its logits and box offsets."""
+    """Apply one of the heads of the detector, and return its logits and box offsets.
+
+    Args:
+        network: Detector.
+        params: Parameters of the detector.
+        features: Features [N, h, w, C] of images for ``propose``, pooled features [R, h, w, C] of regions for ``classify``.
+        method: Head, a method of `Detector`.
+
+    Returns:
+        Logits [N, K] float32 and box offsets [N, K, 6] float32 of the anchors, or [R] and [R, 6] of the regions.
+    """
     logits, codes = network.apply(params, features, method=method)
     assert isinstance(logits, jax.Array) and isinstance(codes, jax.Array)
     return logits, codes
@@ -177,7 +187,19 @@ def heads(
 def classify_proposals(
     network: Detector, params: Any, features: jax.Array, proposals: jax.Array, valid: jax.Array, settings: Settings
 ) -> Found:
-    """Score and refine proposals [P, 6] of one image with features [H, W, C], and remove duplicates."""
+    """Score and refine proposals of one image, and remove duplicates.
+
+    Args:
+        network: Detector.
+        params: Parameters of the detector.
+        features: Features [h, w, C] of the image.
+        proposals: [P, 6], pixels.
+        valid: [P] bool, False for padding.
+        settings: Thresholds, and the maximum number of stalks.
+
+    Returns:
+        At most ``settings.max_stalks`` stalks, without pooled features.
+    """
     logits, codes = heads(network, params, region_features(features, proposals), "classify")
     stalks, scores = decode(codes, proposals), jax.nn.sigmoid(logits)
     valid = valid & (scores >= settings.min_score)
@@ -195,6 +217,9 @@ def detect(params: Any, image: jax.Array, settings: Settings, dtype: Any = jnp.f
         image: [H, W, 3] uint8, resized, and padded to multiples of `PADDING`.
         settings: Settings of the networks; static under jit.
         dtype: Compute dtype of the convolutions; static under jit.
+
+    Returns:
+        Stalks in pixels of ``image``, down to ``settings.min_score``, with pooled features.
     """
     network = settings.detector(dtype)
     shape = (image.shape[0], image.shape[1])
@@ -217,7 +242,7 @@ def _pool_features(features: jax.Array, image: jax.Array) -> jax.Array:
 
 
 def init_detector(settings: Settings, key: jax.Array) -> Any:
-    """Initialise the parameters of a detector at random."""
+    """Initialise the parameters of a detector at random, as nested dictionaries of float32 arrays."""
     images = jax.ShapeDtypeStruct((1, 2 * PADDING, 2 * PADDING, 3), jnp.float32)
     regions = jax.ShapeDtypeStruct((1, *GRID, settings.channels[2]), jnp.float32)
     # Lazily: this avoids running the network, whose operations would be compiled one by one.
@@ -225,6 +250,6 @@ def init_detector(settings: Settings, key: jax.Array) -> Any:
 
 
 def pad(image: np.ndarray) -> np.ndarray:
-    """Pad an image [h, w, 3] with zeros at the bottom and on the right, to multiples of `PADDING`."""
+    """Pad an image [h, w, 3] with zeros at the bottom and on the right, to multiples of `PADDING` in height and width."""
     lines, columns = padded_shape(image.shape[:2])
     return np.pad(image, ((0, lines - image.shape[0]), (0, columns - image.shape[1]), (0, 0)))

@@ -67,7 +67,7 @@ UPPER = (HEIGHTS[1] - HEIGHTS[0]) / (BAND[1] - BAND[0])
 
 
 def upper_segment(stalk: np.ndarray) -> np.ndarray:
-    """Extrapolate a stalk [6] in the band along its axis to its segment [6] around the upper height, of half its height."""
+    """Extrapolate a stalk [6] in the band along its axis to the segment [6] float32 around the upper height, half as tall."""
     left, top, right, bottom, above, below = stalk
     tall = bottom - top
     middle = 0.5 * (top + bottom) - UPPER * tall
@@ -97,7 +97,8 @@ def resize(image: np.ndarray, settings: Settings, pixels_per_metre: float | None
         pixels_per_metre: Resolution of the image at the row; None if unknown.
 
     Returns:
-        Resized image, and the vertical and horizontal scale factors from its coordinates to those of the original.
+        Resized image (``image`` itself if its size does not change), and the vertical and horizontal scale factors from its
+        coordinates to those of the original.
     """
     height, across = image.shape[:2]
     factor = resize_factor(across, settings, pixels_per_metre)
@@ -204,7 +205,7 @@ class Finder:
         return in_image(moved, scale), detected.scores[detected.valid], np.asarray(detected.pooled)
 
     def _find(self, image: np.ndarray, pixels_per_metre: float | None, frame: Frame) -> Detections:
-        """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame."""
+        """Detect and segment the stalks of an image [h, w, 3] uint8 that is already cropped to a frame, in its coordinates."""
         settings = self._settings
         relative_scale = settings.width / settings.full_width / settings.scale_for(image.shape[1], pixels_per_metre)
         stalks, scores, pooled = self.look(image, pixels_per_metre)
@@ -257,7 +258,7 @@ class Finder:
 
 
 def _is_inside_frame(stalk: np.ndarray, frame: Frame) -> bool:
-    """Return whether more than half of the axis of a stalk [6] lies outside the black borders."""
+    """Return True if, of the axis of a stalk [6] within the image, more than half lies outside the black borders."""
     if frame.shown is None:
         return True
     shown = frame.shown[slice(*frame.lines), slice(*frame.columns)]

@@ -29,7 +29,7 @@ class Gate:
 
     Attributes:
         mean: [D] float32, mean of the pooled features; D is twice the number of backbone channels.
-        scale: [D] float32, standard deviation of each feature.
+        scale: [D] float32, standard deviation of each feature, regularised.
         axes: [D, K] float32, principal axes of the standardised features, divided by the standard deviation along each.
         beside: Root mean square of the residual outside the principal subspace.
         weights: [1 + MEASURES] float32, intercept and weights of the regression.

@@ -92,19 +92,19 @@ def detector_loss(
 
 
 def _focal(logits: jax.Array, shows: jax.Array, none: jax.Array) -> jax.Array:
-    """Sum the focal loss over the positive and negative anchors."""
+    """Sum the focal loss of logits [K] over the positive and negative anchors, each [K] bool."""
     loss = optax.sigmoid_focal_loss(logits, shows.astype(jnp.float32), alpha=0.5, gamma=2.0)
     return (loss * (shows | none)).sum()
 
 
 def _distance(codes: jax.Array, targets: jax.Array, shows: jax.Array) -> jax.Array:
-    """Compute the Huber loss of box offsets [K, 6], averaged over the positive boxes."""
+    """Compute the Huber loss of box offsets [K, 6], summed over the six and averaged over the positive boxes [K] bool."""
     loss = optax.huber_loss(codes, jnp.clip(targets, -20.0, 20.0), delta=1.0).sum(axis=-1)
     return (loss * shows).sum() / jnp.maximum(shows.sum(), 1)
 
 
 def segmenter_loss(params: Any, crops: jax.Array, masks: jax.Array, settings: Settings, dtype: Any) -> jax.Array:
-    """Compute the cross-entropy and Dice loss of the segmentation of stalk crops.
+    """Compute the scalar cross-entropy and Dice loss of the segmentation of stalk crops, see `mask_loss`.
 
     Args:
         params: Parameters of the segmentation network.

@@ -51,7 +51,7 @@ def cut(image: jax.Array, stalks: np.ndarray, shape: tuple[int, int]) -> jax.Arr
     """Cut stalk crops [N, height, width, ...] out of an image [H, W, ...]; 0 outside the image.
 
     Args:
-        image: Image of any dtype.
+        image: Image of any dtype, which is that of the crops.
         stalks: [N, 6]; see `crop_places`.
         shape: Height and width of a crop.
     """

@@ -71,7 +71,8 @@ def read_weights(path: Path) -> tuple[dict[str, Any], Settings, dict[str, Any]]:
         Parameters, settings, and the metadata on their origin.
 
     Raises:
-        RequestError: The file does not exist, is not a weights file, or its parameters do not match its settings.
+        RequestError: The file does not exist, is not a weights file of this version, or its parameters do not match its
+            settings.
     """
 
     def declare(about: dict[str, Any]) -> tuple[Settings, Any]:

@@ -59,6 +59,9 @@ def evaluate_plot(task: Task, seed: int) -> Record:
     Args:
         task: Settings of the evaluation.
         seed: Seed of the plot.
+
+    Raises:
+        RequestError: The weights cannot be read.
     """
     find = None
     if task.weights is not None:
@@ -137,7 +140,7 @@ def _evaluate_job(tasks: Mapping[str, Task], jobs: Sequence[tuple[str, int]], nu
 
 
 def read_scores(records: Iterable[Record]) -> list[PlotScore]:
-    """Convert records to scores."""
+    """Convert records to scores, in the same order."""
     return [_read(record) for record in records]
 
 

@@ -157,7 +157,10 @@ def _thesis_score(frames: list[list[Sighting]], owners: list[list[int | None]], 
 
 
 def true_diameter(stalk: Stalk, height: float = HEIGHTS[0]) -> float:
-    """Return the true diameter in mm, as the cameras face it, at a height in m; near a node, the mean above and below it."""
+    """Return the true diameter in mm, as the cameras face it, at a height in m.
+
+    Less than 1 cm from a node, return the mean 2 cm above and below.
+    """
     offsets = (0.02, -0.02) if stalk.node_distance(height) < 0.01 else (0.0,)
     return 1e3 * float(np.mean([stalk.diameter(height + offset) for offset in offsets]))
 
@@ -203,6 +206,8 @@ def overlaps_with(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
 
 def average_precision(finds: np.ndarray, stalks: int) -> float:
     """Compute COCO's average precision: the mean over 101 recall levels of the maximum precision at that recall or higher.
+
+    It is 0 without detections or stalks.
 
     Args:
         finds: Score of each detection, and 1 if it is correct, else 0, [K, 2].
@@ -301,7 +306,7 @@ def _thesis_summary(scores: list[PlotScore]) -> dict[str, float]:
 
 
 def _agreement(counted: np.ndarray, true: np.ndarray) -> float:
-    """Compute 1 - SSE / SST against y = x; NaN if all true values are equal."""
+    """Compute the coefficient of determination 1 - SSE / SST of counts against y = x; NaN if all true counts are equal."""
     spread = float(((true - true.mean()) ** 2).sum()) if len(true) else 0.0
     return 1.0 - float(((counted - true) ** 2).sum()) / spread if spread > 0 else float("nan")
 

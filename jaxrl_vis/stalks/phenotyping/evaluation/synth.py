@@ -56,7 +56,8 @@ def write_plots(
         seeds: Seeds, one per plot.
         image_format: Format of the camera images.
         truth: ``all``; ``boxes``, without masks and without disparity and instance images; or ``none``, only plot.json.
-        done: Called after each pair with the plot's seed and the number of its pairs written so far.
+        done: Called after each pair with the plot's seed and the number of its pairs written so far, and once for a plot that
+            exists.
 
     Returns:
         The number of plots that already existed.
@@ -88,7 +89,7 @@ def write_plots(
 
 
 def _is_complete(folder: Path, truth: Truth, frames: int) -> bool:
-    """Return whether a complete plot holds at least the requested ground truth."""
+    """Return True if a plot that was written completely holds at least the requested ground truth."""
     maps = [folder / "truth" / f"{kind}_{frame:03d}.png" for kind in ("instance", "disparity") for frame in range(frames)]
     wanted = {"none": [], "boxes": [folder / "annotations.json"], "all": [folder / "annotations.json", *maps]}[truth]
     return all(path.exists() for path in wanted)

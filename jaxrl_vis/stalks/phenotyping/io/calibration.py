@@ -35,13 +35,13 @@ def read_calibration(path: Path, unit: str | None = None, image: Path | None = N
 
     Args:
         path: A file of any of these programs, or a folder that holds one for both cameras or one for each.
-        unit: Unit of the baseline, see `in_metres`; None for the unit that the file states or its program uses, by default
-            metres.
+        unit: Unit of the baseline, see `units.baseline_in_metres`; None for the unit that the file states or its program uses,
+            by default metres.
         image: A left image of the cameras, whose size is used if the file covers several sizes or states none.
 
     Raises:
-        RequestError: There is no such file, it does not describe a pair of rectified cameras, or its baseline is implausible in
-            that unit.
+        RequestError: There is no such file, it does not describe a pair of rectified cameras, its image size is unknown, or its
+            baseline is implausible in that unit.
     """
     cameras = read_cameras(path, image)
     pair = cameras.if_rectified() if isinstance(cameras, UnrectifiedPair) else cameras

@@ -312,8 +312,11 @@ def _pair_by_counter(stem: str, stems: set[str]) -> list[tuple[str, str]]:
     im0 and im1 are a pair, but im0 to im7 are the images of one camera.
 
     Args:
-        stem: Stem of its name.
+        stem: Stem of the image's name.
         stems: Lower-case stems of all images in its folder.
+
+    Returns:
+        At most one side (left or right) and stem of the partner.
     """
     matches = [(side, other) for side, other in partners(stem, files=True) if other.lower() in stems]
     if len(matches) != 1:
@@ -330,7 +333,7 @@ def _match_side(stem: str, stems: set[str]) -> re.Match[str] | None:
     as names usually begin with the plot.
 
     Args:
-        stem: Stem of its name.
+        stem: Stem of the image's name.
         stems: Lower-case stems of all images in its folder.
     """
     words = list(_WORD.finditer(stem)) or list(_LETTER.finditer(stem))

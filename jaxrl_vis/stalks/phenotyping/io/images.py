@@ -74,8 +74,8 @@ def read_image(path: Path) -> np.ndarray:
     """Read an image as [H, W, 3] (RGB) or [H, W], uint8 or uint16, rotated by its EXIF orientation; alpha is dropped.
 
     Raises:
-        OSError: The file cannot be read, is not a complete image, or has another pixel type. The message is one line that
-            names the file.
+        OSError: The file cannot be read, is not a complete image, has more than `MAX_PIXELS` pixels, or has another pixel type.
+            The message is one line that names the file.
     """
     image = _decode(path)
     if image is None:
@@ -101,7 +101,7 @@ def rgb8(image: np.ndarray) -> np.ndarray:
 
 
 def read_disparity(path: Path, scale: float = 256.0) -> np.ndarray:
-    """Read disparities from a file: PFM, floating-point TIFF, or 16-bit PNG or TIFF.
+    """Read disparities from a file of one channel: PFM, floating-point TIFF, or PNG or TIFF with 16 bits or more.
 
     Args:
         path: The file. Non-finite values and values up to 0 mark missing disparities.

@@ -53,7 +53,13 @@ def without_width(name: str, kind: str, source: str) -> Annotation:
 
 
 def turned_box(centre: tuple[float, float], size: tuple[float, float], angle: float) -> np.ndarray:
-    """Return the corners [4, 2] of a box (width, height) rotated clockwise about its centre by ``angle``, radians."""
+    """Return the corners [4, 2] of a box, rotated about its centre.
+
+    Args:
+        centre: x and y of the centre, pixels.
+        size: Width and height, pixels.
+        angle: Angle of rotation, rad, clockwise in an image whose y axis points down.
+    """
     across, down = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size
     return np.array(centre) + half[:, :1] * across + half[:, 1:] * down
@@ -63,6 +69,9 @@ def merge_groups(annotations: list[Annotation]) -> list[Annotation]:
     """Merge polygons with the same name and group into one annotation: the visible parts of a partially occluded object.
 
     Modifies the annotations in place: ``group`` is removed, and the ``bbox`` of merged ones is None.
+
+    Returns:
+        The annotations, without those that were merged into an earlier one.
     """
     joined: dict[tuple[str, Any], Annotation] = {}
     result = []

@@ -80,7 +80,13 @@ def camera_matrix(focal_x: float, focal_y: float, x: float, y: float) -> np.ndar
 
 
 def projection(focal: float, x: float, y: float, shift: float = 0.0) -> np.ndarray:
-    """Return the projection matrix [3, 4] float64 of a rectified camera; ``shift`` is minus the focal length times baseline."""
+    """Return the projection matrix [3, 4] float64 of a rectified camera.
+
+    Args:
+        focal: Focal length, pixels.
+        x, y: Principal point, pixels.
+        shift: For the right camera, minus the focal length times the baseline, in pixels times the unit of the baseline.
+    """
     return np.array([[focal, 0.0, x, shift], [0.0, focal, y, 0.0], [0.0, 0.0, 1.0, 0.0]])
 
 

@@ -49,7 +49,7 @@ def read_pair(stores: list[dict[str, Any]], files: list[Path], path: Path) -> Re
 
 
 def message(text: str) -> str:
-    """Remove everything that programs print before the first message."""
+    """Return a text without everything that programs print before the first message (``header:``)."""
     match = _HEADER.search(text)
     return text if match is None else text[match.start() :]
 
