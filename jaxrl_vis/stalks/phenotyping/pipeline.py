@@ -56,7 +56,7 @@ from jaxrl_vis_envs.plants import Calibration
 
 Find = Callable[[np.ndarray, float | None, PlotFolder, PairFiles], list[Detection]]
 """Stalk detector, called with a left image [H, W, 3] uint8, its pixels per metre at the row (None if unknown), and its folder
-and files."""
+and files; returns the detections in pixels of the image."""
 NO_ODOMETRY = "no odometry"
 NO_FIT = "odometry does not fit the images"
 SKIPPED_COLUMNS = ("plot", "pair", "why")
@@ -212,9 +212,10 @@ def _lens_fault(request: Request, frames: list[list[Sighting]], records: list[di
 
 
 def _is_whole(record: dict[str, Any]) -> bool:
-    """Return True if a record is complete and valid.
+    """Return True if the record of a pair is complete and valid.
 
-    Raises KeyError, TypeError or ValueError for others, including those of skipped pairs, which are tried again.
+    Raises:
+        KeyError, TypeError, ValueError: It is not, or the pair was skipped, which is then tried again.
     """
     lines, columns = record["size"]
     for values in record["sightings"]:
@@ -275,7 +276,15 @@ def _sightings_record(plot: PlotFolder, find: Find, request: Request, pair: Pair
 def _finish(
     plot: PlotFolder, records: list[dict[str, Any]], distances: dict[str, float] | None, request: Request, run_all: UnorderedMap
 ) -> PlotResult:
-    """Track the stalks of a plot, compute its table rows, and render its overlays."""
+    """Track the stalks of a plot, compute its table rows, and render its overlays.
+
+    Args:
+        plot: Folder of the plot.
+        records: Record of each pair.
+        distances: Distance driven at each pair by the pair's name, m; None if unknown.
+        request: Options of the run.
+        run_all: Map over jobs in the worker processes.
+    """
     usable = [(pair, record) for pair, record in zip(plot.pairs, records) if "sightings" in record]
     skipped = len(records) - len(usable)
     frames = [[Sighting.read(values) for values in record["sightings"]] for _, record in usable]
@@ -362,7 +371,7 @@ def _draw_overlay(plot: str, job: tuple[Path, PairFiles, list[Sighting], list[st
 
 
 def _tracking_fault(pairs: int, calibration: Calibration | None) -> str:
-    """Return a flag on why the stalks of a plot cannot be tracked."""
+    """Return a flag on why the stalks of a plot cannot be tracked: too few pairs, no calibration, or else no odometry."""
     if pairs == 0:
         return "no usable pairs"
     if calibration is None:

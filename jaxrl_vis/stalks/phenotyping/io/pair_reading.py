@@ -25,7 +25,7 @@ def read_pair(pair: PairFiles, calibration: Calibration | None, right_needed: bo
     Args:
         pair: Files of the pair.
         calibration: Calibration whose size the images must have; None to accept any size.
-        right_needed: If false, the left image is also returned for a missing right one.
+        right_needed: If false and the pair has no right image, the left one is returned in both places.
 
     Raises:
         Unusable: An image is missing, unreadable or black, or the sizes do not match.
@@ -77,7 +77,7 @@ def known_disparity(pair: PairFiles, left: np.ndarray, scale: float) -> np.ndarr
     Args:
         pair: Files of the pair.
         left: Left image, [H, W, 3].
-        scale: Divisor of 16-bit values, see `read_disparity`.
+        scale: Divisor of integer values, see `read_disparity`.
 
     Raises:
         Unusable: The file cannot be read, or its size is not that of the image.

@@ -114,7 +114,11 @@ def _side(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
 
 
 def fill_borders(image: np.ndarray, frame: Frame) -> np.ndarray:
-    """Crop an image [H, W, 3] to the bounding box of its frame, and fill remaining borders with the nearest scene pixels."""
+    """Crop an image [H, W, 3] to the bounding box of its frame, and fill remaining borders with the nearest scene pixels.
+
+    Returns:
+        [h, w, 3], a view of the image if no border remains.
+    """
     part = image[slice(*frame.lines), slice(*frame.columns)]
     if frame.shown is None:
         return part

@@ -127,7 +127,7 @@ def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -
 
 
 def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sample positions and disparities, as returned by `_windows`, from a disparity image."""
+    """Sample positions [N, 2] and disparities [N], as returned by `_windows`, from disparities [H, W] in full-size pixels."""
     lines, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
     values = disparity[np.ix_(lines, columns)]
     line, column = np.nonzero(np.isfinite(values))
@@ -136,7 +136,13 @@ def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarra
 
 
 def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """Fit the plausible ground plane [3] with the most inliers, by RANSAC; None if there is none."""
+    """Fit the plausible ground plane [3] (see `Ground.normal`) with the most inliers, by RANSAC; None if there is none.
+
+    Args:
+        rays: [N, 3], directions to points, with z = 1.
+        inverse: [N], inverse planar depths of the points, 1/m.
+        tolerance: Maximum error of an inlier's inverse depth, 1/m.
+    """
     rng = np.random.default_rng(0)
     # Most of an image is not ground, but most of its lower third is: half of the samples come from there.
     low = np.flatnonzero(rays[:, 1] >= np.quantile(rays[:, 1], 2 / 3))

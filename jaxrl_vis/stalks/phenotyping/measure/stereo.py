@@ -100,6 +100,10 @@ def match_rows(
         half_height: Rows of a window above and below its centre row.
         core: Central fraction of the stalk's width that a window spans: towards its edges a stalk is further away.
         spread: Tolerance for vertical misalignment of the right image, rows up or down.
+
+    Returns:
+        Disparities of the windows with a unique match, in the order of ``lines``. Windows outside the image or narrower than
+        six pixels are not matched.
     """
     wanted = [
         _Window(
@@ -137,7 +141,7 @@ class _Window:
     last: int
 
     def inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
-        """Return whether the window is wide enough and, with the margin for vertical misalignment, inside the image."""
+        """Return True if the window is wide enough and, with the margin for vertical misalignment, inside the image."""
         reach = half_height + spread
         tall = reach <= self.line and self.line + reach + 1 <= shape[0]
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
@@ -179,7 +183,9 @@ def sample_rows(
     bounds: tuple[float, float],
     core: float = 0.7,
 ) -> StalkDisparity:
-    """Sample the disparities of a stalk with known edges from a disparity image.
+    """Sample the disparities of a stalk with known edges from a disparity image: the median across the stalk in each row.
+
+    Rows in which less than half of the used width has a disparity within the bounds are left out.
 
     Args:
         disparity: [H, W] float32, pixels; NaN where unknown.

@@ -274,7 +274,7 @@ def _mode(values: np.ndarray, width: float = 1.0) -> float:
 
 
 def _line(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Return the offset and slope of the weighted least-squares line."""
+    """Fit y = offset + slope * x to points [N] by least squares with weights [N]; the slope is 0 if all x are equal."""
     total = weight.sum()
     mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
     spread = (weight * (x - mean_x) ** 2).sum()
@@ -290,8 +290,8 @@ def ellipse_width(mask: np.ndarray, fit: EllipseFit = "pixels") -> float | None:
         fit: Method of fitting an ellipse; see `ELLIPSE_FITS`.
 
     Returns:
-        Width in pixels; None if no blob has a valid ellipse. Ellipses wider than a blob of that area and length can be, as
-        OpenCV returns for some nearly collinear points, are rejected.
+        Width in pixels; None if no blob of 20 pixels or more has a valid ellipse. Ellipses wider than a blob of that area and
+        length can be, as OpenCV returns for some nearly collinear points, are rejected.
     """
     inside = (np.asarray(mask, np.float32) >= 0.5).astype(np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=8)

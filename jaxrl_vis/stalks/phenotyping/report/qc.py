@@ -285,11 +285,15 @@ class _Pictures:
         )
 
     def of(self, track: Track) -> _Html:
-        """Return the image of a track's best sighting."""
+        """Return the image of a track's best sighting: one with a width, if any, and with maximum confidence."""
         return self._crops[next(index for index, other in enumerate(self._plot.tracks) if other is track)]
 
     def whole(self, count: int) -> Iterable[str]:
-        """Yield images of at most ``count`` whole pairs, spread evenly over the plot."""
+        """Yield HTML elements with the overlays of at most ``count`` whole pairs, spread evenly over the plot.
+
+        Raises:
+            OSError: An overlay cannot be read.
+        """
         pairs = self._plot.pairs
         for place in np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round()).astype(int):
             overlay = read_image(self._folder / file_name(f"{pairs[place]}.png"))

@@ -77,7 +77,7 @@ def write_page(
 
 
 def draw_finds(example: Example, finds: Finds) -> np.ndarray:
-    """Draw the annotations and the detections of at least `MIN_SCORE` on a copy of an example's image, [h, w, 3] uint8."""
+    """Draw the annotations and the detections of at least `MIN_SCORE` on a copy of an example's image, RGB [h, w, 3] uint8."""
     canvas = example.image.copy()
     for stalk in example.stalks[example.kinds == STALK]:
         _box(canvas, stalk, _ANNOTATED)

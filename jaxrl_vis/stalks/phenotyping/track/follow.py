@@ -32,7 +32,7 @@ class Gates:
         astray: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
         row: Maximum difference between the depth of a counted stalk and the median depth.
         fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
-        least: Minimum number of pairs that must show it, unless fewer have it in view.
+        minimum: Minimum number of pairs that must show it, unless fewer have it in view.
         ends: Maximum distance of a counted stalk's foot beyond the ends of the path.
     """
 
@@ -100,6 +100,7 @@ class _Open:
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
     def place(self) -> tuple[float, float]:
+        """Return the median position along the row and depth of the last nine sightings, m; NaN for an unknown depth."""
         depths = [depth for depth in self.depth[-9:] if math.isfinite(depth)]
         return float(np.median(self.along[-9:])), float(np.median(depths)) if depths else math.nan
 
@@ -297,7 +298,7 @@ def _one_behind(track: _Open, other: _Open) -> float:
 
 
 def _track_distance(track: _Open, other: _Open) -> tuple[float, float]:
-    """Return the distances of two tracks along the row and in depth, m."""
+    """Return the distances of two tracks along the row and in depth, m; if only one has a depth, it is assumed for both."""
     depths = track.depths(), other.depths()
     if all(map(len, depths)) or not any(map(len, depths)):
         aside = abs(float(np.median(track.along) - np.median(other.along)))

@@ -69,7 +69,12 @@ class StalkWidths:
 
 
 def stalk_widths(frames: list[list[Sighting]], tracks: list[Track]) -> list[StalkWidths]:
-    """Estimate the widths of the stalks of a plot, in the order of their tracks."""
+    """Estimate the widths of the stalks of a plot, in the order of their tracks.
+
+    Args:
+        frames: Sightings of each pair.
+        tracks: Tracks of the stalks, whose indices refer to ``frames``.
+    """
     of_stalks = [[frames[frame][place] for frame, place in track.sightings] for track in tracks]
     first = [_widths_of_stalk(sightings, USUAL_TAPER) for sightings in of_stalks]
     tapers = [width.taper for width in first if width.taper is not None]
@@ -135,7 +140,7 @@ def _facing(sighting: Sighting) -> float:
 
 
 def _width_at(height: float, values: list[_Value], taper: float) -> Width | None:
-    """Estimate the width at a height in m; None if nothing was measured near it."""
+    """Estimate the width at a height in m, corrected by the ``taper`` in mm per inch; None if nothing was measured near it."""
     near, far = [], 0
     for value in values:
         inches = (value.height - height) / INCH

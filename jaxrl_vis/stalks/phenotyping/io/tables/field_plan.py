@@ -41,8 +41,8 @@ def read_field_plan(path: Path, plots: Sequence[str]) -> tuple[list[str], dict[s
             column in them.
 
     Returns:
-        Names of the columns in order, without the identifier; and the values in them, by plot. Plots that are not in the table
-        are missing.
+        Names of the columns in order, without the identifier and those of single observations in Field Book; and the values in
+        them, by plot, "" where a plot has none. Plots that are not in the table are missing.
 
     Raises:
         RequestError: The table cannot be read, names none of the plots, or has contradictory rows for one.
