@@ -31,7 +31,7 @@ def ledger_differences() -> Iterator[str]:
 
 
 def main() -> int:
-    """Print all differences; return the exit status."""
+    """Print all differences, and return the exit status: 1 if there are any, else 0."""
     differences = [*ledger_differences(), *pages.differences(), *prose.differences(sentences.sentences())]
     print("\n".join(differences) if differences else "all figures are those of the records")
     return int(bool(differences))

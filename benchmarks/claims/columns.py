@@ -25,13 +25,13 @@ class Column(NamedTuple):
 
 
 def band(values: np.ndarray, digits: int = 3) -> str:
-    """Format median and quartiles, ``0.665 (0.635 to 0.685)``; only the median if all three round to the same."""
+    """Format median and quartiles of values [N], ``0.665 (0.635 to 0.685)``; only the median if all three round to the same."""
     low, median, high = (f"{value:.{digits}f}" for value in np.percentile(values, [25, 50, 75]))
     return median if low == median == high else f"{median} ({low} to {high})"
 
 
 def interval(values: np.ndarray, digits: int = 3) -> str:
-    """Format the interquartile mean and its 95 % bootstrap interval."""
+    """Format the interquartile mean of values [N] and its 95 % bootstrap interval."""
     low, high = bootstrap_interval([values])
     return f"{interquartile_mean([values]):.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
@@ -239,7 +239,7 @@ def distance_to_authors(task: str, variant: str) -> Column:
 
 
 def _resampled_medians(record: Record, count: int = 2_000) -> list[list[tuple[int, float]]]:
-    """Return median curves of bootstrap samples of seeds."""
+    """Return the median success curves, pairs of (environment steps, success), of ``count`` bootstrap samples of seeds."""
     steps = [at for at, _ in record.points]
     success = np.stack([record.at(at) for at in steps])
     draws = np.random.default_rng(0).integers(len(record.seeds), size=(count, len(record.seeds)))

@@ -97,7 +97,11 @@ _curves = functools.cache(read_curves)
 
 @functools.cache
 def ablation(name: str) -> Record:
-    """Return a curve of the table of ablations, with revision and device as far as the docs state them."""
+    """Return a curve of benchmarks/results/ablations, with revision and device as far as they are known.
+
+    Raises:
+        KeyError: No curve has this name.
+    """
     curve = _curves()[name]
     made = frozenset({f"{curve.revision} on {curve.device}"} if curve.revision and curve.device else ())
     return Record(f"ablations/{name}", tuple(row for row in curve.rows if SUCCESS in row), made)

@@ -192,6 +192,9 @@ def view_pair(
         calibration: Calibration of the cameras; None if unknown.
         method: Method of measuring widths.
         disparity: Known disparities; see `measure_pair`.
+
+    Returns:
+        Detections and measurements at the distance that stereo confirms, or else at the usual one.
     """
     detections, ground = find_with_ground(find, left, right, calibration, disparity)
     frame = find_frame(left)
@@ -212,7 +215,7 @@ def view_pair(
 
 
 def row_distance(sightings: list[Sighting]) -> float | None:
-    """Return the median depth of the measured stalks of one or several pairs, m; None if there are too few."""
+    """Return the median depth of the measured stalks of one or several pairs, m; None if there are fewer than three."""
     depths = [sighting.depth_m for sighting in sightings if sighting.diameter_mm is not None and sighting.depth_m is not None]
     return float(np.median(depths)) if len(depths) >= _AT_DISTANCE else None
 

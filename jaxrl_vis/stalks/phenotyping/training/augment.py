@@ -52,17 +52,18 @@ def _blur(values: jax.Array, deviation: jax.Array) -> jax.Array:
 def move(
     images: jax.Array, stalks: jax.Array, kinds: jax.Array, sizes: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Randomly mirror, shear, stretch and shift images and their stalks; a quarter of them is mirrored at most.
+    """Mirror, shear, stretch and shift images and their stalks at random; a quarter of them may only be mirrored.
 
     Args:
         images: [N, H, W, 3] uint8, padded at the bottom and on the right.
         stalks: [N, T, 6], boxes and axes.
         kinds: [N, T] int32, see `losses.assign`.
         sizes: [N, 2] int32, height and width of the images without padding.
-        key: PRNG key.
+        key: Typed key, [].
 
     Returns:
-        Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``.
+        Images, stalks clipped to them, and kinds, where stalks that are hardly left in the image become ``NOTHING``; shapes and
+        dtypes are those of the arguments.
     """
     keys = jax.random.split(key, images.shape[0])
     return jax.vmap(_transform_stalks)(images, stalks, kinds, sizes, keys)
@@ -105,7 +106,10 @@ def _transform_stalks(image: jax.Array, stalks: jax.Array, kinds: jax.Array, sha
 
 
 def _sample(image: jax.Array, line: jax.Array, column: jax.Array, shape: jax.Array) -> jax.Array:
-    """Sample an image at rows ``line`` and columns ``column`` by bilinear interpolation; black outside ``shape``."""
+    """Sample an image [H, W, 3] uint8 at rows ``line`` and columns ``column`` [h, w] by bilinear interpolation.
+
+    Pixels outside ``shape`` [2], the height and width of the image without padding, are black.
+    """
     inside = (line >= -0.5) & (line <= shape[0] - 0.5) & (column >= -0.5) & (column <= shape[1] - 0.5)
     line, column = jnp.clip(line, 0.0, shape[0] - 1.0), jnp.clip(column, 0.0, shape[1] - 1.0)
     top, left = jnp.floor(line).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)

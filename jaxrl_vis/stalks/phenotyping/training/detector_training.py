@@ -35,7 +35,7 @@ class Plan:
         batch: Batch size of images.
         crops: Batch size of stalk crops.
         rate: Peak learning rate.
-        average: Decay rate of the exponential moving average of the parameters.
+        average: Decay rate of the exponential moving average of the parameters; lower in the first updates.
         seed: Random seed.
     """
 
@@ -121,7 +121,7 @@ def update_networks(
     Args:
         state: Training state, see `beginning`; its buffers are donated.
         batch: `Images`, and a tuple of stalk crops and masks, or None if masks are not trained.
-        key: PRNG key of the augmentation and of the jittered boxes for the head.
+        key: Typed key of the augmentation and of the jittered boxes for the head.
         rates: Learning rate, and decay rate of the parameter average.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
@@ -176,7 +176,7 @@ def _beginning(params: Any) -> tuple[Any, Any]:
 
 
 def initial_networks(settings: Settings, detector_key: jax.Array, segmenter_key: jax.Array) -> dict[str, Any]:
-    """Initialise the parameters of both networks at random."""
+    """Initialise the parameters of both networks at random, as float32 with keys ``detector`` and ``segmenter``."""
     blank = jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     return {
         "detector": init_detector(settings, detector_key),

@@ -65,11 +65,13 @@ class Example:
 def synthetic_examples(family: Family, settings: Settings, seed: int, frames: int = 4) -> list[Example]:
     """Render the training examples of one synthetic plot.
 
+    Images of a daylight family are rendered at random scales and cropped at random to the size in ``settings``.
+
     Args:
         family: Family from which the plot is sampled.
         settings: Settings of the networks.
         seed: Seed of the plot.
-        frames: Number of images, spread over the plot; fewer if it has fewer.
+        frames: Maximum number of images, spread over the plot.
     """
     sequence = Sequence.of(draw(family, seed))
     settled = sequence.plot.family
@@ -98,7 +100,10 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
 
 
 def resize_crops(example: Example, shape: tuple[int, int]) -> Example:
-    """Resize the stalk crops and masks of an example to ``shape`` (height, width)."""
+    """Resize the stalk crops and masks of an example to ``shape`` (height, width).
+
+    Return the example itself if they have that size, or if there are none.
+    """
     if not len(example.crops) or example.crops.shape[1:3] == shape:
         return example
     size = (shape[1], shape[0])
@@ -234,7 +239,8 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
     The scale of the images is taken from the calibration in the folder, if there is one.
 
     Raises:
-        RequestError: Annotations are missing or invalid, or an image is missing or differs in size from its annotations.
+        RequestError: Annotations are missing or invalid, the calibration is invalid or for images of another size, or an image
+            is missing or differs in size from its annotations.
     """
     data = read_annotations(folder, labels)
     resolution_of = _resolutions(folder, data["images"])
@@ -354,7 +360,11 @@ def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
 
 
 def any_outlined(folder: Path, labels: tuple[str, ...] = ()) -> bool:
-    """Return whether any annotated stalk of a folder has a segmentation besides its box."""
+    """Return True if any annotated stalk of a folder has a segmentation besides its box.
+
+    Raises:
+        RequestError: The annotations of the folder cannot be read.
+    """
     annotations = read_annotations(folder, labels)["annotations"]
     return any(annotation["segmentation"] and not annotation.get("iscrowd") for annotation in annotations)
 
@@ -370,7 +380,7 @@ def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.nda
 
 
 def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
-    """Return the box and axis [6] of one annotation; the axis is fitted to its mask."""
+    """Return the box and axis [6] of one annotation; the axis is fitted to its mask, and vertical if that is small."""
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
     line, column = np.nonzero(_annotated_mask(annotation, size))

@@ -71,6 +71,9 @@ def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], se
         shape: Height and width to which images are padded.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
+
+    Returns:
+        Detections down to `Settings.min_score` in each image, in the same order.
     """
     finds = []
     for example in examples:
@@ -126,7 +129,7 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
 
 
 def score(finds: Sequence[Finds]) -> Score:
-    """Compute the metrics of the detections in several images, pooled."""
+    """Compute the metrics of the detections in several images, pooled; ignored detections are left out."""
     labels = sum(image.labels for image in finds)
     scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])
     right = np.concatenate([image.right[~image.ignored] for image in finds] or [np.zeros(0, bool)])

@@ -43,7 +43,7 @@ def photographs_of(names: Sequence[str], images: Sequence[np.ndarray]) -> np.nda
         images: Images [h, w, 3] uint8 of any size.
 
     Returns:
-        [N] int, equal for images of one photograph.
+        [N] int, index of the first image of the same photograph.
     """
     thumbnails = np.array([_thumbnail(image) for image in images])
     flat = thumbnails.reshape(len(images), -1)

@@ -108,6 +108,9 @@ def tune(
         keep: Called with the best parameters so far and their update, so that they survive an interruption. Without images for
             early stopping, called with the latest parameters at each evaluation.
 
+    Returns:
+        The parameters, on the host, with the best score on the images for early stopping, or the last ones without such images.
+
     Raises:
         NonFiniteError: A loss is not finite.
     """
@@ -220,7 +223,10 @@ class _Batches:
 
 
 def _alike(examples: list[Example]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to their median size."""
+    """Return the stalk crops [N, H, W, 3] uint8 and masks [N, H, W] bool of all examples, resized to one size.
+
+    The size is the median one of all crops; N is 0 if there are none.
+    """
     shapes = sorted(example.crops.shape[1:3] for example in examples for _ in example.crops)
     if not shapes:
         return np.zeros((0, 8, 8, 3), np.uint8), np.zeros((0, 8, 8), bool)

@@ -49,7 +49,7 @@ def repeat(update: Update, pool: Pool, plan: Schedule, start_time: float, report
         Number of updates.
 
     Raises:
-        NonFiniteError: A reported loss is not finite.
+        NonFiniteError: A loss is not finite when it is to be reported.
         RequestError: The time limit was reached before the first update.
     """
     last_report, step, before = start_time, 0, None
