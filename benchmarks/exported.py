@@ -43,7 +43,7 @@ Act = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def succeeded(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, float]]:
-    """Run the same episodes by several functions; return success and goal distance at the last step of each, averaged."""
+    """Run the same episodes with each function, and return its mean ``success`` and ``goal_distance`` at the last step."""
     env = policy.env
     reset, step = jaxrl_vis_envs.jit(jax.vmap(env.reset)), jaxrl_vis_envs.jit(jax.vmap(env.step))
     metrics: list[list[Any]] = [[] for _ in acts]
@@ -71,7 +71,7 @@ def latency(act: Act, shape: tuple[int, ...]) -> float:
 
 
 def measure(name: str, episodes: int) -> dict[str, Any]:
-    """Export a policy and evaluate both forms."""
+    """Export a shipped policy to ONNX, evaluate it in JAX and in onnxruntime, and return its row of the record."""
     policy = jaxrl_vis.load_policy(name)
     call = jax.jit(jax.vmap(policy))
 
@@ -97,7 +97,7 @@ def measure(name: str, episodes: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Measure the named policies, or all, and update the record; return the exit status."""
+    """Measure the named policies, or all, and update the record after each; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="policies; all if none")
     parser.add_argument("--episodes", type=int, default=256)

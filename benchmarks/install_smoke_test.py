@@ -90,7 +90,7 @@ class Shell:
 
 
 def new_shell(folder: Path, python: Path) -> Shell:
-    """Create a shell in a new folder, with ``python`` as python3, and an empty home folder."""
+    """Create a shell in the new folder ``folder``/work, with ``python`` as python3 and an empty home folder."""
     (folder / "home").mkdir(parents=True)
     (folder / "work").mkdir()
     (folder / "bin").mkdir()
@@ -121,7 +121,7 @@ def puck_push() -> str:
 
 
 def mistakes() -> list[tuple[str, Mapping[str, str]]]:
-    """Return invalid command lines with environment variables; each must fail with one line and exit status 2."""
+    """Return invalid command lines, each with additional environment variables; all must fail with one line and status 2."""
     train = "jaxrl-vis train"
     lines = [
         "jaxrl-vis",

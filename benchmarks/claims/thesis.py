@@ -36,7 +36,7 @@ class Comparison:
     Attributes:
         place: Task and budget as text.
         first, second: The records.
-        budget: Environment steps; None: all.
+        budget: Environment steps up to which success is averaged; None for all.
     """
 
     place: str
@@ -132,7 +132,16 @@ def _better_than_logarithm() -> Claim:
 
 
 def with_decay(task: str, variant: str, decay: float) -> Record:
-    """Return the run with a decay of the target networks; for the hand, with the authors' view."""
+    """Return the run with a decay of the target networks; for the hand, with the authors' view.
+
+    Args:
+        task: Name of the task.
+        variant: Weighting or auxiliary loss, as in the study.
+        decay: Fraction of the old parameters that a target network keeps in an update; 0.98 in `paper`.
+
+    Raises:
+        LookupError: No such run is stored.
+    """
     stem = f"{task}-{variant}-paper" if task != HAND else f"{HAND}-view=fingertips-{variant}-paper"
     if decay != 0.98:
         return study("target_decay", f"{stem}-decay{decay:g}", is_fresh=True)

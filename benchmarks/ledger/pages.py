@@ -30,7 +30,7 @@ Writer = Callable[[Path], str | None]
 
 
 def renderer_parity(results: Path) -> str:
-    """Write the table of docs/lab/renderer_parity.md."""
+    """Return the table of docs/lab/renderer_parity.md as Markdown."""
     from benchmarks import render_parity  # imports the models of the tests
 
     return render_parity.table(render_parity.read_rows(results / render_parity.TARGET.name))
@@ -92,7 +92,7 @@ def fill_page(text: str, of_page: dict[str, Writer], results: Path = RESULTS) ->
 
 
 def write_pages(results: Path = RESULTS, checkout: Path = CHECKOUT) -> Iterator[tuple[Path, bool]]:
-    """Write the tables of every page; yield the page, and True if it changed.
+    """Write the tables of every page; yield the page's path, and True if it changed.
 
     Raises:
         RequestError: As in `fill_page`; or a page is missing.

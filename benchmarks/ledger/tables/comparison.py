@@ -99,7 +99,7 @@ def _steps_per_update(rows: Sequence[dict[str, Any]]) -> int:
 
 
 def comparison_table(results: Path = RESULTS) -> str:
-    """Write the table, as Markdown."""
+    """Return the table of README.md and docs/index.md as Markdown."""
     return "\n".join(_lines(results))
 
 

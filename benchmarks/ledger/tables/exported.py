@@ -6,7 +6,7 @@ from typing import Any
 
 
 def exported_table(results: Path) -> str | None:
-    """Write success, difference, size and latency of each policy, as Markdown; None without a record."""
+    """Return a table of success, difference, size and latency of each policy as Markdown; None without a record."""
     paths = sorted(results.glob("exported-*.json"))
     return "\n\n".join(_of_device(json.loads(path.read_text())) for path in paths) if paths else None
 

@@ -35,7 +35,10 @@ def _three_digits(value: float) -> str:
 
 
 def find(figure: Figure, device: str, records: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Select the record of a figure; return None if there is none."""
+    """Select the record of a figure; return None if none matches.
+
+    Of several matching records, the one with the largest value counts, or the smallest detail ``figure.minimum_of``.
+    """
     matches = [
         record
         for record in records
@@ -63,13 +66,13 @@ def _words(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def speed_cell(figures: tuple[Figure, ...], device: str, records: list[dict[str, Any]]) -> str:
-    """Format the figures of one device."""
+    """Format the figures of one device, separated by semicolons; `MISSING` for those without a record."""
     shown = [(figure, find(figure, device, records)) for figure in figures]
     return "; ".join(MISSING if record is None else figure.text.format(**_words(record)) for figure, record in shown)
 
 
 def speed_table(results: Path) -> str:
-    """Write the speed table, as Markdown."""
+    """Return the speed table as Markdown."""
     records = [record for _, record in read_all(results) if record["name"] != evidence.NAME]
     lines = [f"| benchmark | {' | '.join(DEVICES)} |", "|---" * (1 + len(DEVICES)) + "|"]
     for row in SPEED:
@@ -87,7 +90,7 @@ def load_runs(row: Learning, results: Path) -> list[Evidence]:
     """Load the runs of a row; return an empty list if one is missing.
 
     Raises:
-        RequestError: A run has a different configuration than the row.
+        RequestError: A run has a different configuration than the row, or its files are damaged.
     """
     runs = []
     for name, config in row.runs.items():
@@ -143,7 +146,11 @@ def _machine(device: dict[str, Any]) -> str:
 
 
 def results_table(results: Path) -> str:
-    """Write the results table, as Markdown."""
+    """Return the results table as Markdown.
+
+    Raises:
+        RequestError: A run has a different configuration than its row, or its files are damaged.
+    """
     lines = ["| experiment | machine | result | command |", "|---|---|---|---|"]
     for row in LEARNING:
         runs = load_runs(row, results)
@@ -154,7 +161,7 @@ def results_table(results: Path) -> str:
 
 
 def missing_rows(results: Path) -> Iterator[str]:
-    """Yield the rows and figures without a record."""
+    """Yield a line of text for each row and figure without a record."""
     for row in LEARNING:
         missing = [name for name in row.runs if evidence.load(name, results) is None]
         if missing:

@@ -50,10 +50,10 @@ def _table(file: Path, peer: str, title: str, with_depth: bool) -> str:
 
 
 def warp_table(results: Path) -> str:
-    """Write the comparison of MuJoCo Warp's renderer with ours, in images per second, as Markdown."""
+    """Return a table that compares MuJoCo Warp's renderer with ours, in images per second, as Markdown."""
     return _table(results / _WARP_RECORDS, "render/peer_warp", "MuJoCo Warp 4.0.0", with_depth=False)
 
 
 def mujoco_table(results: Path) -> str:
-    """Write the comparison of MuJoCo's own renderer with ours, in images per second, as Markdown."""
+    """Return a table that compares MuJoCo's own renderer with ours, in images per second, as Markdown."""
     return _table(results / _MUJOCO_RECORDS, "render/peer_mujoco", "`mujoco.Renderer`", with_depth=True)

@@ -13,13 +13,13 @@ LENSES = Path("phenotyping") / "lenses.json"
 
 
 def lens_table(results: Path = RESULTS) -> str | None:
-    """Write the table of lenses; None without a record."""
+    """Return the table of lenses as Markdown; None without a record."""
     path = results / LENSES
     return lens_rows(read_json(path)["lenses"]) if path.exists() else None
 
 
 def lens_rows(lenses: dict[str, Any]) -> str:
-    """Format a table of lenses from results by focal length factor; see `benchmarks.stalks.lenses.evaluate_row`."""
+    """Return a table of lenses as Markdown, from results by focal length factor; see `stalks.lenses.evaluate_row`."""
     reference_errors = lenses.get("1", {"width_errors_mm": {}})["width_errors_mm"]
     lines = [
         "| focal length | pixels per m | view, m | stalk count | detected | false positives | ground detected | widths "
@@ -48,7 +48,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
 
 
 def coverage_table(results: Path = RESULTS) -> str | None:
-    """Write the table of 95 % intervals from the records of `phenotype eval` for each family; None without both."""
+    """Return a table of 95 % intervals from the records of `phenotype eval` for both families; None unless both exist."""
     lines = [
         "| family | seeds | widths | coverage | mean absolute error, mm | mean standard error, mm |",
         "|---|---|---|---|---|---|",
