@@ -203,7 +203,7 @@ RECORDERS = {
 
 
 def main() -> int:
-    """Write the recording."""
+    """Record the sequences, write them to the file, and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env", choices=[*RECORDERS, "FetchPush"])
     parser.add_argument("file")

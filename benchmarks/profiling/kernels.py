@@ -79,7 +79,7 @@ def report(name: str, call: Callable[[], Any], turns: int, rows: int, in_order: 
 
 
 def measure(program: TrainStep, options: argparse.Namespace) -> None:
-    """Compile the parts and report each."""
+    """Compile the parts in ``options.parts`` for a program with a replay full of noise, and print a report of each."""
     parts: list[str] = options.parts
     loop, keys = start(program), seed_keys(program, 2)
     train, replay, iteration = loop.train, loop.replay, jnp.zeros((), jnp.int32)

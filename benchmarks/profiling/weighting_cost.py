@@ -59,7 +59,12 @@ class Problem:
         return {"critic": self.networks.init_critic(critic_key), "heads": heads}
 
     def batches(self, key: jax.Array, count: int) -> dict[str, jax.Array]:
-        """Draw ``count`` batches of images [count, 2, B, C, H, W] uint8, actions, values and targets."""
+        """Sample ``count`` batches.
+
+        Returns:
+            ``images`` [count, 2, B, C, H, W] uint8, ``action`` [count, B, A] float32 in [-1, 1], ``value`` [count, B] float32,
+            and ``targets`` [count, L, B, TARGETS] float32 of L auxiliary losses.
+        """
         image_key, action_key, value_key, target_key = jax.random.split(key, 4)
         shape = self.networks.observation_spec.shape
         draw = functools.partial(jax.random.normal, shape=(count, self.size))

@@ -189,13 +189,18 @@ class Comparison:
         return [render_models.poses_of(data) for data in self.data]
 
     def lens(self, view: View) -> tuple[int, int]:
-        """Return height and width, in the aspect ratio of the camera's resolution."""
+        """Return height and width of a view's images, pixels, in the aspect ratio of the camera's resolution."""
         wide, high = (1, 1) if view.camera is None else self.mj_model.cam_resolution[view.camera]
         scale = self.size / max(wide, high)
         return max(1, round(high * scale)), max(1, round(wide * scale))
 
     def compare(self, view: View, pictures: pathlib.Path | None = None) -> tuple[Measures | None, str]:
-        """Compare a view; return its measures (None if our renderer refuses the model) and the verdict."""
+        """Compare a view in all poses; return its measures (None if our renderer refuses the model) and the verdict.
+
+        Args:
+            view: Camera and features to render.
+            pictures: Prefix of the PNG files for ours, MuJoCo's and the difference times 8, side by side; None for no files.
+        """
         height, width = self.lens(view)
         groups = (0, 1, 2) if view.sites else ()
         options: dict[str, Any] = dict(site_groups=groups, haze=view.haze, lights="mujoco")
@@ -235,7 +240,7 @@ class Comparison:
         return total, f"no verdict: {doubt}" if doubt else "**FAIL**: " + ", ".join(failures) + remark
 
     def reference(self, view: View, shift: np.ndarray | float = 0.0) -> list[Frame]:
-        """Render all poses by MuJoCo, with the camera moved by ``shift`` [3] (m)."""
+        """Render all poses with MuJoCo's renderer, with the camera moved by ``shift`` [3] (m, world axes)."""
         height, width = self.lens(view)
         frames = []
         groups = (0, 1, 2) if view.sites else ()

@@ -259,7 +259,7 @@ class References:
             return self._made[name]
 
     def study(self) -> dict[str, list]:
-        """Return rows by name of the cell."""
+        """Return the rows of each run of a sweep by the name of its cell."""
 
         def make(folder: Path) -> dict[str, list]:
             _wait_until_finished(_command(_sweep(folder), folder), 0)
@@ -268,7 +268,7 @@ class References:
         return self._once("study", make)
 
     def phenotyping(self) -> tuple[Path, dict[str, bytes]]:
-        """Return the folder of plots, and their tables."""
+        """Return the folder of plots, and the contents of their tables by file name."""
 
         def make(folder: Path) -> tuple[Path, dict[str, bytes]]:
             (folder / "few.json").write_text(json.dumps(FEW_STALKS))
@@ -280,7 +280,7 @@ class References:
         return self._once("phenotyping", make)
 
     def grasping(self) -> tuple[Path, list]:
-        """Return the file of a family, and the figures of its runs."""
+        """Return the file of a family, and the results of its runs without durations."""
 
         def make(folder: Path) -> tuple[Path, list]:
             spec = folder / "few.json"
@@ -293,7 +293,13 @@ class References:
 
 @dataclasses.dataclass(frozen=True)
 class Alone:
-    """Fault with a folder of its own; see the module."""
+    """Fault with a folder of its own.
+
+    Attributes:
+        strike: Function of the folder to create, a random generator and the references that injects the fault and checks the
+            outcome; see the module.
+        guarantee: Guaranteed outcome, for the table.
+    """
 
     strike: Callable[[Path, random.Random, References], None]
     guarantee: str
@@ -315,7 +321,11 @@ ALONE: dict[str, Alone] = {
 
 
 def strike_alone(name: str, folder: Path, rng: random.Random, references: References) -> bool:
-    """Inject a fault of `ALONE` in a new folder; return False if the command finished first."""
+    """Inject a fault of `ALONE` in a new folder, which is then deleted; return False if the command finished first.
+
+    Raises:
+        Broken: The command does not handle the fault; the folder is left.
+    """
     try:
         ALONE[name].strike(folder, rng, references)
     except NotStruck:

@@ -163,7 +163,11 @@ def _kill_run(folder: Path, rng: random.Random) -> bool:
 
 
 def _resume_run(folder: Path, rng: random.Random, variables: dict[str, str] | None = None) -> tuple[int, Part]:
-    """Resume, and stop again during training; return the exit status and the process."""
+    """Resume, and stop again during training; return the exit status and the process.
+
+    Raises:
+        Broken: The exit status is neither 0 nor 143, or a traceback was printed.
+    """
     with killed_afterwards(_start_run(folder, rng, variables)) as part:
         status = part.stop()
         part.check_words()
@@ -182,6 +186,9 @@ def _check_went_back(
         before: Its rows before it was resumed.
         all_before: Its checkpoints before it was resumed.
         intact: The undamaged ones among ``all_before``.
+
+    Raises:
+        Broken: The newest checkpoint is older than the newest intact one, or rows were lost.
     """
     newest, newest_good, last = (
         max((iteration for iteration, *_ in checkpoints), default=0)

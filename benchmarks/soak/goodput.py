@@ -33,6 +33,9 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
     Returns:
         ``env_steps`` of its networks, per seed; ``kills``; ``minutes``; ``goodput``, gradient steps in its networks over
         gradient steps computed; ``replays_lost``, resumptions without the replay; and ``success`` at the end, one per seed.
+
+    Raises:
+        Broken: The run ends by itself, does not end after SIGTERM, or cannot be evaluated.
     """
     notes = folder.with_name(f"{folder.name}.kills.json")
     earlier: dict[str, float] = json.loads(notes.read_text()) if notes.exists() else {"kills": 0, "minutes": 0.0}
@@ -73,7 +76,11 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
 
 
 def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[float]:
-    """Return the final success of an undisturbed run, per seed; an existing run is not trained again."""
+    """Return the final success of an undisturbed run of ``env_steps`` steps, per seed; an existing run is continued.
+
+    Raises:
+        Broken: The run fails, or takes more than a day.
+    """
     with killed_afterwards(Part.start(folder, options=[*options, "--env-steps", str(env_steps)])) as part:
         if part.end(86400.0) != 0:
             raise Broken(f"the undisturbed run ended early: {part.lines[-3:]}")
@@ -81,7 +88,13 @@ def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[fl
 
 
 def report(killed: dict[str, Any], every: float, reference: Sequence[float] | None) -> dict[str, Any]:
-    """Print the results, and return them for a file."""
+    """Print the results, and return them for a file.
+
+    Args:
+        killed: Results of `killed_every`.
+        every: Time between kills, s.
+        reference: Success of an undisturbed run, per seed; None if there was none.
+    """
     comparison = "" if reference is None else f", undisturbed {' '.join(f'{value:.3f}' for value in reference)}"
     print(
         "goodput {goodput:.4f} over {env_steps:,} environment steps and {minutes:g} minutes, killed {kills} times, every "

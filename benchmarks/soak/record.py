@@ -85,7 +85,7 @@ class Record:
 
 
 def added(records: Sequence[Record]) -> Record:
-    """Add up several soaks of one commit.
+    """Add up several soaks of one commit, in a record with the machine and seed of the first.
 
     Raises:
         ValueError: They are of different commits, or two have the same seed.
