@@ -14,7 +14,7 @@ from jaxrl_vis.stalks.phenotyping.detector import weights
 
 
 def main(trained: Path) -> None:
-    """Replace the packaged weights of the networks that the file ``trained`` holds; exit with an error line if it holds none."""
+    """Replace the packaged weights of the networks in the file ``trained``; exit with an error line if it contains none."""
     for room in (weights, painter):
         try:
             params, settings, origin = room.read_weights(trained)

@@ -88,7 +88,19 @@ MODES = ("cold", "warm")
 
 
 def time_modes(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
-    """Measure in a new process; return its laps."""
+    """Measure one mode in a new process.
+
+    Args:
+        mode: One of the values of ``--mode``.
+        cache: Folder of the compilation cache.
+        options: Options of the command line: ``env``, ``seeds`` and ``preset``.
+
+    Returns:
+        Wall-clock and processor time of each lap, s, by name.
+
+    Raises:
+        subprocess.CalledProcessError: The process failed.
+    """
     command = [sys.executable, __file__, options.env, "--seeds", str(options.seeds), "--mode", mode]
     command += ["--preset", options.preset] if options.preset else []
     variables = {

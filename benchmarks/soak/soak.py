@@ -45,7 +45,11 @@ class Soak:
         self.reference: list[dict[str, Any]] = []
 
     def undisturbed(self) -> None:
-        """Train the run that others are compared with."""
+        """Train the run that others are compared with, and store its rows.
+
+        Raises:
+            Broken: The run failed.
+        """
         with killed_afterwards(Part.start(self._folder / "reference")) as part:
             if part.end() != 0:
                 raise Broken("\n".join(part.lines))
@@ -147,6 +151,9 @@ class Soak:
             folder: The run.
             before: The rows when its last process began.
             checkpointed: Iteration of the newest checkpoint at that time.
+
+        Raises:
+            Broken: Rows up to that checkpoint are missing, or the newest checkpoint is more than one iteration older.
         """
         old = [row for row in before if row["iteration"] <= checkpointed]
         if read_rows(folder)[: len(old)] != old:

@@ -47,11 +47,11 @@ class ImageStatistics:
     """Statistics of the detector on one image.
 
     Attributes:
-        family: Family of the plot.
-        pooled: Pooled features of the network.
-        scores: Scores of the detections.
-        f1: F1 of the detections.
-        plain: Mean brightness and sharpness of the image.
+        family: Name of the plot's family, or ``photographs``; "" before it is known.
+        pooled: [C] float32, pooled features of the network.
+        scores: [N] float32, scores of the detections.
+        f1: F1 of the detections with a score of at least `MIN_SCORE`.
+        plain: Mean brightness and sharpness of the image (`plain_measures`).
     """
 
     family: str
@@ -62,7 +62,14 @@ class ImageStatistics:
 
 
 def draw(folder: Path, part: str, family: str, number: int) -> Path:
-    """Render images of one plot with their stalks into a file, unless it exists; return the file."""
+    """Render `FRAMES` random images of one plot and its true boxes into a .npz file, unless it exists; return its path.
+
+    Args:
+        folder: Folder of the file; created if it does not exist.
+        part: ``fit`` or ``test``, which selects the range of seeds.
+        family: Name of a file of `SPECS`, or of a family of `jaxrl_vis_envs.plants`.
+        number: Number of the plot, added to the first seed.
+    """
     path = folder / f"{part}_{family}_{number}.npz"
     if path.exists():
         return path
@@ -90,7 +97,16 @@ def plain_measures(image: np.ndarray) -> tuple[float, float]:
 def detect_stalks(
     finder: Finder, image: np.ndarray, pixels_per_metre: float | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Detect stalks in an image: return detections [N, 6] in its own coordinates, their scores, and the pooled features."""
+    """Detect stalks in an image whose borders are filled.
+
+    Args:
+        finder: The detector.
+        image: [H, W, 3] uint8.
+        pixels_per_metre: Pixels per metre at the plants; None if unknown.
+
+    Returns:
+        Detections [N, 6] in pixels of ``image``, their scores [N], and the pooled features [C].
+    """
     frame = find_frame(image)
     stalks, scores, pooled = finder.look(fill_borders(image, frame), pixels_per_metre)
     over, down = frame.columns[0], frame.lines[0]
@@ -98,12 +114,18 @@ def detect_stalks(
 
 
 def f1_of(hits: int, finds: int, stalks: int) -> float:
-    """Return the F1 score; 1 if there is nothing and nothing is detected."""
+    """Return the F1 score for the numbers of correct detections, of detections and of stalks; 1 if the last two are 0."""
     return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
 
 
 def detections_in(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
-    """Evaluate the images of a file of `draw`, or read the cached results of the detector of this name."""
+    """Return the statistics of each image in a file of `draw`, from a cache beside it if one exists; else write that cache.
+
+    Args:
+        path: The file.
+        finder: The detector.
+        name: Name of the detector, whose last word identifies the cache.
+    """
     cached = path.with_suffix(f".{name.split()[-1]}.npz")
     if not cached.exists():
         arrays = {}
@@ -132,7 +154,7 @@ def _detect_images(path: Path, finder: Finder) -> Iterator[ImageStatistics]:
 
 
 def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[ImageStatistics]:
-    """Evaluate photographs, whose cameras are unknown."""
+    """Yield the statistics of each photograph, detected without a known resolution, because the cameras are unknown."""
     for image, count, find_boxes in photographs:
         stalks, scores, pooled = detect_stalks(finder, image, None)
         boxes = stalks[scores >= MIN_SCORE][:, :4]
@@ -140,13 +162,26 @@ def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder)
 
 
 def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
-    """Return the probability that a wrong image has a higher value than a correct one; NaN without such pairs."""
+    """Return the area under the ROC curve: the probability that a misread image has a higher value than another.
+
+    Args:
+        values: [N] float, one for each image.
+        wrong: [N] bool, True if the image was misread.
+
+    Returns:
+        The area, in which ties count one half; NaN if all images or none were misread.
+    """
     above = values[wrong][:, None] - values[~wrong][None, :]
     return float(np.mean((above > 0) + 0.5 * (above == 0))) if above.size else float("nan")
 
 
 def control(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.ndarray:
-    """Return the doubts [N] by a logistic regression on brightness and sharpness, their squares and product."""
+    """Return the logits [N] of a logistic regression on brightness and sharpness, their squares and product.
+
+    Args:
+        fitted: Images on which the regression is fitted.
+        tried: The N images for which the logits of being misread are returned.
+    """
 
     def inputs(images: list[ImageStatistics]) -> np.ndarray:
         plain = (np.array([image.plain for image in images]) - [100.0, 6.0]) / [50.0, 2.0]
@@ -157,7 +192,14 @@ def control(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.n
 
 
 def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_control: np.ndarray) -> None:
-    """Print a line of figures."""
+    """Print a line: number of misread images, area under the ROC curve of gate and control, and shares flagged by the gate.
+
+    Args:
+        name: Label of the line.
+        images: Statistics of N images.
+        gate: The gate.
+        doubts_of_control: [N] logits of `control`.
+    """
     wrong = np.array([image.f1 < RIGHT for image in images])
     doubts = np.array([gate.doubt(image.pooled, image.scores) for image in images])
     flagged = doubts > gate.threshold
@@ -177,7 +219,7 @@ def _made(folder: Path, tasks: list[tuple[str, str, int]], index: int) -> dict[s
 
 
 def main() -> None:
-    """Render, fit, write and measure."""
+    """Render the images, fit the gate, write it beside the weights, and print its figures on the images for testing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--weights", type=Path, default=SHIPPED)

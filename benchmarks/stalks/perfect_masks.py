@@ -16,7 +16,17 @@ from jaxrl_vis_envs.plants.truth import outline, stalks_in_view
 
 
 def width_errors(family: Family, seed: int, frame: int) -> list[dict[str, float]]:
-    """Measure one pair: return visibility, confidence and error (mm) by method, for stalks that are at least 0.3 visible."""
+    """Measure the stalks of one rendered stereo pair on their true masks.
+
+    Args:
+        family: Family of the plot.
+        seed: Seed of the plot.
+        frame: Index of the pair in its sequence.
+
+    Returns:
+        For each stalk that is at least 0.3 visible, its visibility, and confidence and error (mm) by method; stalks that a
+        method cannot measure are left out.
+    """
     sequence = Sequence.of(draw(family, seed))
     pair, drive = sequence[frame], sequence.drive
     instance, left, right = np.asarray(pair.instance), grey(np.asarray(pair.left)), grey(np.asarray(pair.right))

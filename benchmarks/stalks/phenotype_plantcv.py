@@ -105,7 +105,11 @@ def plantcv_width(pcv: Any, mask: np.ndarray) -> float:
 
 
 def compare(file: Path) -> None:
-    """Print the width errors of both methods, mm."""
+    """Print the width errors of PlantCV and of this project on the stored masks, mm; exit with a line without PlantCV.
+
+    Args:
+        file: The .npz file with masks, true widths and this project's widths.
+    """
     try:
         from plantcv import plantcv as pcv  # pyright: ignore[reportMissingImports]
     except ImportError:

@@ -39,7 +39,16 @@ def ideal_strip(width: float, ratio: float, lean: float, position: tuple[float, 
 
 
 def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, widths: tuple[float, ...]) -> np.ndarray:
-    """Return the mean relative error of an estimator for each width."""
+    """Return the mean relative error [len(widths)] of a width estimator; NaN where it returned None for a strip.
+
+    Args:
+        estimate: Function from a mask [H, W] to its width, pixels, or None.
+        ratio: Ratio of length to width.
+        lean: Tilt, degrees.
+        soft: Rasterise covered fractions instead of bool.
+        places: Number of random sub-pixel positions per width.
+        widths: True widths, pixels.
+    """
     rng = np.random.default_rng(0)
     errors = []
     for width in widths:
@@ -55,7 +64,12 @@ def strip(mask: np.ndarray) -> float | None:
 
 
 def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
-    """Return the lines of a Markdown table."""
+    """Return the lines of a Markdown table: for each estimator, mask, tilt and ratio, the mean error at the worst width.
+
+    Args:
+        places: Number of random sub-pixel positions per width.
+        widths: True widths, pixels.
+    """
     estimators = {"strip": strip} | {f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
     lines = [
         "| estimator | mask | lean | " + " | ".join(f"L/W {ratio:g}" for ratio in RATIOS) + " |",

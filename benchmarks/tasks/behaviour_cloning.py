@@ -17,14 +17,14 @@ from jaxrl_vis.types import Batch, Metrics, Params, Statistics
 
 
 class Cloned(NamedTuple):
-    """Actor and its optimiser."""
+    """Parameters of the actor and state of its optimiser (Adam)."""
 
     actor: Params
     optimizer: Any
 
 
 def make(setup: Setup) -> Algorithm:
-    """Build the behaviour cloning algorithm."""
+    """Build behaviour cloning: mean squared error between the actor's action and the batch's, with an encoder of its own."""
     config = setup.config.replace(encoders="separate")  # the actor has an encoder of its own: there is no critic
     networks = Networks(config, setup.observation_spec, setup.action_size, 0.0)
     policy = make_policy(networks)

@@ -25,10 +25,16 @@ _TOLERANT = {"tolerance": 8.0, "share": 0.99}  # the defaults of indicator_toler
 
 
 def record(env: Any, episodes: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Play the scripted pusher in N episodes.
+    """Roll out the scripted pusher for N episodes.
+
+    Args:
+        env: VisualFetchPush, with RGB-D images.
+        episodes: N.
+        seed: Seed of the starts and goals.
 
     Returns:
-        Images [N, T+1, 4, H, W] uint8, the same with the arm lifted from the box, and positions of the box [N, T+1, 3] (m).
+        Images [N, T+1, 4, H, W] uint8; images of the same boxes with the arm in the pose of a goal, clear of the box; and
+        positions of the box [N, T+1, 3], m.
     """
     state, aims = environments.reset(env, jax.random.split(jax.random.key(seed), episodes))
     policy, memory = controllers.fetch_push(env)
@@ -54,7 +60,7 @@ def record(env: Any, episodes: int, seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the shares of occluded boxes, and the shares of positive rewards by the distance of the box from its goal."""
     parser = argparse.ArgumentParser(
         description="Indicator rewards of VisualFetchPush, on whole images and on the box's pixels."
     )

@@ -68,7 +68,7 @@ class Cell:
         return f"{self.mode}_{self.method}_noise{self.noise}_seed{self.seed}"
 
     def options(self) -> dict[str, Any]:
-        """Return the options of the learner."""
+        """Return the keyword arguments of `indicator.Learner`."""
         of_method: dict[str, dict[str, Any]] = {
             "exact": {"method": "indicator_balance_filter", "relabel_probability": 0.8},
             # Noise of sigma differs by sigma sqrt(2) between two images; without noise, a few grey levels.
@@ -82,7 +82,17 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Lengths of runs; the defaults are what is recorded."""
+    """Lengths of runs; the defaults are those of the stored records.
+
+    Attributes:
+        steps: Live: maximum number of environment steps.
+        updates_per_episode: Live: gradient steps after each episode.
+        interval: Live: environment steps between evaluations.
+        episodes: Recorded: number of episodes.
+        updates: Recorded: number of gradient steps.
+        eval_episodes: Episodes of each evaluation during learning.
+        final_episodes: Episodes of the evaluation at the end.
+    """
 
     steps: int = 40_000
     updates_per_episode: int = 25
@@ -103,19 +113,23 @@ def cells() -> list[Cell]:
 
 
 def evaluate(learner: indicator.Learner, robot: HostFetch, episodes: int) -> float:
-    """Return the success rate over fixed goals."""
+    """Return the success rate over ``episodes`` fixed goals; restarts the random sequence of ``robot``."""
     robot.reseed(_EVALUATION_SEED)
     return float(np.mean([robot.episode(lambda image, goal, _: learner.act(image, goal)).is_reached for _ in range(episodes)]))
 
 
 def latest(metrics: list[dict[str, float]]) -> dict[str, float]:
-    """Return the means of the last updates' shares, of rewards against the truth among them."""
+    """Return the means over the last `_LATEST` rows of all metrics with ``share`` in their name, without ``train/``."""
     last = metrics[-_LATEST:]
     return {name.removeprefix("train/"): float(np.mean([row[name] for row in last])) for name in last[0] if "share" in name}
 
 
 def live(cell: Cell, size: Size) -> dict[str, Any]:
-    """Learn online; return success by steps."""
+    """Learn online, until `IN_A_ROW` evaluations reach `WANTED` or for ``size.steps`` environment steps.
+
+    Returns:
+        ``rows`` (success by environment steps), final ``success``, ``shares`` (`latest`) and ``seconds``.
+    """
     learner = indicator.Learner(SHAPE, ACTION_SIZE, HORIZON, capacity=size.steps // HORIZON, **cell.options())
     robot, judge, draw = HostFetch(cell.noise, cell.seed), HostFetch(cell.noise, 0), np.random.default_rng(cell.seed)
 
@@ -156,7 +170,12 @@ def record(path: Path, size: Size) -> None:
 
 
 def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
-    """Learn offline, from recordings alone, which are made first if ``folder`` lacks them; return success."""
+    """Learn offline from recorded episodes, which are written first if ``folder`` lacks them.
+
+    Returns:
+        ``rows`` (success by gradient steps), final ``success``, ``behaviour_success`` of the recorded episodes, ``shares``
+        (`latest`) and ``seconds``.
+    """
     path = folder / f"recorded_{size.episodes}.npz"
     if not path.exists():
         record(path, size)
@@ -185,7 +204,14 @@ def recorded(cell: Cell, size: Size, folder: Path) -> dict[str, Any]:
 
 
 def run(cell: Cell, size: Size, results: Path, recordings: Path) -> None:
-    """Run one cell and write its record."""
+    """Run one cell and write its record, ``NAME.json``.
+
+    Args:
+        cell: The cell.
+        size: Lengths of the run.
+        results: Folder of the record; created if it does not exist.
+        recordings: Existing folder of the recorded episodes.
+    """
     result = live(cell, size) if cell.mode == "live" else recorded(cell, size, recordings)
     about = {
         **dataclasses.asdict(cell),
@@ -200,7 +226,7 @@ def run(cell: Cell, size: Size, results: Path, recordings: Path) -> None:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run the cells that have no record."""
+    """Run the cells that have no record; return the exit status, 2 after an error line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", nargs="+", help="cells by name; all if not given")
     parser.add_argument("--list", action="store_true", help="print the names of all cells")

@@ -55,6 +55,9 @@ def visited_states(
         controls: [S, T, nu], each held for ``every`` physics steps.
         every: Physics steps per control; the state before each control is returned.
         mocap: [S, T, 3], positions of the only mocap body, held as the controls are.
+
+    Returns:
+        The S T states before each control, start by start.
     """
     states = []
     data = mujoco.MjData(mj_model)
@@ -136,7 +139,14 @@ STATES: dict[str, Callable[[Any], Visited]] = {
 
 
 def our_step(env: Any, visited: Visited, iterations: Iterations) -> np.ndarray:
-    """Return our joint velocities [N, nv] after one step, with the task's solver iterations and contact accuracy, or more."""
+    """Return our joint velocities [N, nv] float32 after one step.
+
+    Args:
+        env: The task.
+        visited: N states.
+        iterations: ``task`` for the task's solver iterations and contact accuracy, ``more`` for `MORE_ITERATIONS` with exact
+            contacts.
+    """
     mj_model = env.mj_model
     if iterations == "more":
         mj_model = copy.copy(mj_model)
@@ -200,7 +210,7 @@ def in_bounds(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def rows(name: str) -> list[str]:
-    """Return the rows of the table for one task."""
+    """Return the rows of the Markdown table for one task, a key of `STATES`."""
     env = environments.make(name)
     visited = STATES[name](env)
     steps = {iterations: our_step(env, visited, iterations) for iterations in ("task", "more")}
