@@ -146,7 +146,7 @@ def _detect_images(path: Path, finder: Finder) -> Iterator[ImageStatistics]:
     with np.load(path) as data:
         for index in range(FRAMES):
             image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
-            stalks, scores, pooled = detect_stalks(finder, image, float(data["density"]))
+            stalks, scores, pooled = detect_stalks(finder, image, float(data["pixels_per_metre"]))
             right, ignored = match_finds(stalks, scores, truth, kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
