@@ -19,7 +19,7 @@ import numpy as np
 from jaxrl_vis.host.devices import enable_compilation_cache
 from jaxrl_vis.host.worker_pool import evaluate_all, share_accelerator
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder
-from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, gate_path, logistic, write_gate
+from jaxrl_vis.stalks.phenotyping.detector.gate import Gate, fit_gate, fit_logistic_regression, gate_path, write_gate
 from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder
 from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
@@ -108,7 +108,7 @@ def detect_stalks(
         Detections [N, 6] in pixels of ``image``, their scores [N], and the pooled features [C].
     """
     frame = find_frame(image)
-    stalks, scores, pooled = finder.look(fill_borders(image, frame), pixels_per_metre)
+    stalks, scores, pooled = finder.detect_boxes(fill_borders(image, frame), pixels_per_metre)
     over, down = frame.columns[0], frame.lines[0]
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
 
@@ -187,7 +187,7 @@ def control(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.n
         plain = (np.array([image.plain for image in images]) - [100.0, 6.0]) / [50.0, 2.0]
         return np.concatenate([plain, plain**2, plain[:, :1] * plain[:, 1:]], axis=1)
 
-    weights = logistic(inputs(fitted), np.array([image.f1 < RIGHT for image in fitted]))
+    weights = fit_logistic_regression(inputs(fitted), np.array([image.f1 < RIGHT for image in fitted]))
     return weights[0] + inputs(tried) @ weights[1:]
 
 

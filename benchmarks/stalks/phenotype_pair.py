@@ -18,11 +18,11 @@ import numpy as np
 
 from benchmarks.stalks.worker_rate import Once, options, print_rate, timed
 from jaxrl_vis.host.provenance import device_name
-from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad
+from jaxrl_vis.stalks.phenotyping.detector.detect import detect, pad_image
 from jaxrl_vis.stalks.phenotyping.detector.finder import Finder, resize
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED, read_weights
 from jaxrl_vis.stalks.phenotyping.measure.ground import find_ground
-from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, find_with_ground, grey_at, measure_pair
+from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE, detect_with_ground, grey_at, measure_pair
 from jaxrl_vis_envs.plants import SHIFTED, Calibration, draw
 from jaxrl_vis_envs.plants.pairs import Sequence
 from jaxrl_vis_envs.plants.truth import stalks_in_view
@@ -37,7 +37,7 @@ def make(path: Path, stated: Calibration) -> tuple[Once, int]:
 
     def once(number: int) -> list[float]:
         left, right = pairs[number]
-        detections, ground = find_with_ground(finder, left, right, stated)
+        detections, ground = detect_with_ground(finder, left, right, stated)
         return [sighting.diameter_mm or 0.0 for sighting in measure_pair(detections, left, right, stated, ground=ground)]
 
     return once, len(pairs)
@@ -54,7 +54,7 @@ if __name__ == "__main__":
 
     def once() -> tuple[Any, Any, list[Any]]:
         """Process one pair: detections, ground and sightings."""
-        detections, ground = find_with_ground(finder, left, right, stated)
+        detections, ground = detect_with_ground(finder, left, right, stated)
         return detections, ground, measure_pair(detections, left, right, stated, ground=ground)
 
     started = time.perf_counter()
@@ -65,7 +65,7 @@ if __name__ == "__main__":
     print(f"{left.shape[1]} x {left.shape[0]}, {len(detections)} finds, {measured} measured, on {device_name()}")
     print(f"{np.median(seconds):.3f} s a pair (least {min(seconds):.3f}); the first one, which compiles, {first:.1f} s")
     pixels_per_metre = stated.focal / USUAL_DISTANCE
-    small = pad(resize(left, settings, pixels_per_metre)[0])
+    small = pad_image(resize(left, settings, pixels_per_metre)[0])
     dtype = finder.dtype
     parts = {
         "image to the device": lambda: jax.block_until_ready(jax.device_put(left)),

@@ -9,7 +9,7 @@ import argparse
 
 import numpy as np
 
-from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, strip_width
+from jaxrl_vis.stalks.phenotyping.measure.width import ELLIPSE_FITS, ellipse_width, fit_strip
 
 RATIOS = (1.5, 3.0, 6.0, 12.0)
 LEANS = (0.0, 2.0, 8.0, 14.0, 20.0)
@@ -58,8 +58,8 @@ def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, wi
 
 
 def strip(mask: np.ndarray) -> float | None:
-    """Return the width by `strip_width`; None if it finds none."""
-    strip = strip_width(mask)
+    """Return the width by `fit_strip`; None if it finds none."""
+    strip = fit_strip(mask)
     return None if strip is None else strip.width()
 
 

@@ -48,23 +48,23 @@ def write_record(path: Path, record: Mapping[str, Any], sources: Any) -> None:
     write_atomically(path, json.dumps({**record, _SOURCES: sources}) + "\n")
 
 
-def is_current(path: Path, sources: Any, is_whole: Callable[[dict[str, Any]], bool]) -> bool:
+def is_current(path: Path, sources: Any, is_complete: Callable[[dict[str, Any]], bool]) -> bool:
     """Return True if a record exists, is complete, and was made from the current sources.
 
     Args:
         path: The file.
         sources: Current state of its sources.
-        is_whole: Function that returns True for a complete record; it may raise ValueError, KeyError, TypeError or
+        is_complete: Function that returns True for a complete record; it may raise ValueError, KeyError, TypeError or
             AttributeError for a malformed one.
     """
     try:
         record = read_json(path)
-        return is_whole(record) and record[_SOURCES] == sources
+        return is_complete(record) and record[_SOURCES] == sources
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return False
 
 
-def claim(
+def claim_folder(
     out: Path,
     unit: str,
     folders: Iterable[PlotFolder],

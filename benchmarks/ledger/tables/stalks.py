@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ledger.records import RESULTS
-from jaxrl_vis.stalks.phenotyping.measure.lens import TRIED
+from jaxrl_vis.stalks.phenotyping.measure.lens import VALIDATED
 from jaxrl_vis_envs.documents import read_json
 
 LENSES = Path("phenotyping") / "lenses.json"
@@ -29,7 +29,7 @@ def lens_rows(lenses: dict[str, Any]) -> str:
     for factor, lens in lenses.items():
         errors = lens["width_errors_mm"]
         differences = [errors[stalk] - reference_errors[stalk] for stalk in errors.keys() & reference_errors.keys()]
-        tried = lens["pixels_per_metre"] >= TRIED.pixels_per_metre and lens["view_m"] >= TRIED.view
+        tried = lens["pixels_per_metre"] >= VALIDATED.pixels_per_metre and lens["view_m"] >= VALIDATED.view
         cells = (
             f"x {factor}",
             f"{lens['pixels_per_metre']:.0f}",

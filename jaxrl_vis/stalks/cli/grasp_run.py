@@ -56,7 +56,7 @@ def run(options: Run) -> int:
             raise RequestError(f"{name} has no calibration, without which there are no metres: name one with --calibration")
     check_devices()
     enable_compilation_cache()
-    from jaxrl_vis.stalks.grasping.evaluation.attempts import from_any_stop
+    from jaxrl_vis.stalks.grasping.evaluation.attempts import reachable_from_any_stop
     from jaxrl_vis.stalks.grasping.perception.cloud import Mount
     from jaxrl_vis.stalks.grasping.perception.perceive import DEFAULT_VARIANT, THESIS_VARIANT
     from jaxrl_vis.stalks.grasping.pipeline import Request, run
@@ -76,7 +76,7 @@ def run(options: Run) -> int:
 
     known = {name: calibration for name, calibration in calibrations.items() if calibration is not None}
     variant, mount = THESIS_VARIANT if options.thesis else DEFAULT_VARIANT, Mount(options.height, options.pitch)
-    request = Request(options.out, variant, name, known, mount, options.speed, from_any_stop)
+    request = Request(options.out, variant, name, known, mount, options.speed, reachable_from_any_stop)
 
     def echo(row) -> None:
         print(f"{row['run']}: {row['grasp_points']} grasp points in {row['pairs']} pairs: {row['flag']}", flush=True)

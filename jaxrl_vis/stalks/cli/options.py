@@ -242,13 +242,13 @@ class CameraOptions:
             RequestError: There are none, they are ambiguous, or the recording cannot be read.
         """
         from jaxrl_vis.stalks.phenotyping.io.folders import find_plots
-        from jaxrl_vis.stalks.phenotyping.io.recording import Topics, is_recording, take_apart
+        from jaxrl_vis.stalks.phenotyping.io.recording import Topics, extract_recording, is_recording
 
         patterns = self.patterns()
         if not is_recording(folder):
             return find_plots(folder, patterns)
         topics = None if patterns is None else Topics(patterns.left, patterns.right)
-        return find_plots(take_apart(folder, out / "recording", topics))
+        return find_plots(extract_recording(folder, out / "recording", topics))
 
     def read_calibration(self, plot: PlotFolder) -> Calibration | None:
         """Read the calibration of one folder of pairs; return None if there is none.

@@ -64,7 +64,7 @@ def evaluate(options: Eval) -> int:
         weights = resolve_weights(options.weights)
         load_finder(weights, options.min_score)  # reports what is wrong with the weights
         name = detector_name(weights)
-    figures = _evaluate(options, _factors(options) if options.each_factor else {"": family}, weights, name)
+    figures = _evaluate(options, _read_factors(options) if options.each_factor else {"": family}, weights, name)
     if options.each_factor:
         _write_table(options, name, figures)
         return 0
@@ -74,7 +74,7 @@ def evaluate(options: Eval) -> int:
     return 0
 
 
-def _factors(options: Eval) -> "dict[str, Family]":
+def _read_factors(options: Eval) -> "dict[str, Family]":
     """Return the families of ``--each-factor``: unshifted (``none``), with each factor shifted alone, and with ``all``."""
     from jaxrl_vis_envs.plants import SHIFTS
 
@@ -106,10 +106,10 @@ def _evaluate(options: Eval, families: "Mapping[str, Family]", weights: Path | N
         )
 
     seeds = range(options.seed, options.seed + options.plots)
-    return records.evaluate_tasks(tasks, seeds, {factor: _path(options.json, factor) for factor in tasks}, started, done)
+    return records.evaluate_tasks(tasks, seeds, {factor: _factor_file(options.json, factor) for factor in tasks}, started, done)
 
 
-def _path(path: Path | None, factor: str) -> Path | None:
+def _factor_file(path: Path | None, factor: str) -> Path | None:
     """Return the file of one factor, beside the table's ``path``; ``path`` itself if it is None or the factor is ""."""
     return path.with_name(f"{path.stem}-{factor}.json") if path and factor else path
 

@@ -57,14 +57,14 @@ def label(options: Label) -> int:
     check_devices()
     enable_compilation_cache()
     from jaxrl_vis.stalks.phenotyping.detector.loading import detector_name, load_finder, resolve_weights
-    from jaxrl_vis.stalks.phenotyping.io.images import read_image, rgb8
+    from jaxrl_vis.stalks.phenotyping.io.images import read_image, to_rgb8
 
     weights = resolve_weights(options.weights)
     find = load_finder(weights, options.min_score)
     labelled, skipped = [], 0
     for index, path in enumerate(paths, start=1):
         try:
-            image = rgb8(read_image(path))
+            image = to_rgb8(read_image(path))
         except OSError as error:
             print(f"skipped {error}", flush=True)
             skipped += 1

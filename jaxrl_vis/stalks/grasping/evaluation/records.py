@@ -20,7 +20,7 @@ from jaxrl_vis.run.trained.policy import Policy
 from jaxrl_vis.stalks.digests import value_digest
 from jaxrl_vis.stalks.grasping.evaluation.attempts import Loop, Plan, execute_plans, plan
 from jaxrl_vis.stalks.grasping.evaluation.grasp_score import Attempt, Score, Standing, score
-from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summary
+from jaxrl_vis.stalks.grasping.evaluation.scoring import MaskScore, RunScore, draw_scene, score_scene, summarise_scores
 from jaxrl_vis.stalks.grasping.masks.loading import load_painter
 from jaxrl_vis.stalks.grasping.perception.perceive import Variant
 from jaxrl_vis_envs.plants import Family
@@ -127,10 +127,10 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
     """Summarise the records of runs, as values for JSON.
 
     Returns:
-        The figures of `scoring.summary`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
+        The figures of `summarise_scores`, ``devices`` and ``workers`` of the records, and under ``reaches`` the scores of those
         `Reaches` that all records hold, by name.
     """
-    figures: dict[str, Any] = summary([read_score(record) for record in records])
+    figures: dict[str, Any] = summarise_scores([read_score(record) for record in records])
     figures["devices"] = sorted({record["device"] for record in records})
     figures["workers"] = sorted({record["workers"] for record in records})
     known = [set(record.get("reaches", {})) for record in records]
@@ -142,7 +142,7 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
 def score_figures(score: Score) -> dict[str, Any]:
     """Return the thesis's ratio and all proportions of a score, with counts and intervals, as values for JSON."""
     proportions = {
-        proportion.name: {"count": proportion.count, "of": proportion.of, "interval": proportion.interval}
+        proportion.name: {"count": proportion.count, "of": proportion.total, "interval": proportion.interval}
         for proportion in score.proportions
     }
     return {"thesis_ratio": score.thesis_ratio, "shares": proportions}
@@ -247,7 +247,7 @@ def _plan_record(plan: Plan) -> Record:
         "errors": plan.errors.round(_DIGITS).tolist(),
         "sides": plan.sides.tolist(),
         "refused": plan.refused.tolist(),
-        "again": plan.again.round(_DIGITS).tolist(),
+        "again": plan.redetection_errors.round(_DIGITS).tolist(),
         "stands": _stands_record(plan.stands),
         "seen": None if plan.detected is None else _stands_record(plan.detected),
         "standing": [
@@ -273,7 +273,7 @@ def read_plan(number: int, record: Record, name: str = "plan") -> Plan:
         errors=np.array(values["errors"], float),  # None becomes NaN
         sides=np.array(values["sides"], float),
         refused=np.array(values["refused"], bool),
-        again=np.array(values["again"], float).reshape(-1, 2),
+        redetection_errors=np.array(values["again"], float).reshape(-1, 2),
         stands=_read_stands(values["stands"]),
         standing=tuple(
             Standing(number, stalk, reachable, *(np.inf if length is None else length for length in (room, neighbour)))

@@ -118,7 +118,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
         return painted[number]
 
     perception = perceive(scene.views, record_mask, scene.drive.stated, scene.mount, variant)
-    targets = in_world(perception, scene)
+    targets = points_in_plot(perception, scene)
     true, detected, errors = match_stalks(targets, scene.plot)
     poses = scene.drive.poses
     errors_of_stitches = [
@@ -140,7 +140,7 @@ def score_scene(scene: Scene, mask: Mask | None = None, variant: Variant = DEFAU
     return score, perception
 
 
-def in_world(perception: Perception, scene: Scene) -> np.ndarray:
+def points_in_plot(perception: Perception, scene: Scene) -> np.ndarray:
     """Return grasp points [B, 3] in the plot's frame, m, by the true pose at the last pair and the nominal mount."""
     points = np.array([point.point for point in perception.points]).reshape(-1, 3)
     return scene.drive.poses[-1].to_world(scene.mount.pose.to_camera(points))
@@ -219,7 +219,7 @@ def _mean_outline_distance(painted: np.ndarray, true: np.ndarray) -> float:
     return 0.5 * float(far[0][outlines[1] > 0].mean() + far[1][outlines[0] > 0].mean())
 
 
-def summary(scores: Iterable[RunScore]) -> dict[str, Any]:
+def summarise_scores(scores: Iterable[RunScore]) -> dict[str, Any]:
     """Summarise the scores of runs.
 
     Returns:

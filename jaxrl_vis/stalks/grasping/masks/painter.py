@@ -14,7 +14,7 @@ from jaxrl_vis.config import fields
 from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.weights_file import check_range, read_parameters, write_parameters
 from jaxrl_vis.stalks.grasping.masks.mask_networks import Generator
-from jaxrl_vis.stalks.grasping.perception.cloud import RED, redness
+from jaxrl_vis.stalks.grasping.perception.cloud import MASK_THRESHOLD, redness
 
 Loss = Literal["gan", "segmentation"]
 SHIPPED = Path(__file__).with_name("stalks_segmentation.safetensors")
@@ -100,7 +100,7 @@ class Painter:
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the mask [H, W] bool of the stalks of the near row in an image [H, W, 3] uint8."""
         result = self._run(image)
-        return redness(result) > RED if self.settings.loss == "gan" else result
+        return redness(result) > MASK_THRESHOLD if self.settings.loss == "gan" else result
 
     def _run(self, image: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]

@@ -9,11 +9,11 @@ import math
 import jax
 import jax.numpy as jnp
 
-_AS_IT_IS = 0.2  # fraction of crops that are only mirrored
+_UNCHANGED_FRACTION = 0.2  # fraction of crops that are only mirrored
 _TAPS = 4  # radius of the blur's kernel, pixels
 
 
-def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def augment(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Augment crops in exposure, contrast, colour, texture, blur, noise, scale and lean, and mirror half of them.
 
     The strength is sampled per crop; for a fifth of them, it is 0, except for mirroring and a negligible blur.
@@ -29,12 +29,12 @@ def vary(images: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array
     keys = dict(zip(("strength", "kept", "place", "texture", "colour", "light", "blur", "noise"), jax.random.split(key, 8)))
     count = len(images)
     strength = jax.random.uniform(keys["strength"], (count,), minval=0.3)
-    strength = jnp.where(jax.random.bernoulli(keys["kept"], _AS_IT_IS, (count,)), 0.0, strength)
+    strength = jnp.where(jax.random.bernoulli(keys["kept"], _UNCHANGED_FRACTION, (count,)), 0.0, strength)
     values, masks = _transform(images.astype(jnp.float32) / 255.0, masks, strength, keys["place"])
     strengths = strength[:, None, None, None]
     values = values * _textures(values.shape, strengths, keys["texture"])
     values = _shift_colours(values, strengths, keys["colour"])
-    values = _lit(values, strengths, keys["light"])
+    values = _shade(values, strengths, keys["light"])
     values = _blur(values, strength, keys["blur"])
     level, shot = jax.random.split(keys["noise"])
     amount = 0.06 * strengths * jax.random.uniform(level, strengths.shape)
@@ -72,7 +72,7 @@ def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: ja
     return jax.vmap(one)(values, masks, size, wide, shear, mirror)
 
 
-def _field(key: jax.Array, shape: tuple[int, ...], lines: int, columns: int, channels: int = 1) -> jax.Array:
+def _smooth_noise(key: jax.Array, shape: tuple[int, ...], lines: int, columns: int, channels: int = 1) -> jax.Array:
     """Sample smooth noise [N, H, W, channels]: normal values on a coarse grid of at least 2 x 2, upsampled linearly."""
     coarse = jax.random.normal(key, (shape[0], max(lines, 2), max(columns, 2), channels))
     return jax.image.resize(coarse, (*shape[:3], channels), "linear")
@@ -84,11 +84,11 @@ def _textures(shape: tuple[int, ...], strength: jax.Array, key: jax.Array) -> ja
     names = ("blotches", "patches", "fibres", "bands", "speckles", "amounts")
     keys = dict(zip(names, jax.random.split(key, 6)))
     amount = strength * jax.random.uniform(keys["amounts"], (5, shape[0], 1, 1, 1))
-    grain = 0.5 * amount[0] * _field(keys["blotches"], shape, height // 24, width // 24)
-    grain += 0.5 * amount[1] * _field(keys["patches"], shape, height // 6, width // 6)
-    grain += 0.6 * amount[2] * _field(keys["fibres"], shape, height // 96, width // 2)
-    grain += 0.6 * amount[3] * _field(keys["bands"], shape, height // 6, width // 48)
-    spots = _field(keys["speckles"], shape, height // 4, width // 3) > 2.2 - 1.4 * amount[4]
+    grain = 0.5 * amount[0] * _smooth_noise(keys["blotches"], shape, height // 24, width // 24)
+    grain += 0.5 * amount[1] * _smooth_noise(keys["patches"], shape, height // 6, width // 6)
+    grain += 0.6 * amount[2] * _smooth_noise(keys["fibres"], shape, height // 96, width // 2)
+    grain += 0.6 * amount[3] * _smooth_noise(keys["bands"], shape, height // 6, width // 48)
+    spots = _smooth_noise(keys["speckles"], shape, height // 4, width // 3) > 2.2 - 1.4 * amount[4]
     return jnp.exp(grain) * jnp.where(spots, 1.0 - 0.8 * amount[4], 1.0)
 
 
@@ -104,10 +104,10 @@ def _shift_colours(values: jax.Array, strength: jax.Array, key: jax.Array) -> ja
     colour = jnp.cos(angle) * colour + jnp.sin(angle) * across
     saturation = jnp.exp(strength * jax.random.uniform(keys["grey"], (count, 1, 1, 1), minval=-1.5, maxval=0.5))
     cast = 0.2 * strength * jax.random.normal(keys["cast"], (count, 1, 1, 3))
-    return (grey + saturation * colour) * jnp.exp(cast + 0.15 * strength * _field(keys["parts"], values.shape, 6, 6, 3))
+    return (grey + saturation * colour) * jnp.exp(cast + 0.15 * strength * _smooth_noise(keys["parts"], values.shape, 6, 6, 3))
 
 
-def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
+def _shade(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
     """Vary gain, gamma, contrast and black level, and apply an illumination gradient towards a side or corner."""
     count = len(values)
     gain, gamma, contrast, black, amount, ramp = jax.random.split(key, 6)
@@ -118,7 +118,7 @@ def _lit(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
     values = jnp.maximum(values, 1e-4) ** jnp.exp(sample_uniform(gamma, -0.5, 0.5))
     middle = values.mean(axis=(1, 2, 3), keepdims=True)
     values = middle + (values - middle) * jnp.exp(sample_uniform(contrast, -0.5, 0.4))
-    ramp = sample_uniform(amount, 0.0, 0.6) * _field(ramp, values.shape, 2, 2)
+    ramp = sample_uniform(amount, 0.0, 0.6) * _smooth_noise(ramp, values.shape, 2, 2)
     return values * jnp.exp(sample_uniform(gain, -1.1, 0.8) + ramp) + sample_uniform(black, 0.0, 0.08)
 
 

@@ -65,7 +65,7 @@ def slice_at(points: np.ndarray, low: float) -> Slice:
     return Slice(low, corner, heat, regions, np.array(middles).reshape(-1, 3))
 
 
-def slice_points(points: np.ndarray) -> list[GraspPoint]:
+def detect_by_slice(points: np.ndarray) -> list[GraspPoint]:
     """Detect grasp points in the slice around the preferred height, in ascending order of x.
 
     Directions are vertical; thickness and spread are NaN, and the number of pairs is 0.

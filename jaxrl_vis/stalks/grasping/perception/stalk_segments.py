@@ -20,8 +20,8 @@ STEP = 3
 _JUMP = 0.02  # m: adjacent pixels whose depths differ by more are on different stalks
 _MIN_PIXELS = 3  # minimum length of a chord
 _BEHIND_FRONT = 0.9  # distance of the centre behind the matched front, relative to the radius
-_THICK = 0.035  # m: chords at least this long are not stalks
-_SIDEWAYS = 3.0  # pixels: maximum shift of a stalk from one processed row to the next
+_MAX_THICKNESS = 0.035  # m: chords at least this long are not stalks
+_MAX_SHIFT = 3.0  # pixels: maximum shift of a stalk from one processed row to the next
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +44,9 @@ class StalkSegments:
         return len(self.thickness)
 
 
-def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> StalkSegments:
+def extract_stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: int) -> StalkSegments:
     """Return the chords of every `STEP`-th row of one pair, in its own robot frame; ``frame`` is the index of the pair."""
-    red, depth = cloud.red[::STEP], cloud.depth[::STEP]
+    red, depth = cloud.mask[::STEP], cloud.depth[::STEP]
     with np.errstate(invalid="ignore"):
         jump = np.abs(np.diff(depth, axis=1)) > _JUMP
     begins = red.copy()
@@ -54,17 +54,17 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
     line, column = np.nonzero(red)
     first = np.flatnonzero(begins[line, column])
     if not first.size:
-        return _nothing()
+        return _empty_segments()
     last = np.append(first[1:], len(line)) - 1
     length = column[last] - column[first] + 1.0
     far = _middle_depth(depth[line, column], first, last)
     thickness = length * far / calibration.focal
-    good = (length >= _MIN_PIXELS) & np.isfinite(far) & (thickness < _THICK)
+    good = (length >= _MIN_PIXELS) & np.isfinite(far) & (thickness < _MAX_THICKNESS)
     line, far, thickness = line[first][good], far[good], thickness[good]
     across = (0.5 * (column[first] + column[last]))[good]
     if not len(line):
-        return _nothing()
-    piece = _pieces(line, across, far)
+        return _empty_segments()
+    piece = _split_runs(line, across, far)
     rays = np.stack(
         [
             (across - calibration.centre[0]) / calibration.focal,
@@ -80,7 +80,7 @@ def stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount, frame: 
 def join_segments(parts: list[StalkSegments]) -> StalkSegments:
     """Concatenate the chords of several pairs, all in one robot frame; pieces are renumbered to stay distinct."""
     if not parts:
-        return _nothing()
+        return _empty_segments()
     counts = np.cumsum([0, *(int(part.piece.max(initial=-1)) + 1 for part in parts)])
     return StalkSegments(
         np.concatenate([part.middle for part in parts]),
@@ -90,7 +90,7 @@ def join_segments(parts: list[StalkSegments]) -> StalkSegments:
     )
 
 
-def _nothing() -> StalkSegments:
+def _empty_segments() -> StalkSegments:
     return StalkSegments(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int), np.zeros(0, int))
 
 
@@ -113,7 +113,7 @@ def _middle_depth(depth: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.
     return np.where(2 * valid >= end - begin, middle, np.nan).astype(np.float64)
 
 
-def _pieces(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def _split_runs(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Return the number [N] of the piece of each chord: connected components over neighbouring rows.
 
     Args:
@@ -128,7 +128,7 @@ def _pieces(line: np.ndarray, positions: np.ndarray, depth: np.ndarray) -> np.nd
         upper, lower = np.arange(ends[here], ends[here + 1]), np.arange(ends[here + 1], ends[here + 2])
         if not (upper.size and lower.size):
             continue
-        near = np.abs(positions[upper, None] - positions[None, lower]) < _SIDEWAYS
+        near = np.abs(positions[upper, None] - positions[None, lower]) < _MAX_SHIFT
         near &= np.abs(depth[upper, None] - depth[None, lower]) < _JUMP
         rows, columns = np.nonzero(near)
         one.append(upper[rows])

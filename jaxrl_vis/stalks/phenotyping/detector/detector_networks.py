@@ -87,8 +87,8 @@ class Detector(nn.Module):
         coarse = x
         for block in self.coarsest:
             x = block(x)
-        up = _twice(self.lateral[0](x)) + self.lateral[1](coarse)
-        return self.merge(middle + _twice(up))
+        up = _upsample(self.lateral[0](x)) + self.lateral[1](coarse)
+        return self.merge(middle + _upsample(up))
 
     def propose(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return objectness logits [N, K] and box offsets [N, K, 6] of all anchors, in row-major order."""
@@ -143,6 +143,6 @@ class Segmenter(nn.Module):
         return nn.Conv(1, (3, 3), dtype=jnp.float32, bias_init=nn.initializers.constant(-1.0))(x)[..., 0]
 
 
-def _twice(x: jax.Array) -> jax.Array:
+def _upsample(x: jax.Array) -> jax.Array:
     """Upsample by a factor of 2, by repeating each row and column."""
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)

@@ -75,7 +75,7 @@ def find_ground(
         left, right = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (left, right))
     bounds = tuple(float(calibration.disparity(np.array(depth))) * scale for depth in reversed(depths))
     if disparity is None:
-        places, values = _windows(left, right, (bounds[0], bounds[1]))
+        places, values = _match_windows(left, right, (bounds[0], bounds[1]))
     else:
         places, values = _samples(disparity, scale)
     if len(values) < _MIN_WINDOWS:
@@ -87,7 +87,7 @@ def find_ground(
     unit = 1.0 / (focal * calibration.baseline)
     rays = np.concatenate([(places - centre) / focal, np.ones((len(places), 1))], axis=1)
     inverse = (values - calibration.offset * scale) * unit
-    fitted = _plane(rays, inverse, _TOLERANCE * unit)
+    fitted = _fit_plane(rays, inverse, _TOLERANCE * unit)
     if fitted is None:
         return None
     residual = inverse - rays @ fitted
@@ -100,7 +100,7 @@ def find_ground(
     return Ground((float(fitted[0]), float(fitted[1]), float(fitted[2])))
 
 
-def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def _match_windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Match windows in the right image; return the centres (x, y) [N, 2] and disparities [N] of those with a clear match."""
     tall, wide = _WINDOW
     height, width = left.shape
@@ -127,7 +127,7 @@ def _windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -
 
 
 def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sample positions [N, 2] and disparities [N], as returned by `_windows`, from disparities [H, W] in full-size pixels."""
+    """Sample positions [N, 2] and disparities [N], as in `_match_windows`, from disparities [H, W] in full-size pixels."""
     lines, columns = (np.linspace(0, size - 1, 64).astype(int) for size in disparity.shape)
     values = disparity[np.ix_(lines, columns)]
     line, column = np.nonzero(np.isfinite(values))
@@ -135,7 +135,7 @@ def _samples(disparity: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarra
     return places, values[line, column] * scale
 
 
-def _plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
+def _fit_plane(rays: np.ndarray, inverse: np.ndarray, tolerance: float) -> np.ndarray | None:
     """Fit the plausible ground plane [3] (see `Ground.normal`) with the most inliers, by RANSAC; None if there is none.
 
     Args:

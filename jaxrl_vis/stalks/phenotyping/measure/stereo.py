@@ -22,9 +22,9 @@ from jaxrl_vis.stalks.phenotyping.measure.width import index_pairs, median
 _MIN_SCORE = 0.5
 _AGREEING = 0.4
 _SCATTER = 1.0  # pixels: maximum scatter of the disparities of one stalk
-_FIRST = 6  # windows of a stalk that are searched over all disparities
+_COARSE_WINDOWS = 6  # windows of a stalk that are searched over all disparities
 _BESIDE = 12  # pixels: search range of the other windows around the disparity expected from the first ones
-_UNIQUE = 0.97  # maximum ratio of the second to the first peak; above, a window is ambiguous
+_MAX_PEAK_RATIO = 0.97  # maximum ratio of the second to the first peak; above, a window is ambiguous
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,7 @@ class StalkDisparity:
         return mean, scatter / math.sqrt(count)
 
 
-def grey(image: np.ndarray) -> np.ndarray:
+def to_greyscale(image: np.ndarray) -> np.ndarray:
     """Convert an image [H, W] or [H, W, 3] of any dtype to greyscale [H, W] float32."""
     return (
         image.astype(np.float32) if image.ndim == 2 else image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
@@ -115,9 +115,9 @@ def match_rows(
     ]
     wanted = [strip for strip in wanted if strip.inside(left.shape, half_height, spread)]
     # A few windows are searched over all disparities. If these agree, the others are searched near the expected disparity.
-    first = sorted(set(np.linspace(0, len(wanted) - 1, min(_FIRST, len(wanted))).round().astype(int)))
+    first = sorted(set(np.linspace(0, len(wanted) - 1, min(_COARSE_WINDOWS, len(wanted))).round().astype(int)))
     limits = int(np.floor(bounds[0])), int(np.ceil(bounds[1]))
-    matches = {place: _match(left, right, wanted[place], limits, half_height, spread) for place in first}
+    matches = {place: _match_window(left, right, wanted[place], limits, half_height, spread) for place in first}
     expected = _robust_line([(wanted[place].line, result[0]) for place, result in matches.items() if result is not None])
     for place, window in enumerate(wanted):
         if place in matches:
@@ -126,7 +126,7 @@ def match_rows(
         if expected is not None:
             middle = expected[0] + expected[1] * window.line
             within = max(math.floor(middle) - _BESIDE, limits[0]), min(math.ceil(middle) + _BESIDE, limits[1])
-        matches[place] = _match(left, right, window, within, half_height, spread) if within[0] < within[1] else None
+        matches[place] = _match_window(left, right, window, within, half_height, spread) if within[0] < within[1] else None
     values = [(float(wanted[place].line), *result) for place, result in sorted(matches.items()) if result is not None]
     matched = np.array(values, float).reshape(-1, 3)
     return StalkDisparity(matched[:, 0], matched[:, 1], matched[:, 2], len(lines))
@@ -147,7 +147,7 @@ class _Window:
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
 
 
-def _match(
+def _match_window(
     left: np.ndarray, right: np.ndarray, window: _Window, bounds: tuple[int, int], half_height: int, spread: int
 ) -> tuple[float, float] | None:
     """Return the disparity and correlation of a window; None if there is no match within the bounds, or an ambiguous one."""
@@ -157,7 +157,7 @@ def _match(
         return None
     piece = np.ascontiguousarray(left[top:bottom, window.first : window.last])
     searched = np.ascontiguousarray(right[top - spread : bottom + spread, begin:end])
-    best = _peak(cv2.matchTemplate(searched, piece, cv2.TM_CCOEFF_NORMED))
+    best = _subpixel_peak(cv2.matchTemplate(searched, piece, cv2.TM_CCOEFF_NORMED))
     return None if best is None else (window.first - (begin + best[0]), best[1])
 
 
@@ -208,7 +208,7 @@ def sample_rows(
     return StalkDisparity(columns[:, 0], columns[:, 1], np.ones(len(columns)), len(lines))
 
 
-def _peak(score: np.ndarray) -> tuple[float, float] | None:
+def _subpixel_peak(score: np.ndarray) -> tuple[float, float] | None:
     """Return the subpixel column and the height of the unique peak of a correlation; None if there is none."""
     row, column = divmod(int(score.argmax()), score.shape[1])
     height = float(score[row, column])
@@ -216,7 +216,7 @@ def _peak(score: np.ndarray) -> tuple[float, float] | None:
         return None
     best = score.max(axis=0)
     elsewhere = max(best[: max(column - 4, 0)].max(initial=-1.0), best[column + 5 :].max(initial=-1.0))
-    if elsewhere > _UNIQUE * height:
+    if elsewhere > _MAX_PEAK_RATIO * height:
         return None
     before, after = float(score[row, column - 1]), float(score[row, column + 1])
     bend = before - 2.0 * height + after

@@ -29,10 +29,10 @@ class Gates:
         depth: Maximum difference of their depths.
         merge: Maximum distance along the row between two tracks of one stalk, which are merged.
         behind: The same for tracks of different depth, with the rays of one evaluated at the depth of the other.
-        astray: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
+        max_shared: Maximum fraction of the pairs of the shorter track in which both are seen, to merge them.
         row: Maximum difference between the depth of a counted stalk and the median depth.
-        fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
-        minimum: Minimum number of pairs that must show it, unless fewer have it in view.
+        min_fraction: Minimum fraction of the pairs with the stalk in view that must show it to count it.
+        min_pairs: Minimum number of pairs that must show it, unless fewer have it in view.
         ends: Maximum distance of a counted stalk's foot beyond the ends of the path.
     """
 
@@ -40,10 +40,10 @@ class Gates:
     depth: float = 0.05
     merge: float = 0.015
     behind: float = 0.005
-    astray: float = 0.34
+    max_shared: float = 0.34
     row: float = 0.2
-    fraction: float = 0.3
-    minimum: int = 2
+    min_fraction: float = 0.3
+    min_pairs: int = 2
     ends: float = 0.01
 
 
@@ -67,22 +67,22 @@ class Track:
 
 
 @dataclasses.dataclass(frozen=True)
-class Path:
+class RobotPath:
     """Path of the robot.
 
     Attributes:
-        places: [F] float64, position of each pair along the row, m: odometry corrected by stereo.
+        positions: [F] float64, position of each pair along the row, m: odometry corrected by stereo.
         length: Length of the row that was passed, m, including half a step at each end.
-        seen: Fraction of that length in view of any pair.
+        seen_fraction: Fraction of that length in view of any pair.
     """
 
-    places: np.ndarray
+    positions: np.ndarray
     length: float
-    seen: float = 1.0
+    seen_fraction: float = 1.0
 
 
 @dataclasses.dataclass
-class _Open:
+class _OpenTrack:
     """Track under construction; its lists have one entry per sighting."""
 
     sightings: list[tuple[int, int]] = dataclasses.field(default_factory=list)
@@ -95,7 +95,7 @@ class _Open:
         """Return the finite depths of the sightings, m."""
         return np.array(self.depth)[np.isfinite(self.depth)]
 
-    def at(self, depth: float) -> float:
+    def position_at(self, depth: float) -> float:
         """Return the position along the row, m, assuming a depth in m."""
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
@@ -105,13 +105,13 @@ class _Open:
         return float(np.median(self.along[-9:])), float(np.median(depths)) if depths else math.nan
 
 
-def follow(
+def track_stalks(
     frames: list[list[Sighting]],
     distances: np.ndarray,
     calibration: Calibration,
     gates: Gates = Gates(),
     columns: tuple[float, float] | None = None,
-) -> tuple[list[Track], Path]:
+) -> tuple[list[Track], RobotPath]:
     """Track the stalks of a plot.
 
     Args:
@@ -124,7 +124,7 @@ def follow(
     Returns:
         Tracks in the order in which the robot passed them, including those not counted, and the robot's path.
     """
-    tracks: list[_Open] = []
+    tracks: list[_OpenTrack] = []
     places = np.zeros(len(frames))
     correction = 0.0
     driven = np.asarray(distances, float) - (distances[0] if len(distances) else 0.0)
@@ -140,13 +140,13 @@ def follow(
             places[frame] = driven[frame] + correction
             pairs = _assign(tracks, view, places[frame], gates)
         taken = {new: track for track, new in pairs}
-        for new in map(int, np.flatnonzero(view.there)):
+        for new in map(int, np.flatnonzero(view.is_candidate)):
             depth = float(view.depth[new]) if view.known[new] else math.nan
             if new in taken:
                 track = tracks[taken[new]]
                 along = view.along[new] if view.known[new] else view.along_at(track.place()[1])[new]
             else:
-                track, along = _Open(), view.along[new]
+                track, along = _OpenTrack(), view.along[new]
                 tracks.append(track)
             track.sightings.append((frame, new))
             track.along.append(float(along + places[frame]))
@@ -158,16 +158,16 @@ def follow(
         (column - 0.5 - calibration.centre[0]) / calibration.focal for column in columns or (0.0, float(calibration.width))
     )
     length = abs(float(places[-1] - places[0]) + step) if len(places) else 0.0
-    path = Path(places, length, _seen(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
+    path = RobotPath(places, length, _seen_fraction(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
     closed = [_finish_track(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
-def _seen(places: np.ndarray, step: float, field: list[float]) -> float:
+def _seen_fraction(places: np.ndarray, step: float, field: list[float]) -> float:
     """Return the fraction of the row beside the path that is in view of any pair.
 
     Args:
-        places: Position [F] float64 of each pair along the row, m.
+        positions: Position [F] float64 of each pair along the row, m.
         step: Distance between two pairs, m.
         field: Ends of the field of view along the row, relative to the position of the pair, m.
     """
@@ -187,7 +187,7 @@ class _PairView:
         along: Position along the row relative to the midpoint of the cameras, m; at the usual depth if not measured.
         depth: Depth of the front surface, m; NaN if not measured.
         known: True if position and depth were measured.
-        there: True if the sighting may be a stalk of the row.
+        is_candidate: True if the sighting may be a stalk of the row.
         over: Distance along the row from the stalk's foot to the place of its measurement, m; 0 if its height is unknown.
         half: Half the baseline (scalar), m.
         usual: Median depth over all pairs (scalar), m.
@@ -197,7 +197,7 @@ class _PairView:
     along: np.ndarray
     depth: np.ndarray
     known: np.ndarray
-    there: np.ndarray
+    is_candidate: np.ndarray
     over: np.ndarray
     half: float
     usual: float
@@ -248,7 +248,7 @@ def _are_distinct(sightings: list[Sighting]) -> np.ndarray:
     return own
 
 
-def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) -> list[tuple[int, int]]:
+def _assign(tracks: list[_OpenTrack], view: _PairView, place: float, gates: Gates) -> list[tuple[int, int]]:
     """Assign sightings to tracks by minimum cost; return pairs (track, sighting) of indices, each used at most once."""
     if not tracks or not view.rays.size:
         return []
@@ -257,25 +257,25 @@ def _assign(tracks: list[_Open], view: _PairView, place: float, gates: Gates) ->
     along = np.where(view.known, view.along, [view.along_at(depth) for _, depth in there]) + place
     aside = np.abs(there[:, :1] - along) / gates.along
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
-    cost = np.where((aside < 1.0) & (away < 1.0) & view.there, aside + 0.5 * away, _FORBIDDEN_COST)
+    cost = np.where((aside < 1.0) & (away < 1.0) & view.is_candidate, aside + 0.5 * away, _FORBIDDEN_COST)
     rows, columns = linear_sum_assignment(cost)
     return [(int(row), int(column)) for row, column in zip(rows, columns) if cost[row, column] < _FORBIDDEN_COST]
 
 
-def _merge_tracks(tracks: list[_Open], gates: Gates) -> list[_Open]:
+def _merge_tracks(tracks: list[_OpenTrack], gates: Gates) -> list[_OpenTrack]:
     """Merge tracks of one stalk into the longer one, which is modified in place: same position, and hardly ever seen together.
 
     Tracks are also merged if they always lie on the same rays and one of the depths is wrong: of two stalks one behind the
     other, the cameras would see both as they move on.
     """
-    merged: list[_Open] = []
+    merged: list[_OpenTrack] = []
     for track in sorted(tracks, key=lambda track: -len(track.sightings)):
         for other in merged:
             aside, away = _track_distance(track, other)
             shared = {frame for frame, _ in track.sightings} & {frame for frame, _ in other.sightings}
             # A wrongly assigned sighting may make both appear in one pair.
             near = aside < gates.merge and away < gates.depth
-            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.astray * len(track.sightings):
+            if (near or _one_behind(track, other) < gates.behind) and len(shared) <= gates.max_shared * len(track.sightings):
                 other.sightings += track.sightings
                 other.along += track.along
                 other.depth += track.depth
@@ -287,7 +287,7 @@ def _merge_tracks(tracks: list[_Open], gates: Gates) -> list[_Open]:
     return merged
 
 
-def _one_behind(track: _Open, other: _Open) -> float:
+def _one_behind(track: _OpenTrack, other: _OpenTrack) -> float:
     """Return the distance along the row, m, between two tracks if ``track`` is placed at the depth of ``other``."""
     depths = other.depths()
     if len(track.sightings) < 2 or not len(depths):
@@ -297,7 +297,7 @@ def _one_behind(track: _Open, other: _Open) -> float:
     return float(np.median(np.abs(positions)))
 
 
-def _track_distance(track: _Open, other: _Open) -> tuple[float, float]:
+def _track_distance(track: _OpenTrack, other: _OpenTrack) -> tuple[float, float]:
     """Return the distances of two tracks along the row and in depth, m; if only one has a depth, it is assumed for both."""
     depths = track.depths(), other.depths()
     if all(map(len, depths)) or not any(map(len, depths)):
@@ -305,20 +305,22 @@ def _track_distance(track: _Open, other: _Open) -> tuple[float, float]:
         return aside, abs(float(np.median(depths[0]) - np.median(depths[1]))) if len(depths[0]) else 0.0
     # One has no depth: assume that of the other.
     depth = float(np.median(np.concatenate(depths)))
-    return abs(track.at(depth) - other.at(depth)), 0.0
+    return abs(track.position_at(depth) - other.position_at(depth)), 0.0
 
 
-def _finish_track(track: _Open, path: Path, step: float, field: tuple[float, ...], usual: float, gates: Gates) -> Track:
+def _finish_track(
+    track: _OpenTrack, path: RobotPath, step: float, field: tuple[float, ...], usual: float, gates: Gates
+) -> Track:
     position = float(np.median(track.along))
     depths = track.depths()
     depth = float(np.median(depths)) if depths.size else math.nan
     # Expected number of sightings: pairs with the stalk well inside the field of view.
     middle, half = (0.5 * (field[1] + sign * field[0]) * (depth if math.isfinite(depth) else usual) for sign in (1.0, -1.0))
-    expected = int((np.abs(path.places + middle - position) < 0.9 * half).sum())
+    expected = int((np.abs(path.positions + middle - position) < 0.9 * half).sum())
     known = math.isfinite(depth)
     # A stalk without a measured depth must be seen twice as often.
-    wanted = max(min(gates.minimum, expected), math.ceil((1.0 if known else 2.0) * gates.fraction * expected), 1)
-    begin, end = sorted((path.places[0] - 0.5 * step, path.places[-1] + 0.5 * step))
+    wanted = max(min(gates.min_pairs, expected), math.ceil((1.0 if known else 2.0) * gates.min_fraction * expected), 1)
+    begin, end = sorted((path.positions[0] - 0.5 * step, path.positions[-1] + 0.5 * step))
     if len(track.sightings) < wanted:
         reason = f"seen in {len(track.sightings)} of {expected} pairs"
     elif known and abs(depth - usual) > gates.row:

@@ -13,8 +13,8 @@ from jaxrl_vis.config import fields
 from jaxrl_vis.stalks.phenotyping.detector.finder import Detection
 from jaxrl_vis.stalks.phenotyping.measure.borders import Frame, find_frame
 from jaxrl_vis.stalks.phenotyping.measure.ground import Ground, find_ground
-from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure
-from jaxrl_vis.stalks.phenotyping.measure.width import strip_width
+from jaxrl_vis.stalks.phenotyping.measure.stalk import Measurement, Method, measure_stalk
+from jaxrl_vis.stalks.phenotyping.measure.width import fit_strip
 from jaxrl_vis_envs.plants import Calibration
 from jaxrl_vis_envs.plants.truth import HEIGHTS
 
@@ -27,7 +27,7 @@ _OTHER_DISTANCES = (0.55, 1.15)  # m: distances that are tried if no row is foun
 _SAME_DISTANCE = 0.12  # relative: tolerance of the networks to the size of stalks
 _AT_DISTANCE = 3  # minimum number of stalks to estimate the distance of the row
 _FAR_FROM_ROW = 0.2  # m: distance from the row beyond which a match is suspicious
-_OCCLUDED = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
+_OCCLUSION_FACTOR = 0.1  # factor of the confidence of a sighting with an edge that may be occluded
 _BEHIND = 0.003  # m: a stalk further behind occludes nothing
 _TOUCHING = 0.1  # of half a stalk's width: distance within which edges touch
 _SAME_DEPTH = 0.06  # m: change of depth over 12 inches of a stalk that leans by 10 degrees
@@ -129,7 +129,7 @@ def grey_at(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def find_with_ground(
+def detect_with_ground(
     find: Find,
     left: np.ndarray,
     right: np.ndarray,
@@ -196,7 +196,7 @@ def view_pair(
     Returns:
         Detections and measurements at the distance that stereo confirms, or else at the usual one.
     """
-    detections, ground = find_with_ground(find, left, right, calibration, disparity)
+    detections, ground = detect_with_ground(find, left, right, calibration, disparity)
     frame = find_frame(left)
     sightings = measure_pair(detections, left, right, calibration, method, ground, disparity)
     usual = PairView(detections, sightings, ground, frame)
@@ -250,21 +250,25 @@ def measure_pair(
         line = 0.5 * (detection.box[1] + detection.box[3])
         images = (grey_left, grey_right, calibration)
         how = {"method": method, "ground": ground, "disparity": disparity}
-        measurement = measure(
+        measurement = measure_stalk(
             detection.mask, detection.corner, *images, line=line, height=HEIGHTS[0], strip=detection.strip, **how
         )
         upper = None
         if ground is not None and detection.upper is not None:
-            upper = measure(*detection.upper, *images, height=HEIGHTS[1], **how)
+            upper = measure_stalk(*detection.upper, *images, height=HEIGHTS[1], **how)
         measured.append((measurement, upper))
     measured = _without_mismatches(measured, calibration, find_frame(grey_right).columns[0])
     occluded = _occluded_edges([measurement for measurement, _ in measured])
     above = _occluded_edges([upper or Measurement() for _, upper in measured])
-    occluded = [behind or not measurement.here for behind, (measurement, _) in zip(occluded, measured)]
+    occluded = [behind or not measurement.both_edges_visible for behind, (measurement, _) in zip(occluded, measured)]
     sightings = []
     for detection, (measurement, upper), *behind in zip(detections, measured, occluded, above):
-        less = dataclasses.replace(measurement, confidence=measurement.confidence * _OCCLUDED) if behind[0] else measurement
-        sighting = _sighting(detection, less, upper, calibration)
+        less = (
+            dataclasses.replace(measurement, confidence=measurement.confidence * _OCCLUSION_FACTOR)
+            if behind[0]
+            else measurement
+        )
+        sighting = _make_sighting(detection, less, upper, calibration)
         sightings.append(dataclasses.replace(sighting, occluded=behind[0], upper_occluded=behind[1]))
     return sightings
 
@@ -323,7 +327,7 @@ def _occluded_edges(measurements: list[Measurement]) -> list[bool]:
 
 
 def _unscaled_sighting(detection: Detection) -> Sighting:
-    strip = detection.strip or strip_width(detection.mask)
+    strip = detection.strip or fit_strip(detection.mask)
     line = 0.5 * (detection.box[1] + detection.box[3])
     column = 0.5 * sum(detection.axis)
     if strip is None:
@@ -342,7 +346,9 @@ def _unscaled_sighting(detection: Detection) -> Sighting:
     )
 
 
-def _sighting(detection: Detection, measurement: Measurement, upper: Measurement | None, calibration: Calibration) -> Sighting:
+def _make_sighting(
+    detection: Detection, measurement: Measurement, upper: Measurement | None, calibration: Calibration
+) -> Sighting:
     """Build a sighting from measurements, rounded so that it is unchanged by a round trip through JSON."""
     line = measurement.line if math.isfinite(measurement.line) else 0.5 * (detection.box[1] + detection.box[3])
     column = measurement.column if math.isfinite(measurement.column) else 0.5 * sum(detection.axis)

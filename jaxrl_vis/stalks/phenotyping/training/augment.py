@@ -49,7 +49,7 @@ def _blur(values: jax.Array, deviation: jax.Array) -> jax.Array:
     return values
 
 
-def move(
+def augment_geometry(
     images: jax.Array, stalks: jax.Array, kinds: jax.Array, sizes: jax.Array, key: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mirror, shear, stretch and shift images and their stalks at random; a quarter of them may only be mirrored.
@@ -57,7 +57,7 @@ def move(
     Args:
         images: [N, H, W, 3] uint8, padded at the bottom and on the right.
         stalks: [N, T, 6], boxes and axes.
-        kinds: [N, T] int32, see `losses.assign`.
+        kinds: [N, T] int32, see `losses.assign_boxes`.
         sizes: [N, 2] int32, height and width of the images without padding.
         key: Typed key, [].
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect
 from jaxrl_vis.stalks.phenotyping.detector.finder import segment
 from jaxrl_vis.stalks.phenotyping.detector.losses import STALK, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, overlaps_with
-from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, iou_with_boxes
+from jaxrl_vis.stalks.phenotyping.training.detector_training import batch_images
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
 _CROPS = 8  # stalk crops per batch
@@ -62,7 +62,9 @@ class Score:
     soft: float
 
 
-def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any) -> list[Finds]:
+def detect_in_examples(
+    params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any
+) -> list[Finds]:
     """Detect stalks in the images of examples and match them with the true ones.
 
     Args:
@@ -77,7 +79,7 @@ def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], se
     """
     finds = []
     for example in examples:
-        image = image_batch([example], shape)[0][0]
+        image = batch_images([example], shape)[0][0]
         there = jax.device_get(detect(params, image, settings, dtype))
         stalks, scores = there.stalks[there.valid], there.scores[there.valid]
         matched = match_finds(stalks, scores, example.stalks, example.kinds)
@@ -100,10 +102,10 @@ def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds
     clear, unclear = truth[kinds == STALK], truth[kinds == UNCLEAR]
     right, free = np.zeros(len(stalks), bool), np.ones(len(clear), bool)
     for place in np.argsort(-scores, kind="stable"):
-        fitting = np.where(free, overlaps_with(stalks[place, :4], clear[:, :4]), 0.0)
+        fitting = np.where(free, iou_with_boxes(stalks[place, :4], clear[:, :4]), 0.0)
         if fitting.size and fitting.max() >= IOU:
             right[place], free[int(fitting.argmax())] = True, False
-    on_unclear = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
+    on_unclear = np.array([bool((iou_with_boxes(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
     return right, on_unclear & ~right
 
 
@@ -128,7 +130,7 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
     return float(np.mean(overlaps)) if overlaps else float("nan")
 
 
-def score(finds: Sequence[Finds]) -> Score:
+def score_finds(finds: Sequence[Finds]) -> Score:
     """Compute the metrics of the detections in several images, pooled; ignored detections are left out."""
     labels = sum(image.labels for image in finds)
     scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])

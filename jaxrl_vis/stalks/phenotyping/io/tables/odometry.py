@@ -17,7 +17,7 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.host.spreadsheets import unescape_cell
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.names import readable
-from jaxrl_vis.stalks.phenotyping.io.naming.stamps import seconds_in
+from jaxrl_vis.stalks.phenotyping.io.naming.stamps import parse_timestamp
 from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
 
 _MAX_ODOMETRY = 8_000_000  # bytes
@@ -164,7 +164,7 @@ def _distances_by_time(plot: PlotFolder, table: _Table, values: np.ndarray) -> d
 
     Images more than the median interval before the first or after the last row are left out.
     """
-    taken = {pair.name: seconds_in(readable(pair.left.stem)) for pair in plot.pairs if pair.left}
+    taken = {pair.name: parse_timestamp(readable(pair.left.stem)) for pair in plot.pairs if pair.left}
     times = table.times
     if times is None or len(times) < 2 or (np.diff(times) < 0).any() or not taken or None in taken.values():
         return None
