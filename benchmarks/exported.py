@@ -42,7 +42,7 @@ Act = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Function from observations [N, C, H, W] uint8 and goals of the same shape to actions [N, A] float32."""
 
 
-def succeeded(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, float]]:
+def run_episodes(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, float]]:
     """Run the same episodes with each function, and return its mean ``success`` and ``goal_distance`` at the last step."""
     env = policy.env
     reset, step = jaxrl_vis_envs.jit(jax.vmap(env.reset)), jaxrl_vis_envs.jit(jax.vmap(env.step))
@@ -59,7 +59,7 @@ def succeeded(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, 
     ]
 
 
-def latency(act: Act, shape: tuple[int, ...]) -> float:
+def measure_latency(act: Act, shape: tuple[int, ...]) -> float:
     """Return the median time of a call with one observation and one goal, s; inputs vary."""
     images = np.random.default_rng(0).integers(0, 256, (CALLS + 20, 2, 1, *shape), np.uint8)
     seconds = []
@@ -81,7 +81,7 @@ def measure(name: str, episodes: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         check = export_run(name, "onnx", Path(folder) / "onnx")
         by_onnx = Model(check.file)
-        rows = succeeded(policy, [by_jax, by_onnx], episodes)
+        rows = run_episodes(policy, [by_jax, by_onnx], episodes)
         shape = policy.observation_spec.shape
         return {
             "name": name,
@@ -91,8 +91,8 @@ def measure(name: str, episodes: int) -> dict[str, Any]:
             "onnx_bytes": check.file.stat().st_size,
             **{f"jax_{key}": value for key, value in rows[0].items()},
             **{f"onnx_{key}": value for key, value in rows[1].items()},
-            "jax_latency_s": latency(by_jax, shape),
-            "onnx_latency_s": latency(by_onnx, shape),
+            "jax_latency_s": measure_latency(by_jax, shape),
+            "onnx_latency_s": measure_latency(by_onnx, shape),
         }
 
 

@@ -87,7 +87,7 @@ def start(clock: Clock, options: argparse.Namespace) -> None:
 MODES = ("cold", "warm")
 
 
-def time_modes(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
+def time_mode(mode: str, cache: str, options: argparse.Namespace) -> dict[str, tuple[float, float]]:
     """Measure one mode in a new process.
 
     Args:
@@ -113,7 +113,7 @@ def time_modes(mode: str, cache: str, options: argparse.Namespace) -> dict[str, 
     return {name: tuple(seconds) for name, seconds in json.loads(output.splitlines()[-1]).items()}
 
 
-def show(mode: str, laps: dict[str, tuple[float, float]]) -> None:
+def print_laps(mode: str, laps: dict[str, tuple[float, float]]) -> None:
     """Print the table of a process."""
     print(f"{mode:32}{'wall-clock s':>14}{'processor s':>14}")
     total = [sum(seconds) for seconds in zip(*laps.values(), strict=True)]
@@ -138,8 +138,8 @@ def main() -> None:
     laps = {}
     with tempfile.TemporaryDirectory() as cache:
         for mode in MODES:
-            laps[mode] = time_modes(mode, cache, options)
-            show(mode, laps[mode])
+            laps[mode] = time_mode(mode, cache, options)
+            print_laps(mode, laps[mode])
     if options.json:
         options.json.write_text(json.dumps(laps, indent=1) + "\n", encoding="utf-8")
 

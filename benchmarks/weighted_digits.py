@@ -98,7 +98,7 @@ def problems() -> dict[str, Problem]:
     }
 
 
-def initialize(key: jax.Array, problem: Problem) -> Any:
+def init_params(key: jax.Array, problem: Problem) -> Any:
     """Initialise the parameters: a trunk of two layers ([pixels, 64], [64, WIDTH]) and a linear head [WIDTH, classes] per task.
 
     Biases are omitted; weights are normal with variance 1 / inputs.
@@ -143,7 +143,7 @@ def make_training(problem: Problem, weighting: jw.Weighting) -> Callable[[jax.Ar
 
     def run(rate: jax.Array, seed: jax.Array) -> dict[str, jax.Array]:
         params_key, state_key, data_key = jax.random.split(jax.random.key(seed), 3)
-        params = initialize(params_key, problem)
+        params = init_params(params_key, problem)
         state = weighting.init(tuple(problem.classes), params["trunk"], *([params] if weighting.hold else []))
         state = state if state.key is None else state.replace(key=state_key)
 
@@ -184,13 +184,13 @@ def measure(problem: Problem, name: str) -> dict[str, Any]:
     }
 
 
-def methods(problem: Problem) -> Iterator[str]:
+def applicable_weightings(problem: Problem) -> Iterator[str]:
     """Yield the names of the weightings applicable to a problem, the baseline first; some require a main task."""
     for name in (BASELINE, *(name for name in jw.WEIGHTINGS if name != BASELINE)):
         weighting = jw.make_weighting(name)
         if jw.MAIN not in problem.classes:
             try:
-                weighting.init(tuple(problem.classes), initialize(jax.random.key(0), problem)["trunk"])
+                weighting.init(tuple(problem.classes), init_params(jax.random.key(0), problem)["trunk"])
             except RequestError:
                 continue
         yield name
@@ -205,7 +205,7 @@ def main() -> int:
     record: dict[str, Any] = json.loads(options.json.read_text()) if options.json.exists() else {"problems": {}}
     for title, problem in problems().items():
         rows = record["problems"].setdefault(title, [])
-        for name in methods(problem):
+        for name in applicable_weightings(problem):
             if any(row["method"] == name for row in rows) or (options.only and name not in options.only):
                 continue
             rows.append(measure(problem, name))

@@ -75,9 +75,9 @@ def read_plan(folder: Path) -> None:
 
 
 def _plan(path: Path) -> None:
-    from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
+    from jaxrl_vis.stalks.phenotyping.io.tables.cells import read_table_text, split_cells
 
-    assert cells(path, read_table_text(path, 1_000_000))[1]
+    assert split_cells(path, read_table_text(path, 1_000_000))[1]
 
 
 def read_any_annotations(folder: Path) -> None:

@@ -88,7 +88,7 @@ def show_seeds(record: Record) -> str:
     return f"{record.seeds[0]} to {record.seeds[-1]}" if len(record.seeds) > 1 else str(record.seeds[0])
 
 
-def _of_seeds(record: Record, text: Callable[[], str]) -> str:
+def _if_several_seeds(record: Record, text: Callable[[], str]) -> str:
     return text() if len(record.seeds) > 1 else ""
 
 
@@ -108,7 +108,7 @@ def steps_to(level: float, *references: Record) -> Column:
     return Column(f"steps to {level:g}", cell)
 
 
-def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = None) -> Column:
+def median_at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = None) -> Column:
     """Return the column of the median at one evaluation."""
 
     def cell(record: Record) -> str:
@@ -118,7 +118,7 @@ def at(steps: int, digits: int = 2, metric: str = SUCCESS, title: str | None = N
     return Column(title or show_steps(steps), cell)
 
 
-def of_seeds(steps: int, digits: int = 2) -> Column:
+def values_at(steps: int, digits: int = 2) -> Column:
     """Return the column of every seed's success at one evaluation."""
 
     def cell(record: Record) -> str:
@@ -191,14 +191,14 @@ def training_mean(metric: str, title: str, digits: int = 3) -> Column:
 def mean_success(budget: int | None = None) -> Column:
     """Return the column of the interquartile mean over seeds of the mean success up to a budget, with bootstrap interval."""
     title = f"mean success to {show_steps(budget)}" if budget else "mean success over training"
-    return Column(f"{title}, IQM (95 %)", lambda record: _of_seeds(record, lambda: interval(record.means(budget))))
+    return Column(f"{title}, IQM (95 %)", lambda record: _if_several_seeds(record, lambda: interval(record.means(budget))))
 
 
-def p(reference: Record, label: str, budget: int | None = None) -> Column:
+def p_value_against(reference: Record, label: str, budget: int | None = None) -> Column:
     """Return the column of the p-value of the permutation test of mean success against a reference."""
 
     def cell(record: Record) -> str:
-        return "" if record is reference else _of_seeds(record, lambda: show_p(p_value(record, reference, budget)))
+        return "" if record is reference else _if_several_seeds(record, lambda: show_p(p_value(record, reference, budget)))
 
     return Column(f"p against {label}", cell)
 

@@ -43,7 +43,7 @@ def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more
         c.final(),
         c.final_distance(),
         c.mean_success(),
-        c.p(base, label),
+        c.p_value_against(base, label),
         *more,
     ]
     return table([f"{task}, {show_steps(base.end)} steps"], _rows(task, labels), columns)

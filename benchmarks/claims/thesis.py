@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.claims import columns as c
 from benchmarks.claims import indicator, ol_aux
 from benchmarks.claims.indicator import OURS, REACHER, SAWYER
-from benchmarks.claims.markdown import made_by
+from benchmarks.claims.markdown import origin_sentence
 from benchmarks.claims.records import DISTANCE, SUCCESS, Record, study
 from jaxrl_vis.studies.ol_aux import AUX_TASKS, FETCH, FINGER, HAND
 
@@ -376,7 +376,7 @@ def _table() -> str:
     lines += [
         f"| {row.claim} | {row.answer} | {row.finding} | {row.interval} | {_seeds(row)} | {row.source} |" for row in claims()
     ]
-    made = made_by([record for row in claims() for record in row.records])
+    made = origin_sentence([record for row in claims() for record in row.records])
     return "\n".join([*lines, "", made])
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from benchmarks.ledger.records import RESULTS
-from benchmarks.ledger.tables.lab_results import short
+from benchmarks.ledger.tables.lab_results import format_short
 
 FILE = "ablations.jsonl.gz"
 UNKNOWN = "unknown"
@@ -78,6 +78,6 @@ def index_table(results: Path = RESULTS) -> str:
         command = f"`{curve.command}`" if curve.command else f"{UNKNOWN}; {curve.task}, `{curve.preset}`"
         page = "" if curve.page is None else f"[{Path(curve.page).stem}](../{curve.page.removeprefix(_PREFIX)})"
         revision = curve.revision or f"{UNKNOWN}, until {curve.stored}"
-        ending = f"{success:.2f} at {short(end)}"
+        ending = f"{success:.2f} at {format_short(end)}"
         lines.append(f"| {curve.name} | {command} | {revision} | {curve.device or UNKNOWN} | {ending} | {page} |")
     return "\n".join(lines)

@@ -39,7 +39,7 @@ class Evidence:
     rows: list[dict[str, Any]]
 
 
-def keep(run: Path, name: str, results: Path) -> tuple[Path, Path]:
+def keep_run(run: Path, name: str, results: Path) -> tuple[Path, Path]:
     """Store the evidence of a finished run.
 
     Args:

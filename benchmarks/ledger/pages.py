@@ -38,10 +38,10 @@ def renderer_parity(results: Path) -> str:
 
 def soak(results: Path) -> str | None:
     """Return the table of docs/reliability.md, summed over the records in ``soak``, as Markdown; None if there are none."""
-    from benchmarks.soak.record import Record, added
+    from benchmarks.soak.record import Record, add_records
 
     files = sorted((results / "soak").glob("*.json"))
-    return added([Record.read(file) for file in files]).table() if files else None
+    return add_records([Record.read(file) for file in files]).table() if files else None
 
 
 PAGES: dict[str, dict[str, Writer]] = {

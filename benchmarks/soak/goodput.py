@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.soak.parts import Broken, Part, killed_afterwards, read_rows
+from benchmarks.soak.parts import Broken, RunProcess, kill_on_exit, read_rows
 from jaxrl_vis.run.goodput import account, read_processes
 
 _FOREVER = 10**9  # environment steps
@@ -19,7 +19,7 @@ def _success(folder: Path) -> list[float]:
     return [row["eval/success"] for row in rows if row["iteration"] == rows[-1]["iteration"]]
 
 
-def killed_every(folder: Path, every: float, minutes: float, options: Sequence[str]) -> dict[str, Any]:
+def train_with_kills(folder: Path, every: float, minutes: float, options: Sequence[str]) -> dict[str, Any]:
     """Train for some time, killing the process at regular intervals; then evaluate the result.
 
     A run that the folder already holds is continued, so that an hour can be split over several calls; kills and minutes add up.
@@ -43,9 +43,9 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
     asked = [*options, "--env-steps", str(_FOREVER)]
     while True:
         left = started + 60.0 * minutes - time.monotonic()
-        with killed_afterwards(Part.start(folder, options=asked)) as part:
+        with kill_on_exit(RunProcess.start(folder, options=asked)) as part:
             part.wait_for(lambda: False, min(every, left))
-            if not part.runs():
+            if not part.is_running():
                 raise Broken(f"it ended by itself: {part.lines[-3:]}")
             if left > every:
                 part.send(signal.SIGKILL)
@@ -62,8 +62,8 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
     copy = folder.with_name(f"{folder.name}-evaluated")
     shutil.rmtree(copy, ignore_errors=True)
     shutil.copytree(folder, copy)
-    with killed_afterwards(Part.start(copy, options=["--env-steps", "1"])) as part:
-        if part.end() != 0:
+    with kill_on_exit(RunProcess.start(copy, options=["--env-steps", "1"])) as part:
+        if part.wait() != 0:
             raise Broken(f"it could not be evaluated: {part.lines[-3:]}")
     last = read_rows(copy)[-1]
     total = account(read_processes(folder / "processes.jsonl"), last["iteration"])
@@ -75,14 +75,14 @@ def killed_every(folder: Path, every: float, minutes: float, options: Sequence[s
     }
 
 
-def undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[float]:
+def train_undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> list[float]:
     """Return the final success of an undisturbed run of ``env_steps`` steps, per seed; an existing run is continued.
 
     Raises:
         Broken: The run fails, or takes more than a day.
     """
-    with killed_afterwards(Part.start(folder, options=[*options, "--env-steps", str(env_steps)])) as part:
-        if part.end(86400.0) != 0:
+    with kill_on_exit(RunProcess.start(folder, options=[*options, "--env-steps", str(env_steps)])) as part:
+        if part.wait(86400.0) != 0:
             raise Broken(f"the undisturbed run ended early: {part.lines[-3:]}")
     return _success(folder)
 
@@ -91,7 +91,7 @@ def report(killed: dict[str, Any], every: float, reference: Sequence[float] | No
     """Print the results, and return them for a file.
 
     Args:
-        killed: Results of `killed_every`.
+        killed: Results of `train_with_kills`.
         every: Time between kills, s.
         reference: Success of an undisturbed run, per seed; None if there was none.
     """

@@ -64,7 +64,7 @@ def list_checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
 
 
 @dataclasses.dataclass
-class Part:
+class RunProcess:
     """One process of a run.
 
     Attributes:
@@ -84,7 +84,7 @@ class Part:
         variables: dict[str, str] | None = None,
         options: Sequence[str] | None = None,
         file_bytes: int | None = None,
-    ) -> "Part":
+    ) -> "RunProcess":
         """Start or resume the run in ``folder`` (`OPTIONS` by default); ``file_bytes`` limits the size of each file."""
         resume_option = ["--resume"] if folder.exists() else []
         command = [
@@ -97,12 +97,12 @@ class Part:
             str(folder),
             *resume_option,
         ]
-        return cls.command(command, folder, variables, file_bytes)
+        return cls.start_command(command, folder, variables, file_bytes)
 
     @classmethod
-    def command(
+    def start_command(
         cls, command: Sequence[str], folder: Path, variables: dict[str, str] | None = None, file_bytes: int | None = None
-    ) -> "Part":
+    ) -> "RunProcess":
         """Start any command in the parent of ``folder``."""
 
         def prepare() -> None:
@@ -127,7 +127,7 @@ class Part:
         for line in self.process.stdout:
             self.lines.append(line.rstrip())
 
-    def end(self, seconds: float = 240.0) -> int:
+    def wait(self, seconds: float = 240.0) -> int:
         """Wait for the process and its last line; return its exit status.
 
         Raises:
@@ -146,20 +146,20 @@ class Part:
     def send(self, number: int) -> int:
         """Send a signal and wait for the end; return the exit status."""
         self.process.send_signal(number)
-        return self.end()
+        return self.wait()
 
     def stop(self) -> int:
         """Send SIGTERM if the process still runs, and wait for its end; return the exit status."""
-        return self.send(signal.SIGTERM) if self.runs() else self.end()
+        return self.send(signal.SIGTERM) if self.is_running() else self.wait()
 
-    def runs(self) -> bool:
+    def is_running(self) -> bool:
         """Return True if the process has not ended yet."""
         return self.process.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
         """Wait for a condition, at most until the process ends; return True if it holds."""
         deadline = time.monotonic() + seconds
-        while self.runs() and time.monotonic() < deadline:
+        while self.is_running() and time.monotonic() < deadline:
             if condition():
                 return True
             time.sleep(0.002)
@@ -181,7 +181,7 @@ class Part:
         """Count the printed lines that contain ``words``."""
         return sum(words in line for line in self.lines)
 
-    def check_words(self) -> None:
+    def check_output(self) -> None:
         """Raise `Broken` if a traceback or a fatal error of Python was printed."""
         said = "\n".join(self.lines)
         if "Traceback" in said or "Fatal Python error" in said:
@@ -189,12 +189,12 @@ class Part:
 
 
 @contextlib.contextmanager
-def killed_afterwards(part: Part) -> Iterator[Part]:
+def kill_on_exit(part: RunProcess) -> Iterator[RunProcess]:
     """Kill the process and its group on exit, if it still runs."""
     try:
         yield part
     finally:
-        if part.runs():
+        if part.is_running():
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(part.process.pid, signal.SIGKILL)
             part.process.wait()

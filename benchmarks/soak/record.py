@@ -84,7 +84,7 @@ class Record:
         return "\n".join(lines) + "\n"
 
 
-def added(records: Sequence[Record]) -> Record:
+def add_records(records: Sequence[Record]) -> Record:
     """Add up several soaks of one commit, in a record with the machine and seed of the first.
 
     Raises:

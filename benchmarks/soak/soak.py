@@ -12,7 +12,7 @@ from typing import Any
 
 from benchmarks.soak.alone import ALONE, References, strike_alone
 from benchmarks.soak.faults import FAULTS
-from benchmarks.soak.parts import LAST, Broken, Part, killed_afterwards, list_checkpoints, read_rows
+from benchmarks.soak.parts import LAST, Broken, RunProcess, kill_on_exit, list_checkpoints, read_rows
 from benchmarks.soak.record import Record
 from jaxrl_vis.run.goodput import account, read_processes
 
@@ -44,14 +44,14 @@ class Soak:
         self.record = Record(seed=seed)
         self.reference: list[dict[str, Any]] = []
 
-    def undisturbed(self) -> None:
+    def train_reference(self) -> None:
         """Train the run that others are compared with, and store its rows.
 
         Raises:
             Broken: The run failed.
         """
-        with killed_afterwards(Part.start(self._folder / "reference")) as part:
-            if part.end() != 0:
+        with kill_on_exit(RunProcess.start(self._folder / "reference")) as part:
+            if part.wait() != 0:
                 raise Broken("\n".join(part.lines))
         self.reference = read_rows(part.folder)
 
@@ -95,16 +95,16 @@ class Soak:
             try:
                 # Workers begin with different kinds, so that a short soak covers both.
                 if self._alone and (turn + worker) % 2:
-                    going = self._one_alone(place, rng, faults)
+                    going = self._strike_alone(place, rng, faults)
                 else:
-                    going = self._one_run(place, rng, faults)
+                    going = self._strike_run(place, rng, faults)
             except Exception as error:  # the others continue; the folder is kept for inspection
                 self._note_violation(place, faults, error)
                 going = True
             if not going:
                 return
 
-    def _one_alone(self, place: Path, rng: random.Random, faults: list[str]) -> bool:
+    def _strike_alone(self, place: Path, rng: random.Random, faults: list[str]) -> bool:
         fault = self._next_fault(ALONE)
         if fault is None:
             return False
@@ -115,7 +115,7 @@ class Soak:
             self._return_fault(ALONE, fault)
         return True
 
-    def _one_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
+    def _strike_run(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
         """Train one run to its end, with faults; return False if none is left for it."""
         spoilt, fault = False, None
         while len(faults) < FAULTS_PER_RUN:
@@ -132,19 +132,19 @@ class Soak:
                 raise Broken(f"status {status}: {LAST.lines[-4:]}")
             spoilt |= FAULTS[fault].spoils
             if folder.exists() and not (FAULTS[fault].spoils or FAULTS[fault].goes_back):
-                self._check_kept(folder, before, good[-1][0] if good else 0)
+                self._check_nothing_lost(folder, before, good[-1][0] if good else 0)
             self._note_fault(folder.name, fault, f"status {status}")
         if not faults:  # the run finished before the first fault, or it is time to end
             shutil.rmtree(folder, ignore_errors=True)
             return fault is not None
-        with killed_afterwards(Part.start(folder)) as part:
-            if (status := part.end()) != 0:
+        with kill_on_exit(RunProcess.start(folder)) as part:
+            if (status := part.wait()) != 0:
                 raise Broken(f"it did not finish: status {status}, {part.lines[-5:]}")
-            part.check_words()
+            part.check_output()
         self._check_end(folder, spoilt)
         return True
 
-    def _check_kept(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
+    def _check_nothing_lost(self, folder: Path, before: list[dict[str, Any]], checkpointed: int) -> None:
         """Check that no rows and no checkpoints were lost.
 
         Args:

@@ -35,7 +35,7 @@ PLOTS = {"training": 28, "shifted": 28, "daylight_all": 36, "daylight_near": 20,
 """Number of plots of each family for fitting, and for testing."""
 FIRST_SEEDS = {"fit": 20_000, "test": 30_000}
 WIDTH, FRAMES = 844, 2
-RIGHT = 0.8
+MIN_F1 = 0.8
 """Minimum F1 of the detections of an image that counts as correct."""
 MAX_FLAGGED = 0.04
 AXES = 8
@@ -51,7 +51,7 @@ class ImageStatistics:
         pooled: [C] float32, pooled features of the network.
         scores: [N] float32, scores of the detections.
         f1: F1 of the detections with a score of at least `MIN_SCORE`.
-        plain: Mean brightness and sharpness of the image (`plain_measures`).
+        plain: Mean brightness and sharpness of the image (`brightness_and_sharpness`).
     """
 
     family: str
@@ -61,7 +61,7 @@ class ImageStatistics:
     plain: tuple[float, float]
 
 
-def draw(folder: Path, part: str, family: str, number: int) -> Path:
+def render_plot(folder: Path, part: str, family: str, number: int) -> Path:
     """Render `FRAMES` random images of one plot and its true boxes into a .npz file, unless it exists; return its path.
 
     Args:
@@ -88,7 +88,7 @@ def draw(folder: Path, part: str, family: str, number: int) -> Path:
     return path
 
 
-def plain_measures(image: np.ndarray) -> tuple[float, float]:
+def brightness_and_sharpness(image: np.ndarray) -> tuple[float, float]:
     """Return mean brightness, and sharpness (logarithm of the Laplacian's variance), of an image [H, W, 3] uint8."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float64)
     return float(grey.mean()), float(np.log(cv2.Laplacian(grey, cv2.CV_64F).var() + 1e-3))
@@ -113,13 +113,13 @@ def detect_stalks(
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
 
 
-def f1_of(hits: int, finds: int, stalks: int) -> float:
+def f1_score(hits: int, finds: int, stalks: int) -> float:
     """Return the F1 score for the numbers of correct detections, of detections and of stalks; 1 if the last two are 0."""
     return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
 
 
-def detections_in(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
-    """Return the statistics of each image in a file of `draw`, from a cache beside it if one exists; else write that cache.
+def image_statistics(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
+    """Return the statistics of each image in a file of `render_plot`, from the cache beside it, which is written if missing.
 
     Args:
         path: The file.
@@ -149,33 +149,35 @@ def _detect_images(path: Path, finder: Finder) -> Iterator[ImageStatistics]:
             stalks, scores, pooled = detect_stalks(finder, image, float(data["pixels_per_metre"]))
             right, ignored = match_finds(stalks, scores, truth, kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
-            f1 = f1_of(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
-            yield ImageStatistics("", pooled, scores, f1, plain_measures(image))
+            f1 = f1_score(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
+            yield ImageStatistics("", pooled, scores, f1, brightness_and_sharpness(image))
 
 
-def detections_in_photographs(photographs: Iterator[Photograph], finder: Finder) -> Iterator[ImageStatistics]:
+def photograph_statistics(photographs: Iterator[Photograph], finder: Finder) -> Iterator[ImageStatistics]:
     """Yield the statistics of each photograph, detected without a known resolution, because the cameras are unknown."""
     for image, count, find_boxes in photographs:
         stalks, scores, pooled = detect_stalks(finder, image, None)
         boxes = stalks[scores >= MIN_SCORE][:, :4]
-        yield ImageStatistics("photographs", pooled, scores, f1_of(find_boxes(boxes), len(boxes), count), plain_measures(image))
+        yield ImageStatistics(
+            "photographs", pooled, scores, f1_score(find_boxes(boxes), len(boxes), count), brightness_and_sharpness(image)
+        )
 
 
-def area_under_roc(values: np.ndarray, wrong: np.ndarray) -> float:
+def area_under_roc(values: np.ndarray, misread: np.ndarray) -> float:
     """Return the area under the ROC curve: the probability that a misread image has a higher value than another.
 
     Args:
         values: [N] float, one for each image.
-        wrong: [N] bool, True if the image was misread.
+        misread: [N] bool, True if the image was misread.
 
     Returns:
         The area, in which ties count one half; NaN if all images or none were misread.
     """
-    above = values[wrong][:, None] - values[~wrong][None, :]
+    above = values[misread][:, None] - values[~misread][None, :]
     return float(np.mean((above > 0) + 0.5 * (above == 0))) if above.size else float("nan")
 
 
-def control(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.ndarray:
+def control_logits(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.ndarray:
     """Return the logits [N] of a logistic regression on brightness and sharpness, their squares and product.
 
     Args:
@@ -187,7 +189,7 @@ def control(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.n
         plain = (np.array([image.plain for image in images]) - [100.0, 6.0]) / [50.0, 2.0]
         return np.concatenate([plain, plain**2, plain[:, :1] * plain[:, 1:]], axis=1)
 
-    weights = fit_logistic_regression(inputs(fitted), np.array([image.f1 < RIGHT for image in fitted]))
+    weights = fit_logistic_regression(inputs(fitted), np.array([image.f1 < MIN_F1 for image in fitted]))
     return weights[0] + inputs(tried) @ weights[1:]
 
 
@@ -198,9 +200,9 @@ def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_contr
         name: Label of the line.
         images: Statistics of N images.
         gate: The gate.
-        doubts_of_control: [N] logits of `control`.
+        doubts_of_control: [N] logits of `control_logits`.
     """
-    wrong = np.array([image.f1 < RIGHT for image in images])
+    wrong = np.array([image.f1 < MIN_F1 for image in images])
     doubts = np.array([gate.doubt(image.pooled, image.scores) for image in images])
     flagged = doubts > gate.threshold
     parts = [f"{wrong.sum()} of {len(images)} read wrongly"]
@@ -214,8 +216,8 @@ def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_contr
     print(f"{name:14} " + "; ".join(parts), flush=True)
 
 
-def _made(folder: Path, tasks: list[tuple[str, str, int]], index: int) -> dict[str, str]:
-    return {"path": str(draw(folder, *tasks[index]))}
+def _render_task(folder: Path, tasks: list[tuple[str, str, int]], index: int) -> dict[str, str]:
+    return {"path": str(render_plot(folder, *tasks[index]))}
 
 
 def main() -> None:
@@ -238,7 +240,7 @@ def main() -> None:
     if not options.drawn:
         if options.workers > 1:
             share_accelerator()
-        done = functools.partial(_made, options.folder, tasks)
+        done = functools.partial(_render_task, options.folder, tasks)
         evaluate_all(done, range(len(tasks)), options.workers, lambda place, made: print(made["path"], flush=True))
     enable_compilation_cache()
     finder = load_finder(options.weights, MIN_SCORE)
@@ -246,18 +248,18 @@ def main() -> None:
     for part, family, number in tasks:
         path = options.folder / f"{part}_{family}_{number}.npz"
         if path.exists():
-            seen[part] += detections_in(path, finder, detector_name(options.weights))
+            seen[part] += image_statistics(path, finder, detector_name(options.weights))
     fitted, tried = seen["fit"], seen["test"]
-    wrong = np.array([image.f1 < RIGHT for image in fitted])
+    wrong = np.array([image.f1 < MIN_F1 for image in fitted])
     pooled, plots = np.array([image.pooled for image in fitted]), np.arange(len(fitted)) // FRAMES
     gate = fit_gate(pooled, [image.scores for image in fitted], wrong, plots, AXES, MAX_FLAGGED)
     about = {"images": len(fitted), "families": list(PLOTS), "origin": "synthetic images alone"}
     write_gate(options.weights, gate, about)
     if options.photographs:
         module, _, name = options.photographs.partition(":")
-        tried += detections_in_photographs(getattr(importlib.import_module(module), name)(), finder)
-    doubts = control(fitted, tried)
-    print(f"{detector_name(options.weights)}: {len(fitted)} images to fit on, {len(tried)} to try; right is F1 >= {RIGHT:g}")
+        tried += photograph_statistics(getattr(importlib.import_module(module), name)(), finder)
+    doubts = control_logits(fitted, tried)
+    print(f"{detector_name(options.weights)}: {len(fitted)} images to fit on, {len(tried)} to try; right is F1 >= {MIN_F1:g}")
     report("all", tried, gate, doubts)
     for family in dict.fromkeys(image.family for image in tried):
         chosen = [place for place, image in enumerate(tried) if image.family == family]

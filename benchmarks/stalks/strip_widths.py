@@ -57,7 +57,7 @@ def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, wi
     return np.array(errors)
 
 
-def strip(mask: np.ndarray) -> float | None:
+def width_by_strip(mask: np.ndarray) -> float | None:
     """Return the width by `fit_strip`; None if it finds none."""
     strip = fit_strip(mask)
     return None if strip is None else strip.width()
@@ -70,7 +70,9 @@ def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> l
         places: Number of random sub-pixel positions per width.
         widths: True widths, pixels.
     """
-    estimators = {"strip": strip} | {f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS}
+    estimators = {"strip": width_by_strip} | {
+        f"ellipse, {fit}": lambda mask, fit=fit: ellipse_width(mask, fit) for fit in ELLIPSE_FITS
+    }
     lines = [
         "| estimator | mask | lean | " + " | ".join(f"L/W {ratio:g}" for ratio in RATIOS) + " |",
         "|---|---|---" + "|---" * len(RATIOS) + "|",

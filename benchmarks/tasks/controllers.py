@@ -136,7 +136,7 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
     env = environments.make(name, **overrides)
     state, goals = environments.reset(env, jax.random.split(jax.random.key(seed), episodes))
     if name == "FingerTurn":
-        return turn_the_finger(env, state, np.random.default_rng(seed))
+        return finger_turn_success(env, state, np.random.default_rng(seed))
     policy, memory = POLICIES[name](env)
     act = jaxrl_vis_envs.jit(jax.vmap(policy))
     memory = jax.tree.map(lambda leaf: jnp.tile(leaf, (episodes, 1)), memory)
@@ -146,7 +146,7 @@ def success_rate(name: str, episodes: int, seed: int = 0, **overrides: Any) -> f
     return float(np.mean(state.metrics["success"]))
 
 
-def turn_the_finger(env: Any, state: Any, generator: np.random.Generator) -> float:
+def finger_turn_success(env: Any, state: Any, generator: np.random.Generator) -> float:
     """Return the success rate of random shooting on FingerTurn: take the first action of the best of many plans in C MuJoCo.
 
     Args:

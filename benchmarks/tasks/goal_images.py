@@ -70,7 +70,7 @@ def visible_pixels(env: Any, labels: np.ndarray, geoms: tuple[str, ...]) -> np.n
     return np.isin(labels, [env.mj_model.geom(name).id for name in geoms]).sum(axis=(1, 2))
 
 
-def compare(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, int]]:
+def compare_pairs(goals: Goals, threshold: float) -> tuple[int, int, int, tuple[int, int]]:
     """Compare pairs of goals that are more than a threshold apart.
 
     Returns:
@@ -100,7 +100,7 @@ def report(name: str, count: int, size: int) -> bool:
     """
     env: Any = jaxrl_vis_envs.make(name, image_size=size, pixels="rgbd")
     goals = draw_goals(env, count)
-    identical, near, nearest, pair = compare(goals, env.threshold)
+    identical, near, nearest, pair = compare_pairs(goals, env.threshold)
     print(f"{name}: {count} goals at {size}x{size}, {len(goals.images[0])} channels")
     print(f"  identical images of goals more than {env.threshold:g} {env.distance_unit} apart: {identical} pairs")
     span = f"{env.threshold:g} to {_NEAR * env.threshold:g} {env.distance_unit}"

@@ -19,7 +19,7 @@ SHAPE = (32, 32, 1)
 _NEAR, _FAR = 0.25, 1.25
 
 # Their triangles are half of all, and out of the camera's sight.
-_UNSEEN = ("robot0:estop_link", "robot0:laser_link")
+_HIDDEN = ("robot0:estop_link", "robot0:laser_link")
 
 Policy = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Function (image, goal image, true displacement [3] to the goal, m) -> action [4]; learners ignore the displacement."""
@@ -43,7 +43,7 @@ class Episode(NamedTuple):
     is_reached: bool
 
 
-def with_noise(image: np.ndarray, noise: float, draw: np.random.Generator) -> np.ndarray:
+def add_noise(image: np.ndarray, noise: float, draw: np.random.Generator) -> np.ndarray:
     """Return images [...] uint8 with Gaussian noise added, rounded and clipped to 0 to 255.
 
     Args:
@@ -80,10 +80,10 @@ class Camera:
     """Depth camera of an environment of MuJoCo. Close it to free the GL context."""
 
     def __init__(self, env: Any) -> None:
-        """Open the GL context; make the mocap body and `_UNSEEN` transparent in the environment's model, in place."""
+        """Open the GL context; make the mocap body and `_HIDDEN` transparent in the environment's model, in place."""
         model, self._data = env.model, env.data
         for geom in range(model.ngeom):
-            if model.geom(geom).name in _UNSEEN or model.body(model.geom_bodyid[geom]).name == "robot0:mocap":
+            if model.geom(geom).name in _HIDDEN or model.body(model.geom_bodyid[geom]).name == "robot0:mocap":
                 model.geom_rgba[geom, 3] = 0.0
         model.vis.quality.offsamples = 0  # no antialiasing
         self._renderer = mujoco.Renderer(model, *SHAPE[:2])
@@ -93,7 +93,7 @@ class Camera:
         self._view.azimuth, self._view.elevation = 180.0, -30.0
         self._options.sitegroup[:] = 0  # the goal is a site
 
-    def image(self) -> np.ndarray:
+    def render(self) -> np.ndarray:
         """Render a depth image [32, 32, 1] uint8: 0 at 0.25 m and nearer, 255 at 1.25 m and farther, linear in between."""
         self._renderer.update_scene(self._data, self._view, self._options)
         share = (self._renderer.render()[..., None] - _NEAR) / (_FAR - _NEAR)
@@ -133,9 +133,9 @@ class HostFetch:
         return self._env.step(np.asarray(action, np.float32))[0]["achieved_goal"]
 
     def _image(self) -> np.ndarray:
-        return with_noise(self._camera.image(), self._noise, self._draw)
+        return add_noise(self._camera.render(), self._noise, self._draw)
 
-    def episode(self, policy: Policy) -> Episode:
+    def run_episode(self, policy: Policy) -> Episode:
         """Roll out an episode of `HORIZON` steps; actions are clipped to [-1, 1].
 
         The goal image is taken after ten actions of a proportional controller towards the goal, from another start.

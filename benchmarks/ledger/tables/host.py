@@ -77,6 +77,6 @@ def _steps(record: dict[str, Any]) -> int | None:
     """Return the environment steps of the first of three evaluations in a row with a success of 0.9 or more, or None."""
     success = [row["success"] for row in record["rows"]]
     for start in range(len(success) - host_learning.IN_A_ROW + 1):
-        if min(success[start : start + host_learning.IN_A_ROW]) >= host_learning.WANTED:
+        if min(success[start : start + host_learning.IN_A_ROW]) >= host_learning.TARGET_SUCCESS:
             return record["rows"][start]["env_steps"]
     return None

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ledger.tables.lab_results import short
+from benchmarks.ledger.tables.lab_results import format_short
 from jaxrl_vis.bench.record import load
 
 _PARITY = "pixels_parity.json"
@@ -73,5 +73,6 @@ def _speeds(path: Path) -> dict[str, str]:
             values.setdefault(record["config"]["task"], {})[record["name"]] = record["value"]
     complete = {task: pair for task, pair in values.items() if len(pair) == 2}
     return {
-        task: f"{short(pair['pixels/steps'])} / {short(pair['pixels/steps_with_images'])}" for task, pair in complete.items()
+        task: f"{format_short(pair['pixels/steps'])} / {format_short(pair['pixels/steps_with_images'])}"
+        for task, pair in complete.items()
     }

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ledger.tables.lab_results import short
+from benchmarks.ledger.tables.lab_results import format_short
 from jaxrl_vis.bench.record import load
 
 _WARP_RECORDS, _MUJOCO_RECORDS = "render-nvidia-h200-x1.json", "render-amd-epyc-2-cores.json"
@@ -44,8 +44,8 @@ def _table(file: Path, peer: str, title: str, with_depth: bool) -> str:
             continue
         config = ours["config"]
         images = f"{config['image_size']}x{config['image_size']} {_OUTPUTS[config['pixels']]}, {config['images']:,}"
-        rate, ratio = ("", "") if other is None else (short(other["value"]), f"{other['details']['ours_over_peer']:.3g}")
-        lines.append(f"| {_label(config)} | {images} | {short(ours['value'])} | {rate} | {ratio} |")
+        rate, ratio = ("", "") if other is None else (format_short(other["value"]), f"{other['details']['ours_over_peer']:.3g}")
+        lines.append(f"| {_label(config)} | {images} | {format_short(ours['value'])} | {rate} | {ratio} |")
     return "\n".join(lines)
 
 

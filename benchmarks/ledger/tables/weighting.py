@@ -36,10 +36,10 @@ def cost_table(results: Path) -> str | None:
     paths = sorted(results.glob("weighting_cost-nvidia-*.json"))
     if not paths:
         return None
-    return "\n\n".join(_of_device(json.loads(path.read_text())) for path in paths)
+    return "\n\n".join(_device_table(json.loads(path.read_text())) for path in paths)
 
 
-def _of_device(record: dict[str, Any]) -> str:
+def _device_table(record: dict[str, Any]) -> str:
     counts = record["size"]["losses"]
     ours, theirs = (
         {(row["method"], row["losses"], row["what"]): row["seconds"] for row in record[side]} for side in ("ours", "torchjd")
@@ -76,7 +76,7 @@ def digits_table(results: Path) -> str | None:
     if not path.exists():
         return None
     record = json.loads(path.read_text())
-    columns = {title: _of_problem(rows) for title, rows in record["problems"].items()}
+    columns = {title: _problem_cells(rows) for title, rows in record["problems"].items()}
     names = list(dict.fromkeys(row["method"] for rows in record["problems"].values() for row in rows))
     lines = ["| method | " + " | ".join(f"`{title}`" for title in columns) + " |", "|---|" + "---|" * len(columns)]
     lines += [f"| `{name}` | " + " | ".join(column.get(name, "") for column in columns.values()) + " |" for name in names]
@@ -90,7 +90,7 @@ def digits_table(results: Path) -> str | None:
     return "\n".join(lines)
 
 
-def _of_problem(rows: list[dict[str, Any]]) -> dict[str, str]:
+def _problem_cells(rows: list[dict[str, Any]]) -> dict[str, str]:
     """Return the cells of a problem by method: accuracy, and difference from the sum, in bold if significant."""
     scores = {row["method"]: np.asarray(row["test"]) for row in rows}
     baseline = scores[_BASELINE]

@@ -69,15 +69,15 @@ def _count_links(tracks: list[Track]) -> int:
     return sum(len(track.sightings) - 1 for track in tracks)
 
 
-def _is_contradicted(frames: list[list[Sighting]], places: np.ndarray) -> bool:
+def _is_contradicted(frames: list[list[Sighting]], positions: np.ndarray) -> bool:
     """Return whether most pairs that share stalks with the previous one contradict the path.
 
     Args:
         frames: Sightings of each pair.
-        places: Position [F] float64 of each pair along the row, m.
+        positions: Position [F] float64 of each pair along the row, m.
     """
     compared = judged = against = 0
-    for first, second, step in zip(frames, frames[1:], np.diff(places)):
+    for first, second, step in zip(frames, frames[1:], np.diff(positions)):
         best, own, possible = _count_shared(_row_positions(first), _row_positions(second), float(step))
         compared += possible >= _MIN_SHARED
         if best >= max(_MIN_SHARED, _MIN_SHARED_FRACTION * possible):

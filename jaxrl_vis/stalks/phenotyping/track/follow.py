@@ -125,20 +125,20 @@ def track_stalks(
         Tracks in the order in which the robot passed them, including those not counted, and the robot's path.
     """
     tracks: list[_OpenTrack] = []
-    places = np.zeros(len(frames))
+    positions = np.zeros(len(frames))
     correction = 0.0
     driven = np.asarray(distances, float) - (distances[0] if len(distances) else 0.0)
     row = [sighting.depth_m for sightings in frames for sighting in sightings if sighting.depth_m is not None]
     usual = float(np.median(row)) if row else _USUAL_DEPTH
     for frame, sightings in enumerate(frames):
         view = _PairView.of(sightings, calibration, usual)
-        places[frame] = driven[frame] + correction
-        pairs = _assign(tracks, view, places[frame], gates)
-        moves = [tracks[track].place()[0] - view.along[new] - places[frame] for track, new in pairs if view.known[new]]
+        positions[frame] = driven[frame] + correction
+        pairs = _assign(tracks, view, positions[frame], gates)
+        moves = [tracks[track].place()[0] - view.along[new] - positions[frame] for track, new in pairs if view.known[new]]
         if len(moves) >= 3:
             correction += float(np.median(moves))
-            places[frame] = driven[frame] + correction
-            pairs = _assign(tracks, view, places[frame], gates)
+            positions[frame] = driven[frame] + correction
+            pairs = _assign(tracks, view, positions[frame], gates)
         taken = {new: track for track, new in pairs}
         for new in map(int, np.flatnonzero(view.is_candidate)):
             depth = float(view.depth[new]) if view.known[new] else math.nan
@@ -149,21 +149,23 @@ def track_stalks(
                 track, along = _OpenTrack(), view.along[new]
                 tracks.append(track)
             track.sightings.append((frame, new))
-            track.along.append(float(along + places[frame]))
+            track.along.append(float(along + positions[frame]))
             track.depth.append(depth)
-            track.rays.append((float(places[frame]) - view.half, float(view.rays[new])))
-            track.feet.append(float(along + places[frame] - view.over[new]))
-    step = float(np.median(np.diff(places))) if len(places) > 1 else 0.0
+            track.rays.append((float(positions[frame]) - view.half, float(view.rays[new])))
+            track.feet.append(float(along + positions[frame] - view.over[new]))
+    step = float(np.median(np.diff(positions))) if len(positions) > 1 else 0.0
     field = tuple(
         (column - 0.5 - calibration.centre[0]) / calibration.focal for column in columns or (0.0, float(calibration.width))
     )
-    length = abs(float(places[-1] - places[0]) + step) if len(places) else 0.0
-    path = RobotPath(places, length, _seen_fraction(places, step, [ray * usual - 0.5 * calibration.baseline for ray in field]))
+    length = abs(float(positions[-1] - positions[0]) + step) if len(positions) else 0.0
+    path = RobotPath(
+        positions, length, _seen_fraction(positions, step, [ray * usual - 0.5 * calibration.baseline for ray in field])
+    )
     closed = [_finish_track(track, path, step, field, usual, gates) for track in _merge_tracks(tracks, gates)]
     return sorted(closed, key=lambda track: track.position_m * (-1.0 if step < 0 else 1.0)), path
 
 
-def _seen_fraction(places: np.ndarray, step: float, field: list[float]) -> float:
+def _seen_fraction(positions: np.ndarray, step: float, field: list[float]) -> float:
     """Return the fraction of the row beside the path that is in view of any pair.
 
     Args:
@@ -171,10 +173,10 @@ def _seen_fraction(places: np.ndarray, step: float, field: list[float]) -> float
         step: Distance between two pairs, m.
         field: Ends of the field of view along the row, relative to the position of the pair, m.
     """
-    if not len(places):
+    if not len(positions):
         return 0.0
-    points = np.linspace(places[0] - 0.5 * step, places[-1] + 0.5 * step, 201)
-    offsets = points[:, None] - places
+    points = np.linspace(positions[0] - 0.5 * step, positions[-1] + 0.5 * step, 201)
+    offsets = points[:, None] - positions
     return float(((offsets >= field[0]) & (offsets <= field[1])).any(axis=1).mean())
 
 

@@ -18,7 +18,7 @@ from jaxrl_vis.host.spreadsheets import unescape_cell
 from jaxrl_vis.stalks.phenotyping.io.folders import PairFiles, PlotFolder
 from jaxrl_vis.stalks.phenotyping.io.names import readable
 from jaxrl_vis.stalks.phenotyping.io.naming.stamps import parse_timestamp
-from jaxrl_vis.stalks.phenotyping.io.tables.cells import cells, read_table_text
+from jaxrl_vis.stalks.phenotyping.io.tables.cells import read_table_text, split_cells
 
 _MAX_ODOMETRY = 8_000_000  # bytes
 _NAMES = tuple(f"{stem}{end}" for stem in ("odometry", "odom", "gps") for end in (".csv", ".tsv", ".txt", ".yaml"))
@@ -39,7 +39,7 @@ _POSITIONS = (
     ("x", "y", "z"),
 )
 _GLOBE = (("latitude", "longitude"), ("lat", "lon"), ("lat", "lng"), ("field.latitude", "field.longitude"))
-_EARTH = 6_371_000.0  # m, radius
+_EARTH_RADIUS = 6_371_000.0  # m, radius
 _MAX_SECONDS = 1e11  # maximum of time_s: larger numbers are in another unit
 _NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
 _PRINTED_STAMP = re.compile(r"\bsecs?: *(\d{1,12})\s+n(?:ano)?secs?: *(\d{1,9})\b")
@@ -214,7 +214,7 @@ def _parse_table(path: Path, text: str) -> _Table:
     Raises:
         RequestError: A column or a number is missing.
     """
-    columns, rows, comma = cells(path, text)
+    columns, rows, comma = split_cells(path, text)
     columns = [name.lower() for name in columns]
     metres = [(place, _METRES[match[1]]) for place, name in enumerate(columns) if (match := _DISTANCE.fullmatch(name))]
     time = _time_column(columns)
@@ -275,7 +275,7 @@ def _parse_seconds(values: np.ndarray, name: str, path: Path) -> tuple[np.ndarra
 def _project_to_plane(degrees: np.ndarray) -> np.ndarray:
     """Project latitudes and longitudes [N, 2], degrees, to positions [N, 2] in m relative to the first one."""
     turned = np.radians(degrees - degrees[:1])
-    return _EARTH * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
+    return _EARTH_RADIUS * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
 
 
 def _project_on_path(places: np.ndarray) -> np.ndarray:
