@@ -43,7 +43,16 @@ Act = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def run_episodes(policy: Policy, acts: list[Act], episodes: int) -> list[dict[str, float]]:
-    """Run the same episodes with each function, and return its mean ``success`` and ``goal_distance`` at the last step."""
+    """Run the same episodes with each function.
+
+    Args:
+        policy: Policy, whose environment is used.
+        acts: Functions from observations and goals [`BATCH`, ...] to actions.
+        episodes: Number of episodes.
+
+    Returns:
+        Mean ``success`` and ``goal_distance`` at the last step, for each function.
+    """
     env = policy.env
     reset, step = jaxrl_vis_envs.jit(jax.vmap(env.reset)), jaxrl_vis_envs.jit(jax.vmap(env.step))
     metrics: list[list[Any]] = [[] for _ in acts]
@@ -60,7 +69,12 @@ def run_episodes(policy: Policy, acts: list[Act], episodes: int) -> list[dict[st
 
 
 def measure_latency(act: Act, shape: tuple[int, ...]) -> float:
-    """Return the median time of a call with one observation and one goal, s; inputs vary."""
+    """Return the median time of a call with one observation and one goal, s.
+
+    Args:
+        act: Function to time.
+        shape: Shape of an observation; each of the `CALLS` random inputs is uint8.
+    """
     images = np.random.default_rng(0).integers(0, 256, (CALLS + 20, 2, 1, *shape), np.uint8)
     seconds = []
     for observation, goal in images:

@@ -28,7 +28,7 @@ _PARTS = {
 
 @functools.cache
 def run(task: str, variant: str) -> Record:
-    """Return a run of these studies, with fresh seeds if there are any."""
+    """Return the run of a variant of rewards on a task, with fresh seeds if there are any."""
     return study("indicator", f"{task}-{variant}-fast", is_fresh=True)
 
 
@@ -37,7 +37,15 @@ def _rows(task: str, labels: Mapping[str, str]) -> list[Row]:
 
 
 def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more: Sequence[c.Column] = ()) -> str:
-    """Return the table of results at the end and over training, with a test against one of the rows."""
+    """Return the Markdown table of results at the end and over training, with a test against one of the rows.
+
+    Args:
+        task: Name of the environment.
+        labels: First cell of each row, by variant.
+        reference: Variant that the others are tested against.
+        label: Name of the reference in the title of the test's column.
+        more: Further columns.
+    """
     base = run(task, reference)
     columns = [
         c.final(),

@@ -27,13 +27,19 @@ LABELS = {
 
 
 def run(task: str, variant: str, view: str = "") -> Record:
-    """Return the run for figures: seeds 0 to 4."""
+    """Return the run for figures: seeds 0 to 4 of a task with a variant of auxiliary losses, and a view if given."""
     return study("ol_aux", f"{task}-{variant}-paper" + (f"-{view}" if view else ""))
 
 
 @functools.cache
 def claim(task: str, variant: str, budget: int | None = None) -> Record:
-    """Return the run for claims, with fresh seeds if there are any."""
+    """Return the run of a variant of auxiliary losses on a task for claims, with fresh seeds if any ran for the budget.
+
+    Args:
+        task: Name of the environment.
+        variant: Name of the variant, a key of `LABELS`.
+        budget: Environment steps that fresh seeds must have; None for the task's in `BUDGETS`.
+    """
     return study("ol_aux", f"{task}-{variant}-paper", is_fresh=True, budget=budget or BUDGETS[task])
 
 
@@ -75,7 +81,11 @@ def _figure_5_7(task: str, budget: int, columns: Sequence[c.Column]) -> str:
 
 
 def rank_correlation(task: str) -> float:
-    """Return Spearman's rank correlation between a loss's mean weight in OL-AUX-5 and its gain when used alone."""
+    """Return Spearman's rank correlation, over the auxiliary losses, of weight and gain.
+
+    The weight is the median over seeds of a loss's mean weight in OL-AUX-5. The gain is the mean success up to the budget
+    with that loss alone, minus that without auxiliary losses.
+    """
     base = np.mean([success for steps, success in run(task, "none").points if steps <= BUDGETS[task]])
     gains = [np.mean([v for steps, v in run(task, name).points if steps <= BUDGETS[task]]) - base for name in AUX_TASKS]
     weights = [np.median(run(task, "ol_aux_5").means(metric=f"train/weight/{name}")) for name in AUX_TASKS]

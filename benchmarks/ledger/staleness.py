@@ -116,6 +116,12 @@ def staleness_reason(name: str, env: str | None, on_cpu: bool, revision: str, ch
         on_cpu: True if a CPU was measured.
         revision: Revision of the record.
         checkout: Git checkout of the revision.
+
+    Returns:
+        The first changed files and definitions; or that the record, its revision or its code is unknown.
+
+    Raises:
+        FileNotFoundError: A file listed in `MEASURED` does not exist.
     """
     if name not in MEASURED:
         return f"which code {name} measures is unknown: add it to MEASURED in {Path(__file__).name}"

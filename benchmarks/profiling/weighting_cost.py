@@ -76,14 +76,25 @@ class Problem:
         }
 
     def encode(self, encoder: Any, batch: dict[str, jax.Array]) -> jax.Array:
-        """Encode the images before and after the action to latents [2, B, latent]."""
+        """Encode the images before and after the action to latents [2, B, latent].
+
+        Args:
+            encoder: Parameters of the encoder.
+            batch: One batch of `batches`.
+        """
         mean, scale = (jnp.full(self.networks.observation_spec.shape, value) for value in (127.5, 1 / 74.0))
         images = batch["images"].reshape(2 * self.size, *self.networks.observation_spec.shape)
         inputs = self.networks.prepare(Scaling(mean, scale), images)
         return self.networks.encode({"encoder": encoder}, inputs).reshape(2, self.size, -1)
 
     def losses(self, params: Any, latents: jax.Array, batch: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """Compute the main loss and each auxiliary loss, by name."""
+        """Compute the main loss and each auxiliary loss, [] float32 by name: mean squared errors of value and targets.
+
+        Args:
+            params: Parameters as from `params`.
+            latents: [2, B, latent], before and after the action.
+            batch: One batch of `batches`.
+        """
         value = self.networks.value(params["critic"], latents, batch["action"])
         both = jnp.concatenate([latents[0], latents[1]], axis=-1).astype(jnp.bfloat16)
         losses = {MAIN: jnp.mean(jnp.square(value - batch["value"]))}
@@ -93,7 +104,12 @@ class Problem:
         return losses
 
     def make_steps(self, weighting: Weighting, mode: Any) -> Any:
-        """Return the jitted function (params, weighting's state, batches) -> both after `STEPS` updates, and the weights."""
+        """Return the jitted function (params, weighting's state, batches) -> both after `STEPS` updates, and the weights.
+
+        Args:
+            weighting: Weighting of the losses.
+            mode: Differentiation mode of `weighted_grad`.
+        """
         find = weighted_grad(
             self.losses,
             weighting,

@@ -150,7 +150,7 @@ def _run(
     echo: Callable[[str, str], None],
     run_all: UnorderedMap,
 ) -> tuple[list[Row], list[Row]]:
-    """Process plots one by one; see `run`."""
+    """Process plots one by one; return the rows of plots.csv and skipped.csv. See `run` for the arguments."""
     stalks: list[Row] = []
     rows: list[Row] = []
     skipped: list[Row] = []

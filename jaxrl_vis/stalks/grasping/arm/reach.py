@@ -224,6 +224,14 @@ def _observe_targets(
 ) -> np.ndarray:
     """Return the targets [B, 3] after a call of the observer, unchanged where its target is not finite or out of reach.
 
+    Args:
+        observer: See `reach`.
+        stands: True stalks around each of B arms.
+        targets: [B, 3] float32, present targets, m in the plot's frame.
+        can: [B] bool, arms whose first target was within reach; the targets of the others are unchanged.
+        time: Time since the start, s.
+        report: Last report of `_advance`, batched.
+
     Raises:
         ValueError: The observer returns targets of another shape.
     """

@@ -73,13 +73,26 @@ def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: ja
 
 
 def _smooth_noise(key: jax.Array, shape: tuple[int, ...], lines: int, columns: int, channels: int = 1) -> jax.Array:
-    """Sample smooth noise [N, H, W, channels]: normal values on a coarse grid of at least 2 x 2, upsampled linearly."""
+    """Sample smooth noise [N, H, W, channels] float32: normal values on a coarse grid, upsampled linearly.
+
+    Args:
+        key: Typed key, [].
+        shape: Shape that begins with N, H and W.
+        lines, columns: Size of the grid; at least 2 are used.
+        channels: Number of channels.
+    """
     coarse = jax.random.normal(key, (shape[0], max(lines, 2), max(columns, 2), channels))
     return jax.image.resize(coarse, (*shape[:3], channels), "linear")
 
 
 def _textures(shape: tuple[int, ...], strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Sample brightness factors [N, H, W, 1]: blotches, fibres along stalks, bands across them, and dark speckles."""
+    """Sample brightness factors [N, H, W, 1]: blotches, fibres along stalks, bands across them, and dark speckles.
+
+    Args:
+        shape: Shape that begins with N, H and W.
+        strength: [N, 1, 1, 1] float32, 0 to 1.
+        key: Typed key, [].
+    """
     height, width = shape[1:3]
     names = ("blotches", "patches", "fibres", "bands", "speckles", "amounts")
     keys = dict(zip(names, jax.random.split(key, 6)))
@@ -93,7 +106,13 @@ def _textures(shape: tuple[int, ...], strength: jax.Array, key: jax.Array) -> ja
 
 
 def _shift_colours(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Vary hue, saturation and colour cast of each crop, and the cast also within it."""
+    """Vary hue, saturation and colour cast of each crop, and the cast also within it.
+
+    Args:
+        values: [N, H, W, 3] float32, crops.
+        strength: [N, 1, 1, 1] float32, 0 to 1.
+        key: Typed key, [].
+    """
     count = len(values)
     keys = dict(zip(("hue", "grey", "cast", "parts"), jax.random.split(key, 4)))
     angle = 0.4 * strength * jax.random.normal(keys["hue"], (count, 1, 1, 1))
@@ -108,7 +127,13 @@ def _shift_colours(values: jax.Array, strength: jax.Array, key: jax.Array) -> ja
 
 
 def _shade(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Vary gain, gamma, contrast and black level, and apply an illumination gradient towards a side or corner."""
+    """Vary gain, gamma, contrast and black level, and apply an illumination gradient towards a side or corner.
+
+    Args:
+        values: [N, H, W, 3] float32, crops.
+        strength: [N, 1, 1, 1] float32, 0 to 1.
+        key: Typed key, [].
+    """
     count = len(values)
     gain, gamma, contrast, black, amount, ramp = jax.random.split(key, 6)
 
@@ -123,7 +148,13 @@ def _shade(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _blur(values: jax.Array, strength: jax.Array, key: jax.Array) -> jax.Array:
-    """Apply a Gaussian blur with a standard deviation of up to 1.3 pixels."""
+    """Apply a Gaussian blur with a standard deviation of up to 1.3 pixels to crops; edge pixels are repeated.
+
+    Args:
+        values: [N, H, W, 3] float32, crops.
+        strength: [N] float32, 0 to 1.
+        key: Typed key, [].
+    """
     deviation = jnp.maximum(1.3 * strength * jax.random.uniform(key, strength.shape), 0.05)
     taps = jnp.exp(-0.5 * (jnp.arange(-_TAPS, _TAPS + 1) / deviation[:, None]) ** 2)
     taps = taps / taps.sum(axis=1, keepdims=True)

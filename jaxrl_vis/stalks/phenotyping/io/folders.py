@@ -103,7 +103,7 @@ def find_plots(folder: Path, patterns: Patterns | None = None) -> list[PlotFolde
 
 
 def _search_subfolders(folder: Path, patterns: Patterns | None) -> dict[Path, tuple[PairFiles, ...]]:
-    """Return the pairs of all subfolders that hold some, depth first; folders inside those are not searched.
+    """Return the pairs of all subfolders that hold some, up to `_MAX_DEPTH` levels deep; folders inside those are not searched.
 
     Raises:
         RequestError: There are more than 20,000 folders.

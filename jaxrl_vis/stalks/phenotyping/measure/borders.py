@@ -70,7 +70,12 @@ def _is_filled(part: np.ndarray) -> bool:
 
 
 def _border_wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
-    """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image."""
+    """Return a mask [H, W] bool of the borders that do not extend along a whole side of the image.
+
+    Args:
+        image: [H, W, 3] or [H, W] uint8.
+        dark: [H, W] bool, True where all channels are dark.
+    """
     outside = np.zeros(dark.shape, bool)
     for turns in range(4):
         turned, filled = np.rot90(dark, turns), np.rot90(image, turns)
@@ -82,7 +87,12 @@ def _border_wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:
 
 
 def _border_width(dark: np.ndarray, image: np.ndarray) -> np.ndarray | None:
-    """Return the width [H] of a border at the left of each row, pixels; None if there is no border."""
+    """Return the width [H] float64 of a border at the left of each row, pixels, 0 beyond its ends; None if there is no border.
+
+    Args:
+        dark: [H, W] bool, True where all channels are dark.
+        image: [H, W, 3] or [H, W] uint8.
+    """
     if np.count_nonzero(dark[:, 0]) < _MIN_LINES * dark.shape[0]:
         return None
     depth = np.where(dark.all(axis=1), 0, np.argmin(dark, axis=1))

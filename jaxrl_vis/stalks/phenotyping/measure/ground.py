@@ -43,7 +43,13 @@ class Ground:
         return 1.0 / math.hypot(*self.normal)
 
     def height(self, column: float, line: float, depth: float, calibration: Calibration) -> float:
-        """Return the height above the ground, m, of a point at a pixel of the left image and a planar ``depth`` in m."""
+        """Return the height of a point above the ground, m.
+
+        Args:
+            column, line: Position in the left image, pixels.
+            depth: Planar depth, m.
+            calibration: Calibration of the cameras.
+        """
         x = (column - calibration.centre[0]) / calibration.focal
         y = (line - calibration.centre[1]) / calibration.focal
         across, down, forwards = self.normal
@@ -101,7 +107,15 @@ def find_ground(
 
 
 def _match_windows(left: np.ndarray, right: np.ndarray, bounds: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Match windows in the right image; return the centres (x, y) [N, 2] and disparities [N] of those with a clear match."""
+    """Match a grid of windows of the left image in the right one.
+
+    Args:
+        left, right: Rectified greyscale images [H, W], uint8 or float32.
+        bounds: Minimum and maximum disparity, pixels.
+
+    Returns:
+        Centres (x, y) [N, 2] in the left image and disparities [N] of the windows with a clear match, pixels, float64.
+    """
     tall, wide = _WINDOW
     height, width = left.shape
     low, high = math.floor(bounds[0]), math.ceil(bounds[1])

@@ -134,7 +134,16 @@ def measure_stalk(
 def _row_at_height(
     height: float, strip: Strip, corner: tuple[int, int], matched: StalkDisparity, calibration: Calibration, ground: Ground
 ) -> float:
-    """Return the row of the mask with visible edges nearest to a ``height`` in m; the reference row if heights are unknown."""
+    """Return the row of the mask with visible edges nearest to a height; the reference row if heights are unknown.
+
+    Args:
+        height: Height above the ground, m.
+        strip: Edges of the stalk's mask.
+        corner: Image row and column of the first pixel of the mask.
+        matched: Disparities of the stalk.
+        calibration: Calibration of the cameras.
+        ground: Ground in front of the cameras.
+    """
     ends = np.array([strip.first, strip.last], float)
     disparities = [matched.at(place + corner[0]) for place in ends]
     known = [disparity_here[0] for disparity_here in disparities if disparity_here is not None]
@@ -192,7 +201,13 @@ def stalk_disparity(
 
 
 def _tilt(matched: StalkDisparity, disparity: float, calibration: Calibration) -> float:
-    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short or the tilt implausible."""
+    """Return the tilt of the stalk away from the camera, rad; 0 if the matched segment is too short or the tilt implausible.
+
+    Args:
+        matched: Disparities of the stalk.
+        disparity: Disparity at the row of the measurement, pixels.
+        calibration: Calibration of the cameras.
+    """
     if matched.lines.size < 6 or np.ptp(matched.lines) < 0.03 * calibration.focal:
         return 0.0
     first, second = index_pairs(matched.lines.size, 3)

@@ -141,7 +141,13 @@ class _Window:
     last: int
 
     def inside(self, shape: tuple[int, ...], half_height: int, spread: int) -> bool:
-        """Return True if the window is wide enough and, with the margin for vertical misalignment, inside the image."""
+        """Return True if the window is at least 6 pixels wide and, with the margin for vertical misalignment, in the image.
+
+        Args:
+            shape: Height and width of the image.
+            half_height: Rows of the window above and below its centre.
+            spread: Maximum vertical misalignment, rows.
+        """
         reach = half_height + spread
         tall = reach <= self.line and self.line + reach + 1 <= shape[0]
         return tall and self.last - self.first >= 6 and self.first >= 0 and self.last <= shape[1]
@@ -150,7 +156,15 @@ class _Window:
 def _match_window(
     left: np.ndarray, right: np.ndarray, window: _Window, bounds: tuple[int, int], half_height: int, spread: int
 ) -> tuple[float, float] | None:
-    """Return the disparity and correlation of a window; None if there is no match within the bounds, or an ambiguous one."""
+    """Return the disparity (pixels) and correlation of a window; None without a match in the bounds, or if it is ambiguous.
+
+    Args:
+        left, right: Rectified greyscale images [H, W], uint8 or float32.
+        window: Window of the left image.
+        bounds: Minimum and maximum disparity, pixels.
+        half_height: Rows of the window above and below its centre.
+        spread: Maximum vertical misalignment, rows.
+    """
     top, bottom = window.line - half_height, window.line + half_height + 1
     begin, end = max(window.first - bounds[1] - 1, 0), min(window.last - bounds[0] + 1, right.shape[1])
     if end - begin < window.last - window.first + 2:

@@ -242,7 +242,12 @@ def fit_edges(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> Strip | 
 
 
 def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> float:
-    """Estimate the common slope of both edges, columns per row: the mode over pairs of edge points."""
+    """Estimate the common slope of both edges, columns per row: the mode over pairs of edge points.
+
+    Args:
+        line: Rows [N], in ascending order.
+        left, right: Columns [N] of the edges in these rows, pixels.
+    """
     step = max(line.size // 60, 1)
     places = np.arange(0, line.size, step)
     first, second = index_pairs(places.size, max(places.size // 4, 1))

@@ -133,7 +133,7 @@ def augment_crops(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[j
 
 
 def _stretch(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Stretch crops and masks horizontally about their centre by a factor from exp(-0.3) to exp(0.3)."""
+    """Stretch crops [N, H, W, 3] uint8 and masks [N, H, W] bool horizontally about their centres by exp(-0.3) to exp(0.3)."""
     count, _, width = crops.shape[:3]
     wider = jnp.exp(jax.random.uniform(key, (count,), minval=-0.3, maxval=0.3))
     place = (jnp.arange(width) + 0.5 - width / 2) / wider[:, None] + width / 2 - 0.5  # [N, W], source of each column
@@ -153,7 +153,10 @@ def _stretch(crops: jax.Array, masks: jax.Array, key: jax.Array) -> tuple[jax.Ar
 
 
 def _add_texture(crops: jax.Array, key: jax.Array) -> jax.Array:
-    """Add random speckles, fibres along the stalk and shading to crops, to cover more than the textures of a family."""
+    """Multiply crops [N, H, W, 3] uint8 by random speckles, fibres along the stalk and shading; same shape and dtype.
+
+    Together they cover more than the textures of a family of synthetic plots.
+    """
     count, height, width = crops.shape[:3]
     spots, fibres, shades, amounts = jax.random.split(key, 4)
     amount = jax.random.uniform(amounts, (4, count, 1, 1))
@@ -171,6 +174,14 @@ def _add_stripes(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.Arra
     """Add light and dark stripes along the stalk to 70 % of the crops, as of ribs and folded sheaths, varying by internode.
 
     A dark stripe looks like a gap between two stalks, but the stalk continues on its other side.
+
+    Args:
+        crops: [N, H, W, 3] uint8.
+        masks: [N, H, W] bool, pixels of the stalk, which alone change.
+        key: Typed key, [].
+
+    Returns:
+        Crops of the same shape and dtype.
     """
     count, height, width = crops.shape[:3]
     keys = jax.random.split(key, 5)
@@ -194,6 +205,14 @@ def _change_contrast(crops: jax.Array, masks: jax.Array, key: jax.Array) -> jax.
     The shading of a round stalk towards its edges depends on its surface and on the light. A network that overfits to it
     misplaces the edges of other stalks. The change is multiplicative, so black remains black and no edge appears where none was
     visible.
+
+    Args:
+        crops: [N, H, W, 3] uint8.
+        masks: [N, H, W] bool, pixels of the stalk, which alone change.
+        key: Typed key, [].
+
+    Returns:
+        Crops of the same shape and dtype.
     """
     count, _, width = crops.shape[:3]
     keys = jax.random.split(key, 6)
