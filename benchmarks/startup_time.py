@@ -38,7 +38,7 @@ class Clock:
         self._wall, self._processor = float(os.environ.get(STARTED, time.time())), 0.0
 
     def lap(self, name: str) -> None:
-        """End a lap and start the next."""
+        """End a lap, store its wall-clock and processor time (s) under ``name``, and start the next."""
         wall, processor = time.time(), time.process_time()
         self.laps[name] = round(wall - self._wall, 3), round(processor - self._processor, 3)
         self._wall, self._processor = time.time(), time.process_time()

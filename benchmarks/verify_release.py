@@ -148,11 +148,11 @@ def first_example(page: Path) -> str:
 def smoke_test(shell: Shell, wheel: Path) -> None:
     """Install a wheel into a new environment, and run the commands of `SMOKE`; failures are added to ``shell.failures``."""
     (shell.folder / "ten_lines.py").write_text(first_example(CHECKOUT / "docs" / "weighting.md"))
-    shell.type("python3 -m venv venv")
+    shell.run("python3 -m venv venv")
     shell.activate(shell.folder / "venv")
-    shell.type(f"pip install --quiet {wheel}")
+    shell.run(f"pip install --quiet {wheel}")
     for words, shows in SMOKE:
-        shell.type(words, shows=shows)
+        shell.run(words, shows=shows)
 
 
 def main() -> int:

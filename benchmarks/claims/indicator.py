@@ -36,7 +36,7 @@ def _rows(task: str, labels: Mapping[str, str]) -> list[Row]:
     return [Row(label, run(task, variant)) for variant, label in labels.items()]
 
 
-def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more: Sequence[c.Column] = ()) -> str:
+def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, extra_columns: Sequence[c.Column] = ()) -> str:
     """Return the Markdown table of results at the end and over training, with a test against one of the rows.
 
     Args:
@@ -44,7 +44,7 @@ def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more
         labels: First cell of each row, by variant.
         reference: Variant that the others are tested against.
         label: Name of the reference in the title of the test's column.
-        more: Further columns.
+        extra_columns: Further columns.
     """
     base = run(task, reference)
     columns = [
@@ -52,7 +52,7 @@ def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more
         c.final_distance(),
         c.mean_success(),
         c.p_value_against(base, label),
-        *more,
+        *extra_columns,
     ]
     return table([f"{task}, {show_steps(base.end)} steps"], _rows(task, labels), columns)
 

@@ -82,9 +82,11 @@ class Record:
         return np.array([np.mean([row[metric] for row in rows if row["seed"] == seed]) for seed in self.seeds])
 
 
-def _merge_records(name: str, parts: Iterable[Record]) -> Record:
-    parts = list(parts)
-    return Record(name, tuple(row for part in parts for row in part.rows), frozenset().union(*(part.origins for part in parts)))
+def _merge_records(name: str, records: Iterable[Record]) -> Record:
+    records = list(records)
+    return Record(
+        name, tuple(row for part in records for row in part.rows), frozenset().union(*(part.origins for part in records))
+    )
 
 
 def _evaluations(file: Path) -> tuple[dict[str, Any], ...]:

@@ -97,7 +97,7 @@ def measure(program: TrainStep, options: argparse.Namespace) -> None:
         with rarely_collecting_garbage():
             compiled[part] = function.lower(*inputs).compile()
 
-    def call(part: str) -> None:
+    def run_phase(part: str) -> None:
         # Donated arguments are returned, so that the next call can use them.
         nonlocal train, replay
         if part == "update":
@@ -113,7 +113,7 @@ def measure(program: TrainStep, options: argparse.Namespace) -> None:
         _, _, turns, what = arguments[part]
         report(
             f"{what} of {program.config.run.seeds} learners",
-            lambda part=part: call(part),
+            lambda part=part: run_phase(part),
             turns,
             options.rows,
             options.in_order,

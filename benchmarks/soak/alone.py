@@ -63,17 +63,17 @@ FEW_TO_GRASP = {
 _CLI = (sys.executable, "-m", "jaxrl_vis")
 
 
-def _start_command(words: Sequence[str], folder: Path, **variables: str) -> RunProcess:
-    return RunProcess.start_command([*_CLI, *words], folder, variables)
+def _start_command(arguments: Sequence[str], folder: Path, **variables: str) -> RunProcess:
+    return RunProcess.start_command([*_CLI, *arguments], folder, variables)
 
 
-def _wait_until_finished(part: RunProcess, *statuses: int) -> RunProcess:
-    with kill_on_exit(part):
-        status = part.wait()
-    part.check_output()
+def _wait_until_finished(process: RunProcess, *statuses: int) -> RunProcess:
+    with kill_on_exit(process):
+        status = process.wait()
+    process.check_output()
     if status not in statuses:
-        raise Broken(f"ended with {status}, not {statuses}: {part.lines[-6:]}")
-    return part
+        raise Broken(f"ended with {status}, not {statuses}: {process.lines[-6:]}")
+    return process
 
 
 def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
@@ -114,23 +114,31 @@ def _list_descendants(process: int) -> list[int]:
     return processes
 
 
-def _has_command(process: int, words: str) -> bool:
+def _has_command(process: int, command: str) -> bool:
     try:
-        return words.encode() in Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ")
+        return command.encode() in Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ")
     except OSError:
         return False
 
 
-def _kill_a_worker(part: RunProcess, words: str, rng: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
-    """Kill a descendant of a part whose command line contains ``words``, after a random delay; return True if there was one."""
+def _kill_a_worker(process: RunProcess, command: str, rng: random.Random, delay: float, is_ready: Callable[[], bool]) -> bool:
+    """Kill a descendant of a process after a random delay; return True if there was one.
+
+    Args:
+        process: The process.
+        command: Text that the command line of the descendant must contain.
+        rng: Source of the delay and of the choice among several.
+        delay: Maximum delay, s, once there is such a descendant and ``is_ready`` returns True.
+        is_ready: Function that returns True when the descendant may be killed.
+    """
 
     def workers() -> list[int]:
-        return [process for process in _list_descendants(part.process.pid) if _has_command(process, words)]
+        return [pid for pid in _list_descendants(process.popen.pid) if _has_command(pid, command)]
 
-    part.wait_for(lambda: bool(workers()) and is_ready())
+    process.wait_for(lambda: bool(workers()) and is_ready())
     time.sleep(rng.uniform(0.0, delay))
     running = workers()
-    if not running or not part.is_running():
+    if not running or not process.is_running():
         return False
     try:
         os.kill(rng.choice(running), signal.SIGKILL)
@@ -139,14 +147,14 @@ def _kill_a_worker(part: RunProcess, words: str, rng: random.Random, delay: floa
     return True
 
 
-def _check_single_line(part: RunProcess, words: str) -> None:
-    if sum(words in line for line in part.lines) != 1:
-        raise Broken(f"not one line says {words!r}: {part.lines[-8:]}")
+def _check_single_line(process: RunProcess, text: str) -> None:
+    if sum(text in line for line in process.lines) != 1:
+        raise Broken(f"not one line says {text!r}: {process.lines[-8:]}")
 
 
 def worker_of_a_study(folder: Path, rng: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
     """Kill one of two cells: the other continues, and the next start finishes both, with the rows of undisturbed ones."""
-    words = _sweep_command(folder, executor)
+    words = _sweep_arguments(folder, executor)
     part = _start_command(words, folder)
     with kill_on_exit(part):
         cells = folder / "runs"
@@ -154,10 +162,10 @@ def worker_of_a_study(folder: Path, rng: random.Random, references: "References"
         part.wait()
     part.check_output()
     if struck:
-        if part.process.returncode == 0:
+        if part.popen.returncode == 0:
             raise NotStruck
-        if part.process.returncode not in (1, 3):
-            raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
+        if part.popen.returncode not in (1, 3):
+            raise Broken(f"ended with {part.popen.returncode}: {part.lines[-5:]}")
         _check_single_line(part, "failed with exit status")
     _wait_until_finished(_start_command(words, folder), 0)
     if _cell_rows(folder) != references.study():
@@ -166,7 +174,7 @@ def worker_of_a_study(folder: Path, rng: random.Random, references: "References"
         raise NotStruck
 
 
-def _sweep_command(folder: Path, executor: Sequence[str] = ()) -> list[str]:
+def _sweep_arguments(folder: Path, executor: Sequence[str] = ()) -> list[str]:
     words = ["sweep", "Reacher", "--preset", "debug", "--seeds", "2", "--seeds-per-run", "1", "--env-steps", "24000"]
     return [*words, "--updates-per-iteration", "20", "--eval-interval", "20", "--runs", str(folder / "runs"), *executor]
 
@@ -180,7 +188,7 @@ def job_of_a_study(folder: Path, rng: random.Random, references: "References") -
     worker_of_a_study(folder, rng, references, ("--executor", "local"))
 
 
-def _phenotype_command(folder: Path, plots: Path) -> list[str]:
+def _phenotype_arguments(folder: Path, plots: Path) -> list[str]:
     return ["phenotype", "run", str(plots), "--out", str(folder / "out"), "--masks", "truth", "--workers", "2"]
 
 
@@ -191,12 +199,12 @@ def _tables(out: Path) -> dict[str, bytes]:
 def worker_of_phenotyping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``phenotype run``; the next start writes the same tables."""
     plots, tables = references.phenotyping()
-    _pool(_phenotype_command(folder, plots), folder, rng)
+    _check_pool(_phenotype_arguments(folder, plots), folder, rng)
     if _tables(folder / "out") != tables:
         raise Broken("tables differ from those of an undisturbed run")
 
 
-def _grasp_command(folder: Path, spec: Path) -> list[str]:
+def _grasp_arguments(folder: Path, spec: Path) -> list[str]:
     words = ["grasp", "eval", "--masks", "truth", "--width", "256", "--frames", "3", "--runs", "3", "--spec", str(spec)]
     return [*words, "--workers", "2", "--json", str(folder / "eval.json")]
 
@@ -212,7 +220,7 @@ def _figures(file: Path) -> list[dict[str, Any]]:
 def worker_of_grasping(folder: Path, rng: random.Random, references: "References") -> None:
     """Kill a worker of ``grasp eval``; the next start gives the same figures."""
     spec, figures = references.grasping()
-    _pool(_grasp_command(folder, spec), folder, rng)
+    _check_pool(_grasp_arguments(folder, spec), folder, rng)
     if _figures(folder / "eval.json") != figures:
         raise Broken("figures differ from those of an undisturbed evaluation")
 
@@ -221,21 +229,21 @@ class NotStruck(Exception):
     """The command finished before the fault."""
 
 
-def _pool(words: Sequence[str], folder: Path, rng: random.Random) -> None:
+def _check_pool(arguments: Sequence[str], folder: Path, rng: random.Random) -> None:
     """Kill a worker of a pool, and check that the same command finishes when started again."""
     folder.mkdir(exist_ok=True)
-    part = _start_command(words, folder)
+    part = _start_command(arguments, folder)
     with kill_on_exit(part):
         struck = _kill_a_worker(part, "spawn_main", rng, 4.0, lambda: True)
         part.wait()
     part.check_output()
-    if struck and part.process.returncode == 0:
+    if struck and part.popen.returncode == 0:
         raise NotStruck  # the worker had finished its work
     if struck:
-        if part.process.returncode not in (1, 2):
-            raise Broken(f"ended with {part.process.returncode}: {part.lines[-5:]}")
+        if part.popen.returncode not in (1, 2):
+            raise Broken(f"ended with {part.popen.returncode}: {part.lines[-5:]}")
         _check_single_line(part, "processes was killed from outside")
-    _wait_until_finished(_start_command(words, folder), 0)
+    _wait_until_finished(_start_command(arguments, folder), 0)
     if not struck:
         raise NotStruck
 
@@ -262,7 +270,7 @@ class References:
         """Return the rows of each run of a sweep by the name of its cell."""
 
         def make(folder: Path) -> dict[str, list]:
-            _wait_until_finished(_start_command(_sweep_command(folder), folder), 0)
+            _wait_until_finished(_start_command(_sweep_arguments(folder), folder), 0)
             return _cell_rows(folder)
 
         return self._compute_once("study", make)
@@ -274,7 +282,7 @@ class References:
             (folder / "few.json").write_text(json.dumps(FEW_STALKS))
             words = ["phenotype", "synth", str(folder / "plots"), "--spec", str(folder / "few.json"), "--width", "422"]
             _wait_until_finished(_start_command([*words, "--frames", "4", "--plots", "2"], folder), 0)
-            _wait_until_finished(_start_command(_phenotype_command(folder, folder / "plots"), folder), 0)
+            _wait_until_finished(_start_command(_phenotype_arguments(folder, folder / "plots"), folder), 0)
             return folder / "plots", _tables(folder / "out")
 
         return self._compute_once("phenotyping", make)
@@ -285,7 +293,7 @@ class References:
         def make(folder: Path) -> tuple[Path, list]:
             spec = folder / "few.json"
             spec.write_text(json.dumps(FEW_TO_GRASP))
-            _wait_until_finished(_start_command(_grasp_command(folder, spec), folder), 0)
+            _wait_until_finished(_start_command(_grasp_arguments(folder, spec), folder), 0)
             return spec, _figures(folder / "eval.json")
 
         return self._compute_once("grasping", make)

@@ -68,16 +68,16 @@ def _send_signal(*numbers: int, to_group: bool = False) -> Strike:
                 if not part.is_running():
                     break
                 with contextlib.suppress(ProcessLookupError):
-                    (os.killpg if to_group else os.kill)(part.process.pid, number)
+                    (os.killpg if to_group else os.kill)(part.popen.pid, number)
                 time.sleep(rng.uniform(0.0, 0.3) if len(numbers) > 1 else 0.0)
             return _wait_for_end(part)
 
     return strike
 
 
-def _wait_for_end(part: RunProcess) -> int | None:
-    status = part.wait()
-    part.check_output()
+def _wait_for_end(process: RunProcess) -> int | None:
+    status = process.wait()
+    process.check_output()
     return status or None
 
 
@@ -124,9 +124,9 @@ def _stalled_disk(folder: Path, rng: random.Random) -> int | None:
             time.sleep(still)
             freeze(False)
         elif part.is_running():
-            part.process.send_signal(signal.SIGSTOP)
+            part.popen.send_signal(signal.SIGSTOP)
             time.sleep(still)
-            part.process.send_signal(signal.SIGCONT)
+            part.popen.send_signal(signal.SIGCONT)
         time.sleep(0.5)
         return part.stop() or None
 

@@ -69,12 +69,12 @@ class RunProcess:
 
     Attributes:
         folder: The run folder.
-        process: The process.
+        popen: The process.
         lines: Lines printed so far, stdout and stderr.
     """
 
     folder: Path
-    process: subprocess.Popen
+    popen: subprocess.Popen
     lines: list[str] = dataclasses.field(default_factory=list)
 
     @classmethod
@@ -103,7 +103,14 @@ class RunProcess:
     def start_command(
         cls, command: Sequence[str], folder: Path, variables: dict[str, str] | None = None, file_bytes: int | None = None
     ) -> "RunProcess":
-        """Start any command in the parent of ``folder``."""
+        """Start any command in the parent of ``folder``, in a session of its own.
+
+        Args:
+            command: The command.
+            folder: Run folder of the command.
+            variables: Additional environment variables.
+            file_bytes: Maximum size of a file that the process writes, bytes; None for no limit.
+        """
 
         def prepare() -> None:
             for number in (signal.SIGINT, signal.SIGHUP):  # ignored if the soak was started in the background
@@ -123,8 +130,8 @@ class RunProcess:
         self.reader = threading.Thread(target=self._read, daemon=True)
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+        assert self.popen.stdout is not None
+        for line in self.popen.stdout:
             self.lines.append(line.rstrip())
 
     def wait(self, seconds: float = 240.0) -> int:
@@ -134,10 +141,10 @@ class RunProcess:
             Broken: The process does not end in time; it is killed.
         """
         try:
-            status = self.process.wait(seconds)
+            status = self.popen.wait(seconds)
         except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+            self.popen.kill()
+            self.popen.wait()
             raise Broken(f"did not end within {seconds:g} s: {self.lines[-3:]}") from None
         self.reader.join(5.0)
         LAST.lines = self.lines
@@ -145,7 +152,7 @@ class RunProcess:
 
     def send(self, number: int) -> int:
         """Send a signal and wait for the end; return the exit status."""
-        self.process.send_signal(number)
+        self.popen.send_signal(number)
         return self.wait()
 
     def stop(self) -> int:
@@ -154,7 +161,7 @@ class RunProcess:
 
     def is_running(self) -> bool:
         """Return True if the process has not ended yet."""
-        return self.process.poll() is None
+        return self.popen.poll() is None
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 180.0) -> bool:
         """Wait for a condition, at most until the process ends; return True if it holds."""
@@ -177,9 +184,9 @@ class RunProcess:
         """Return True if a checkpoint is being written."""
         return any("tmp" in path.name for path in self.folder.glob("checkpoints/*/*"))
 
-    def count(self, words: str) -> int:
-        """Count the printed lines that contain ``words``."""
-        return sum(words in line for line in self.lines)
+    def count(self, text: str) -> int:
+        """Count the printed lines that contain ``text``."""
+        return sum(text in line for line in self.lines)
 
     def check_output(self) -> None:
         """Raise `Broken` if a traceback or a fatal error of Python was printed."""
@@ -189,12 +196,12 @@ class RunProcess:
 
 
 @contextlib.contextmanager
-def kill_on_exit(part: RunProcess) -> Iterator[RunProcess]:
+def kill_on_exit(process: RunProcess) -> Iterator[RunProcess]:
     """Kill the process and its group on exit, if it still runs."""
     try:
-        yield part
+        yield process
     finally:
-        if part.is_running():
+        if process.is_running():
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(part.process.pid, signal.SIGKILL)
-            part.process.wait()
+                os.killpg(process.popen.pid, signal.SIGKILL)
+            process.popen.wait()

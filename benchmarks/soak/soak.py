@@ -55,35 +55,35 @@ class Soak:
                 raise Broken("\n".join(part.lines))
         self.reference = read_rows(part.folder)
 
-    def _next_fault(self, kinds: dict[str, Any]) -> str | None:
+    def _next_fault(self, faults: dict[str, Any]) -> str | None:
         """Draw the next fault of these kinds, all equally often; None if it is time to end."""
         with self._lock:
             if self._left <= 0 or time.monotonic() > self._deadline:
                 return None
             self._left -= 1
-            deck = self._decks.setdefault(next(iter(kinds)), [])
+            deck = self._decks.setdefault(next(iter(faults)), [])
             if not deck:
-                deck += self._dice.sample(list(kinds), len(kinds))
+                deck += self._dice.sample(list(faults), len(faults))
             return deck.pop()
 
-    def _return_fault(self, kinds: dict[str, Any], fault: str) -> None:
+    def _return_fault(self, faults: dict[str, Any], fault: str) -> None:
         """Return a fault to the deck, because the run had finished before it."""
         with self._lock:
             self._left += 1
-            self._decks[next(iter(kinds))].insert(0, fault)
+            self._decks[next(iter(faults))].insert(0, fault)
 
-    def _note_fault(self, where: str, fault: str, outcome: str) -> None:
+    def _note_fault(self, run: str, fault: str, outcome: str) -> None:
         with self._lock:
             self.record.faults[fault] += 1
             self.record.minutes = round((time.monotonic() - self._started) / 60.0, 2)
-            print(f"{self.record.total:4}  {where:8} {fault:32} {outcome}", flush=True)
+            print(f"{self.record.total:4}  {run:8} {fault:32} {outcome}", flush=True)
             self._note(self.record)
 
-    def _note_violation(self, where: Path, faults: list[str], error: Exception) -> None:
+    def _note_violation(self, folder: Path, faults: list[str], error: Exception) -> None:
         text = str(error) if isinstance(error, Broken) else traceback.format_exc()
         with self._lock:
-            self.record.broken.append(f"{where.name}, {faults}: {text}")
-            print(f"BROKEN in {where}, after {faults}: {text}", flush=True)
+            self.record.broken.append(f"{folder.name}, {faults}: {text}")
+            print(f"BROKEN in {folder}, after {faults}: {text}", flush=True)
             self._note(self.record)
 
     def work(self, worker: int) -> None:
@@ -104,13 +104,13 @@ class Soak:
             if not going:
                 return
 
-    def _strike_alone(self, place: Path, rng: random.Random, faults: list[str]) -> bool:
+    def _strike_alone(self, folder: Path, rng: random.Random, faults: list[str]) -> bool:
         fault = self._next_fault(ALONE)
         if fault is None:
             return False
         faults.append(fault)
-        if strike_alone(fault, place, rng, self._references):
-            self._note_fault(place.name, fault, "")
+        if strike_alone(fault, folder, rng, self._references):
+            self._note_fault(folder.name, fault, "")
         else:
             self._return_fault(ALONE, fault)
         return True

@@ -25,7 +25,7 @@ from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
 from jaxrl_vis.stalks.phenotyping.detector.weights import SHIPPED
 from jaxrl_vis.stalks.phenotyping.measure.borders import fill_borders, find_frame
 from jaxrl_vis.stalks.phenotyping.training.examples import true_boxes
-from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_finds
+from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, match_to_annotations
 from jaxrl_vis_envs import plants
 from jaxrl_vis_envs.plants.pairs import Sequence
 
@@ -61,20 +61,20 @@ class ImageStatistics:
     plain: tuple[float, float]
 
 
-def render_plot(folder: Path, part: str, family: str, number: int) -> Path:
+def render_plot(folder: Path, purpose: str, family: str, number: int) -> Path:
     """Render `FRAMES` random images of one plot and its true boxes into a .npz file, unless it exists; return its path.
 
     Args:
         folder: Folder of the file; created if it does not exist.
-        part: ``fit`` or ``test``, which selects the range of seeds.
+        purpose: ``fit`` or ``test``, which selects the range of seeds.
         family: Name of a file of `SPECS`, or of a family of `jaxrl_vis_envs.plants`.
         number: Number of the plot, added to the first seed.
     """
-    path = folder / f"{part}_{family}_{number}.npz"
+    path = folder / f"{purpose}_{family}_{number}.npz"
     if path.exists():
         return path
     drawn_from = plants.read(FAMILIES / f"{family}.toml") if family in SPECS else plants.FAMILIES[family]
-    seed = FIRST_SEEDS[part] + number
+    seed = FIRST_SEEDS[purpose] + number
     sequence = Sequence.of(plants.draw(drawn_from.at_width(WIDTH), seed))
     true, arrays = sequence.drive.true, {}
     for index, frame in enumerate(np.random.default_rng(seed).choice(len(sequence), FRAMES, replace=False)):
@@ -113,9 +113,9 @@ def detect_stalks(
     return stalks + np.array([over, down, over, down, over, over], np.float32), scores, pooled
 
 
-def f1_score(hits: int, finds: int, stalks: int) -> float:
+def f1_score(hits: int, detections: int, stalks: int) -> float:
     """Return the F1 score for the numbers of correct detections, of detections and of stalks; 1 if the last two are 0."""
-    return 2.0 * hits / (finds + stalks) if finds + stalks else 1.0
+    return 2.0 * hits / (detections + stalks) if detections + stalks else 1.0
 
 
 def image_statistics(path: Path, finder: Finder, name: str) -> list[ImageStatistics]:
@@ -147,7 +147,7 @@ def _detect_images(path: Path, finder: Finder) -> Iterator[ImageStatistics]:
         for index in range(FRAMES):
             image, truth, kinds = (data[f"{name}_{index}"] for name in ("image", "stalks", "kinds"))
             stalks, scores, pooled = detect_stalks(finder, image, float(data["pixels_per_metre"]))
-            right, ignored = match_finds(stalks, scores, truth, kinds)
+            right, ignored = match_to_annotations(stalks, scores, truth, kinds)
             counted = (scores >= MIN_SCORE) & ~ignored
             f1 = f1_score(int((right & counted).sum()), int(counted.sum()), int((kinds == STALK).sum()))
             yield ImageStatistics("", pooled, scores, f1, brightness_and_sharpness(image))
@@ -177,12 +177,12 @@ def area_under_roc(values: np.ndarray, misread: np.ndarray) -> float:
     return float(np.mean((above > 0) + 0.5 * (above == 0))) if above.size else float("nan")
 
 
-def control_logits(fitted: list[ImageStatistics], tried: list[ImageStatistics]) -> np.ndarray:
+def control_logits(fitted: list[ImageStatistics], tested: list[ImageStatistics]) -> np.ndarray:
     """Return the logits [N] of a logistic regression on brightness and sharpness, their squares and product.
 
     Args:
         fitted: Images on which the regression is fitted.
-        tried: The N images for which the logits of being misread are returned.
+        tested: The N images for which the logits of being misread are returned.
     """
 
     def inputs(images: list[ImageStatistics]) -> np.ndarray:
@@ -190,7 +190,7 @@ def control_logits(fitted: list[ImageStatistics], tried: list[ImageStatistics]) 
         return np.concatenate([plain, plain**2, plain[:, :1] * plain[:, 1:]], axis=1)
 
     weights = fit_logistic_regression(inputs(fitted), np.array([image.f1 < MIN_F1 for image in fitted]))
-    return weights[0] + inputs(tried) @ weights[1:]
+    return weights[0] + inputs(tested) @ weights[1:]
 
 
 def report(name: str, images: list[ImageStatistics], gate: Gate, doubts_of_control: np.ndarray) -> None:

@@ -67,7 +67,7 @@ def plot_masks(options: argparse.Namespace, seed: int) -> tuple[int, Masks]:
 
 
 def keep_masks(options: argparse.Namespace) -> None:
-    """Render plots, and write their masks."""
+    """Render plots, and write their masks, widths and true widths to ``options.file`` (.npz) for `compare`."""
     from jaxrl_vis.host.worker_pool import map_unordered, share_accelerator
 
     if options.workers > 1:

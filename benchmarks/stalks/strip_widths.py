@@ -38,7 +38,7 @@ def ideal_strip(width: float, ratio: float, lean: float, position: tuple[float, 
     return inside.reshape(size, fine, size, fine).mean(axis=(1, 3)).astype(np.float32)
 
 
-def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, widths: tuple[float, ...]) -> np.ndarray:
+def mean_errors(estimate, ratio: float, lean: float, soft: bool, positions: int, widths: tuple[float, ...]) -> np.ndarray:
     """Return the mean relative error [len(widths)] of a width estimator; NaN where it returned None for a strip.
 
     Args:
@@ -46,13 +46,15 @@ def mean_errors(estimate, ratio: float, lean: float, soft: bool, places: int, wi
         ratio: Ratio of length to width.
         lean: Tilt, degrees.
         soft: Rasterise covered fractions instead of bool.
-        places: Number of random sub-pixel positions per width.
+        positions: Number of random sub-pixel positions per width.
         widths: True widths, pixels.
     """
     rng = np.random.default_rng(0)
     errors = []
     for width in widths:
-        estimates = [estimate(ideal_strip(width, ratio, lean, tuple(rng.uniform(-0.5, 0.5, 2)), soft)) for _ in range(places)]
+        estimates = [
+            estimate(ideal_strip(width, ratio, lean, tuple(rng.uniform(-0.5, 0.5, 2)), soft)) for _ in range(positions)
+        ]
         errors.append(np.mean([np.nan if estimated is None else estimated / width - 1.0 for estimated in estimates]))
     return np.array(errors)
 
@@ -63,11 +65,11 @@ def width_by_strip(mask: np.ndarray) -> float | None:
     return None if strip is None else strip.width()
 
 
-def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
+def table(positions: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> list[str]:
     """Return the lines of a Markdown table: for each estimator, mask, tilt and ratio, the mean error at the worst width.
 
     Args:
-        places: Number of random sub-pixel positions per width.
+        positions: Number of random sub-pixel positions per width.
         widths: True widths, pixels.
     """
     estimators = {"strip": width_by_strip} | {
@@ -80,7 +82,7 @@ def table(places: int = 12, widths: tuple[float, ...] = (20.0, 27.5, 38.9)) -> l
     for name, estimate in estimators.items():
         for soft in (True, False) if name == "strip" else (False,):
             for lean in LEANS if name == "strip" else (0.0, 20.0):
-                errors = [mean_errors(estimate, ratio, lean, soft, places, widths) for ratio in RATIOS]
+                errors = [mean_errors(estimate, ratio, lean, soft, positions, widths) for ratio in RATIOS]
                 worst = [row[np.nanargmax(np.abs(row))] if np.isfinite(row).any() else np.nan for row in errors]
                 cells = " | ".join(f"{100 * error:+.2f} %" for error in worst)
                 lines.append(f"| {name} | {'soft' if soft else 'hard'} | {lean:g} | {cells} |")

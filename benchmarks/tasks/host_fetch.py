@@ -138,7 +138,7 @@ class HostFetch:
     def run_episode(self, policy: Policy) -> Episode:
         """Roll out an episode of `HORIZON` steps; actions are clipped to [-1, 1].
 
-        The goal image is taken after ten actions of a proportional controller towards the goal, from another start.
+        The goal image is taken after ten actions of a proportional controller towards the goal, before the robot is reset.
         """
         grip, goal = self._begin()
         for _ in range(10):

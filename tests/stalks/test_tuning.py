@@ -24,7 +24,7 @@ from jaxrl_vis.stalks.phenotyping.training.examples import (
     fit_settings,
     resize_crops,
 )
-from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, match_finds, score_finds
+from jaxrl_vis.stalks.phenotyping.training.held_out import ImageDetections, match_to_annotations, score_detections
 from jaxrl_vis.stalks.phenotyping.training.photographs import group_by_photograph, split_images
 from jaxrl_vis.stalks.phenotyping.training.tuning import FROZEN, Tuning, tune
 
@@ -103,14 +103,14 @@ def test_scores_of_finds():
         [[1, 0, 11, 100, 6, 6], [0, 0, 10, 100, 5, 5], [80, 0, 90, 100, 85, 85], [20, 0, 30, 100, 25, 25]], np.float32
     )
     scores = np.array([0.9, 0.8, 0.95, 0.3])
-    right, ignored = match_finds(stalks, scores, truth, kinds)
+    right, ignored = match_to_annotations(stalks, scores, truth, kinds)
     assert right.tolist() == [True, False, False, False] and ignored.tolist() == [False, False, True, False]
-    result = score_finds([Finds(stalks, scores, right, ignored, 2)])
+    result = score_detections([ImageDetections(stalks, scores, right, ignored, 2)])
     assert (result.finds, result.right, result.labels) == (2, 1, 2)
     assert result.precision == result.recall == result.f1 == 0.5
     assert result.soft == pytest.approx(2 * 0.9 / (0.9 + 0.8 + 0.3 + 2))
     # As good with a higher threshold; F1 does not see that the wrong one became less sure.
-    better = score_finds([Finds(stalks, np.array([0.9, 0.6, 0.95, 0.1]), right, ignored, 2)])
+    better = score_detections([ImageDetections(stalks, np.array([0.9, 0.6, 0.95, 0.1]), right, ignored, 2)])
     assert better.f1 == result.f1 and better.soft > result.soft
 
 

@@ -27,12 +27,12 @@ def host_table(results: Path) -> str | None:
 def rows(folder: Path) -> str:
     """Return a table of all records in ``folder`` as Markdown, with a row for the seeds of each mode, method and noise."""
     cells = [cell for cell in host_learning.cells() if (folder / f"{cell.name}.json").exists()]
-    records = sorted((read_json(folder / f"{cell.name}.json") for cell in cells), key=_place)
+    records = sorted((read_json(folder / f"{cell.name}.json") for cell in cells), key=_sort_key)
     lines = [
         "| data | reward | camera noise | seeds | steps to 0.9 | final success | false positive rate | false negative rate |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for _, group in itertools.groupby(records, key=_place):
+    for _, group in itertools.groupby(records, key=_sort_key):
         lines.append(_row(list(group)))
     revisions = ", ".join(sorted({record["revision"][:7] for record in records}))
     versions = records[0]["versions"]
@@ -44,7 +44,7 @@ def rows(folder: Path) -> str:
     return "\n".join(lines)
 
 
-def _place(record: dict[str, Any]) -> tuple[str, int, int]:
+def _sort_key(record: dict[str, Any]) -> tuple[str, int, int]:
     return record["mode"], record["noise"], list(_TITLES).index(record["method"])
 
 

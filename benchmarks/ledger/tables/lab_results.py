@@ -51,7 +51,7 @@ def find_record(figure: Figure, device: str, records: list[dict[str, Any]]) -> d
     return max(matches, key=lambda record: record["value"], default=None)
 
 
-def _words(record: dict[str, Any]) -> dict[str, Any]:
+def _format_fields(record: dict[str, Any]) -> dict[str, Any]:
     """Return the fields for the format string of a figure."""
     config = record["config"]
     words = {**record["details"], **config, "value": format_short(record["value"])}
@@ -68,7 +68,7 @@ def _words(record: dict[str, Any]) -> dict[str, Any]:
 def speed_cell(figures: tuple[Figure, ...], device: str, records: list[dict[str, Any]]) -> str:
     """Format the figures of one device, separated by semicolons; `MISSING` for those without a record."""
     shown = [(figure, find_record(figure, device, records)) for figure in figures]
-    return "; ".join(MISSING if record is None else figure.text.format(**_words(record)) for figure, record in shown)
+    return "; ".join(MISSING if record is None else figure.text.format(**_format_fields(record)) for figure, record in shown)
 
 
 def speed_table(results: Path) -> str:
@@ -118,14 +118,14 @@ def learning_text(row: Learning, runs: list[Evidence]) -> str:
     for target in row.targets:
         steps = steps_to(points, target, row.lower_is_better)
         reached = "not reached" if steps is None else f"by {format_short(steps)} steps"
-        parts.append(row.word.format(target) + f" {reached}")
+        parts.append(row.value_format.format(target) + f" {reached}")
     for budget in row.steps:
         steps, value = max(point for point in points if point[0] <= budget)
-        parts.append(row.word.format(value) + f" at {format_short(steps)} steps")
+        parts.append(row.value_format.format(value) + f" at {format_short(steps)} steps")
     end, median = points[-1]
     finals = sorted(line[row.metric] for line in rows if line["env_steps"] == end)
     spread = f" ({finals[0]:.3g} to {finals[-1]:.3g})" if finals[0] != finals[-1] else ""
-    parts.append(row.word.format(median) + f"{spread} at the end, {format_short(end)} steps")
+    parts.append(row.value_format.format(median) + f"{spread} at the end, {format_short(end)} steps")
     wall, compiling = (statistics.median(times) for times in zip(*(evidence.seconds(run.rows) for run in runs), strict=True))
     return (
         f"{'; '.join(parts)} (median of {len(finals)} seeds); {format_minutes(wall)}{' each' if len(runs) > 1 else ''}, "

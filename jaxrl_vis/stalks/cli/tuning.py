@@ -114,7 +114,7 @@ def _split(options: DetectorTraining, names: list[str], examples: list[Example],
 def _report(
     page: Path,
     examples: list[Example],
-    parts: Split,
+    split: Split,
     tuned: TuningResult,
     settings: Settings,
     start: Any,
@@ -125,10 +125,10 @@ def _report(
     import jax.numpy as jnp
 
     from jaxrl_vis.stalks.phenotyping.report.training_page import write_page
-    from jaxrl_vis.stalks.phenotyping.training.held_out import mask_overlap, score_finds
+    from jaxrl_vis.stalks.phenotyping.training.held_out import mask_overlap, score_detections
 
-    test = [examples[place] for place in parts.test]
-    scores = {name: score_finds(finds) for name, finds in (("before", tuned.before), ("after", tuned.after))}
+    test = [examples[place] for place in split.test]
+    scores = {name: score_detections(finds) for name, finds in (("before", tuned.before), ("after", tuned.after))}
     overlaps = dict.fromkeys(scores, math.nan)
     if masks:
         pairs = {"before": start, "after": tuned.params}
@@ -145,8 +145,8 @@ def _report(
             + (f", masks overlap {overlap:.2f}" if math.isfinite(overlap) else "")
         )
     facts = [
-        f"{len(parts.train)} images to learn from, {len(parts.stop)} to decide when to stop, {len(parts.test)} for this page; "
-        f"{parts.photographs} photographs, no copy of one on both sides.",
+        f"{len(split.train)} images to learn from, {len(split.stop)} to decide when to stop, {len(split.test)} for this page; "
+        f"{split.photographs} photographs, no copy of one on both sides.",
         f"{tuned.updates} updates in {tuned.update_s / 60:.1f} min after {tuned.compile_s:.0f} s of compilation; the end: "
         f"{tuned.stop_reason}; the weights are those of update {tuned.best_step}.",
     ]

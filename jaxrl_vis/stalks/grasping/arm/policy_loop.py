@@ -42,11 +42,11 @@ def check_policy(policy: Policy) -> None:
         raise RequestError(f"--policy must see single images: its run has frame_stack {policy.env.frame_stack}")
 
 
-class _Moving(NamedTuple):
+class _LoopState(NamedTuple):
     """State of an arm during a reach, and setpoint [3] of its grip, m in the frame of the stand."""
 
     reaching: Reaching
-    place: jax.Array
+    setpoint: jax.Array
 
 
 def reach_by_policy(
@@ -119,22 +119,22 @@ def _compile_programs(policy: Policy) -> tuple[Any, Any]:
         scene = Scene(shape, bending.gusts(key, wind), jnp.float32(1.0))
         model = bending.fit(arms.model, arms.layout, shape)
 
-        def step(moving: _Moving, _: None) -> tuple[_Moving, dict[str, jax.Array]]:
+        def step(moving: _LoopState, _: None) -> tuple[_LoopState, dict[str, jax.Array]]:
             reaching, place = moving
             action = jnp.clip(policy(image(model, reaching.data), goal), -1.0, 1.0)
             wanted = within_reach(place + env.config.action_scale * action)
             is_closing = reaching.data.time > timing.reach - 0.5 / control.RATE
 
-            def one(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:
+            def interpolate(reaching: Reaching, fraction: jax.Array) -> tuple[Reaching, None]:
                 return step_control(arms, model, scene, reaching, place + fraction * (wanted - place), is_closing, gains), None
 
-            reaching, _ = jax.lax.scan(one, reaching, jnp.arange(1, substeps + 1) / substeps)
+            reaching, _ = jax.lax.scan(interpolate, reaching, jnp.arange(1, substeps + 1) / substeps)
             reaching = reaching._replace(data=mjx_model.kinematics(model, reaching.data))
             now = {"path": wanted, "taken": stalk_arm.grip_at(reaching.data.qpos[:3]), "poses": reaching.data.qpos}
-            return _Moving(reaching, wanted), now
+            return _LoopState(reaching, wanted), now
 
         with jax.default_matmul_precision("highest"):
-            start = _Moving(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
+            start = _LoopState(begin(arms, scene, HOME), jnp.asarray(HOME, jnp.float32))
             steps = round((timing.reach + timing.close) / env.control_period)
             (reaching, _), history = jax.lax.scan(step, start, length=steps)
         return {**history, "held": held_stalks(arms, reaching.data), "touched": reaching.touched, "brushed": reaching.brushed}

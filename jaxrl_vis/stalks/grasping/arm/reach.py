@@ -220,7 +220,12 @@ def reach(
 
 
 def _observe_targets(
-    observer: Callable[[ArmView], np.ndarray], stands: Stands, targets: np.ndarray, can: np.ndarray, time: float, report: dict
+    observer: Callable[[ArmView], np.ndarray],
+    stands: Stands,
+    targets: np.ndarray,
+    is_reachable: np.ndarray,
+    time: float,
+    report: dict,
 ) -> np.ndarray:
     """Return the targets [B, 3] after a call of the observer, unchanged where its target is not finite or out of reach.
 
@@ -228,7 +233,7 @@ def _observe_targets(
         observer: See `reach`.
         stands: True stalks around each of B arms.
         targets: [B, 3] float32, present targets, m in the plot's frame.
-        can: [B] bool, arms whose first target was within reach; the targets of the others are unchanged.
+        is_reachable: [B] bool, arms whose first target was within reach; the targets of the others are unchanged.
         time: Time since the start, s.
         report: Last report of `_advance`, batched.
 
@@ -240,7 +245,7 @@ def _observe_targets(
     if updated.shape != targets.shape:
         raise ValueError(f"a look must return targets {list(targets.shape)}, got {list(updated.shape)}")
     there = np.all(np.isfinite(updated), axis=-1)
-    there &= can & reachable(stands.origin, np.where(there[:, None], updated, 0.0))
+    there &= is_reachable & reachable(stands.origin, np.where(there[:, None], updated, 0.0))
     return np.where(there[:, None], updated, targets)
 
 

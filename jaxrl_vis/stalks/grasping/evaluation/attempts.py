@@ -155,9 +155,9 @@ def _detections_around(choice: Choice, x: float, target: np.ndarray, scene: Scen
     return stand_of_lines(ends[:, 0], ends[:, 1] - ends[:, 0], stalk_radii(perception.points, height), x, target, POLICY_STALKS)
 
 
-def _offset_from_stalk(target: np.ndarray, places: np.ndarray, stalk: int) -> np.ndarray:
+def _offset_from_stalk(target: np.ndarray, positions: np.ndarray, stalk: int) -> np.ndarray:
     """Return the horizontal offset [2] of a target from its stalk, m; NaN without one."""
-    return target[:2] - places[stalk] if stalk >= 0 else np.full(2, np.nan)
+    return target[:2] - positions[stalk] if stalk >= 0 else np.full(2, np.nan)
 
 
 def _offset_at_stop(
@@ -192,7 +192,13 @@ def reachable_from_any_stop(points: np.ndarray, stops: np.ndarray) -> np.ndarray
 
 
 def _true_stalks(plot: Plot, origins: np.ndarray, number: int) -> tuple[Standing, ...]:
-    """Return the true stalks of the stretch, with their reachability and room at the preferred height."""
+    """Return the true stalks of the stretch that the run passes, with their reachability and room at the preferred height.
+
+    Args:
+        plot: The plot.
+        origins: [S, 3] float64, `Stands.origin` of the arm at each stop, m in the plot's frame.
+        number: Number of the run.
+    """
     low, high = driven_stretch(plot)
     middles = np.array([stalk.at_height(PREFERRED)[0] for stalk in plot.measured]).reshape(-1, 3)
     radii = np.array([0.5 * stalk.diameter(PREFERRED) for stalk in plot.measured])
@@ -246,16 +252,16 @@ def execute_plans(
     return attempts
 
 
-def wind_keys(runs: np.ndarray, places: np.ndarray, seed: int = 0) -> jax.Array:
+def wind_keys(runs: np.ndarray, indices: np.ndarray, seed: int = 0) -> jax.Array:
     """Return typed keys [B] for sampling the wind, derived from each attempt's run, its index within the run, and the seed.
 
     Args:
         runs: [B] int, numbers of the runs.
-        places: [B] int, indices of the attempts within their runs.
+        indices: [B] int, indices of the attempts within their runs.
         seed: Seed of the wind.
     """
     of_runs = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(seed), runs)
-    return jax.vmap(jax.random.fold_in)(of_runs, places)
+    return jax.vmap(jax.random.fold_in)(of_runs, indices)
 
 
 def to_attempts(

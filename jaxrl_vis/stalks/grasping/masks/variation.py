@@ -57,7 +57,7 @@ def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: ja
     mirror = jnp.where(draws[3] > 0.0, 1.0, -1.0)
     line, column = jnp.meshgrid(jnp.arange(height) - 0.5 * (height - 1), jnp.arange(width) - 0.5 * (width - 1), indexing="ij")
 
-    def one(image: jax.Array, mask: jax.Array, size: jax.Array, wide: jax.Array, shear: jax.Array, mirror: jax.Array):
+    def resample(image: jax.Array, mask: jax.Array, size: jax.Array, wide: jax.Array, shear: jax.Array, mirror: jax.Array):
         y = jnp.clip(line / size + 0.5 * (height - 1), 0.0, height - 1.0)
         x = jnp.clip(mirror * (column / wide + shear * line) / size + 0.5 * (width - 1), 0.0, width - 1.0)
         top, left = jnp.floor(y).astype(jnp.int32), jnp.floor(x).astype(jnp.int32)
@@ -69,7 +69,7 @@ def _transform(values: jax.Array, masks: jax.Array, strength: jax.Array, key: ja
         mixed = upper * (1 - down) + lower * down
         return mixed[..., :3], mixed[..., 3] >= 0.5
 
-    return jax.vmap(one)(values, masks, size, wide, shear, mirror)
+    return jax.vmap(resample)(values, masks, size, wide, shear, mirror)
 
 
 def _smooth_noise(key: jax.Array, shape: tuple[int, ...], lines: int, columns: int, channels: int = 1) -> jax.Array:

@@ -112,8 +112,8 @@ def detect_grasp_points(
 
 def _seeds(segments: StalkSegments) -> list[np.ndarray]:
     """Return the indices of the chords of each piece with at least 5, tall pieces first."""
-    order = np.argsort(segments.piece, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(segments.piece[order])) + 1) if len(order) else []
+    order = np.argsort(segments.component, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(segments.component[order])) + 1) if len(order) else []
     parts = [part for part in parts if len(part) >= 5]
     return sorted(parts, key=lambda part: -float(np.ptp(segments.middle[part, 2])))
 
@@ -262,15 +262,15 @@ def _is_same_stalk(point: GraspPoint, other: GraspPoint) -> bool:
     return distance < _APART + _SEPARATION_GROWTH * abs(up) or (distance < _REST_WITHIN and point.spread > _REST_SPREAD)
 
 
-def _are_side_by_side(segments: StalkSegments, one: _Line, other: _Line) -> bool:
+def _are_side_by_side(segments: StalkSegments, first: _Line, second: _Line) -> bool:
     """Return True if pairs show two lines side by side in the same image rows: these are distinct stalks, however near."""
     apart = [np.zeros(0)]
-    for frame in np.intersect1d(segments.frame[one.members], segments.frame[other.members]):
-        mine, theirs = (segments.middle[line.members[segments.frame[line.members] == frame]] for line in (one, other))
+    for frame in np.intersect1d(segments.frame[first.members], segments.frame[second.members]):
+        mine, theirs = (segments.middle[line.members[segments.frame[line.members] == frame]] for line in (first, second))
         theirs = theirs[np.argsort(theirs[:, 2])]
         place = np.searchsorted(0.5 * (theirs[1:, 2] + theirs[:-1, 2]), mine[:, 2])
         level = np.abs(theirs[place, 2] - mine[:, 2]) < _LEVEL
         apart.append(np.linalg.norm((theirs[place] - mine)[level, :2], axis=1))
     distances = np.concatenate(apart)
-    enough = max(_MIN_BESIDE, _FRACTION_BESIDE * min(len(one.members), len(other.members)))
+    enough = max(_MIN_BESIDE, _FRACTION_BESIDE * min(len(first.members), len(second.members)))
     return len(distances) >= enough and float(np.median(distances)) > _APART_BESIDE

@@ -32,13 +32,13 @@ class StalkSegments:
         middle: [N, 3] float64, centre of the stalk at each chord in the robot's frame (`cloud`), m.
         thickness: [N] float64, diameter of the stalk, m.
         frame: [N] int, index of the pair.
-        piece: [N] int, number of the piece: chords of one pair that are connected from row to row.
+        component: [N] int, index of the connected component: chords of one pair that are connected from row to row.
     """
 
     middle: np.ndarray
     thickness: np.ndarray
     frame: np.ndarray
-    piece: np.ndarray
+    component: np.ndarray
 
     def __len__(self) -> int:
         return len(self.thickness)
@@ -77,16 +77,16 @@ def extract_stalk_segments(cloud: Cloud, calibration: Calibration, mount: Mount,
     return StalkSegments(mount.pose.to_world(points), thickness, np.full(len(line), frame), piece)
 
 
-def join_segments(parts: list[StalkSegments]) -> StalkSegments:
-    """Concatenate the chords of several pairs, all in one robot frame; pieces are renumbered to stay distinct."""
-    if not parts:
+def join_segments(segments: list[StalkSegments]) -> StalkSegments:
+    """Concatenate the chords of several pairs, all in one robot frame; components are renumbered to stay distinct."""
+    if not segments:
         return _empty_segments()
-    counts = np.cumsum([0, *(int(part.piece.max(initial=-1)) + 1 for part in parts)])
+    counts = np.cumsum([0, *(int(part.component.max(initial=-1)) + 1 for part in segments)])
     return StalkSegments(
-        np.concatenate([part.middle for part in parts]),
-        np.concatenate([part.thickness for part in parts]),
-        np.concatenate([part.frame for part in parts]),
-        np.concatenate([part.piece + count for part, count in zip(parts, counts)]),
+        np.concatenate([part.middle for part in segments]),
+        np.concatenate([part.thickness for part in segments]),
+        np.concatenate([part.frame for part in segments]),
+        np.concatenate([part.component + count for part, count in zip(segments, counts)]),
     )
 
 

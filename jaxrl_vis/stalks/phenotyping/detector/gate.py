@@ -142,28 +142,32 @@ def fit_gate(
     measures = np.zeros((len(misread), MEASURES))
     for part in range(_FOLDS):
         here = np.flatnonzero(parts == part)
-        of_others = _statistics(pooled[~misread & (parts != part)], axes)
+        of_others = _fit_statistics(pooled[~misread & (parts != part)], axes)
         measures[here] = [of_others.measures(pooled[place], scores[place]) for place in here]
     weights = fit_logistic_regression(measures, misread)
     doubts = 1.0 / (1.0 + np.exp(-np.clip(weights[0] + measures @ weights[1:], -30.0, 30.0)))
     threshold = float(np.quantile(doubts[~misread], 1.0 - max_flagged))
-    return dataclasses.replace(_statistics(pooled[~misread], axes), weights=weights, threshold=threshold)
+    return dataclasses.replace(_fit_statistics(pooled[~misread], axes), weights=weights, threshold=threshold)
 
 
-def _statistics(right: np.ndarray, axes: int) -> Gate:
+def _fit_statistics(pooled: np.ndarray, axes: int) -> Gate:
     """Return a gate with the statistics of pooled features [N, D] of correctly read images, and zero weights."""
-    mean, scale = right.mean(axis=0), right.std(axis=0)
+    mean, scale = pooled.mean(axis=0), pooled.std(axis=0)
     scale = scale + 0.1 * scale.mean() + 1e-6  # regularised: few images may understate the variance
-    offset = (right - mean) / scale
+    offset = (pooled - mean) / scale
     _, lengths, directions = np.linalg.svd(offset, full_matrices=False)
-    spread = lengths[:axes] / np.sqrt(len(right))
+    spread = lengths[:axes] / np.sqrt(len(pooled))
     principal = (directions[:axes] / spread[:, None]).T
     left = offset - (offset @ directions[:axes].T) @ directions[:axes]
     return Gate(mean, scale, principal, float(np.sqrt(np.mean(left**2))), np.zeros(1 + MEASURES), 0.5)
 
 
 def fit_logistic_regression(measures: np.ndarray, misread: np.ndarray) -> np.ndarray:
-    """Fit a class-balanced, L2-regularised logistic regression to measures [N, M] by Newton's method.
+    """Fit a class-balanced, L2-regularised logistic regression by Newton's method.
+
+    Args:
+        measures: [N, M] float64, inputs.
+        misread: [N] bool, targets, with both values.
 
     Returns:
         Intercept and weights [1 + M].
@@ -173,8 +177,8 @@ def fit_logistic_regression(measures: np.ndarray, misread: np.ndarray) -> np.nda
     shrink = np.diag([0.0, *[1e-3] * measures.shape[1]])
     weights = np.zeros(inputs.shape[1])
     for _ in range(50):
-        chance = 1.0 / (1.0 + np.exp(-np.clip(inputs @ weights, -30.0, 30.0)))
-        slope = inputs.T @ (weight * (chance - misread)) + shrink @ weights
-        bend = (inputs.T * (weight * chance * (1.0 - chance))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
-        weights = weights - np.linalg.solve(bend, slope)
+        probability = 1.0 / (1.0 + np.exp(-np.clip(inputs @ weights, -30.0, 30.0)))
+        gradient = inputs.T @ (weight * (probability - misread)) + shrink @ weights
+        hessian = (inputs.T * (weight * probability * (1.0 - probability))) @ inputs + shrink + 1e-9 * np.eye(len(weights))
+        weights = weights - np.linalg.solve(hessian, gradient)
     return weights

@@ -226,6 +226,9 @@ def _pair_by_times(folder: Path, sides: _Sides) -> _Sides:
         folder: The folder, for messages.
         sides: Files by name of their pair; modified in place if all unpaired names are timestamps, unchanged otherwise.
 
+    Returns:
+        ``sides``.
+
     Raises:
         RequestError: The images of a pair are so far apart in time that the robot has moved.
     """

@@ -120,17 +120,17 @@ def _write_all(path: Path, folder: Path, topics: Topics | None) -> None:
         _write_odometry(folder / "odometry.csv", kinds, messages)
 
 
-def _find_topics(kinds: dict[str, str], path: Path) -> Topics:
+def _find_topics(message_types: dict[str, str], path: Path) -> Topics:
     """Find the topics of the left and right images.
 
     Args:
-        kinds: Message type by topic.
+        message_types: Message type by topic.
         path: The recording, for messages.
 
     Raises:
         RequestError: There is no pair of topics, or several.
     """
-    images = [topic for topic, kind in kinds.items() if kind in _IMAGE and "depth" not in topic]
+    images = [topic for topic, kind in message_types.items() if kind in _IMAGE and "depth" not in topic]
     pairs = {
         Topics(topic, other) for topic in images for side, other in partner_names(topic) if side == "left" and other in images
     }
@@ -140,17 +140,17 @@ def _find_topics(kinds: dict[str, str], path: Path) -> Topics:
         pairs = best or pairs
     if len(pairs) != 1:
         what = "several pairs of images" if pairs else "no pair of left and right images"
-        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_format_topics(kinds)}")
+        raise RequestError(f"{path} has {what}: say --left TOPIC --right TOPIC; {_format_topics(message_types)}")
     return pairs.pop()
 
 
-def _format_topics(kinds: dict[str, str]) -> str:
-    images = sorted(topic for topic, kind in kinds.items() if kind in _IMAGE)
+def _format_topics(message_types: dict[str, str]) -> str:
+    images = sorted(topic for topic, kind in message_types.items() if kind in _IMAGE)
     others = f" and {len(images) - _MAX_LISTED} others" if len(images) > _MAX_LISTED else ""
     return f"images are on {', '.join(images[:_MAX_LISTED])}{others}" if images else "no topic has images"
 
 
-def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) -> None:
+def _write_camera(path: Path, topic: str, message_types: dict[str, str], messages: Any) -> None:
     """Write the first camera_info message that belongs to an image topic, if there is one.
 
     Raises:
@@ -159,7 +159,7 @@ def _write_camera(path: Path, topic: str, kinds: dict[str, str], messages: Any) 
     """
     parts = topic.split("/")
     named = ["/".join([*parts[:length], "camera_info"]) for length in range(len(parts) - 1, 0, -1)]
-    info = next((name for name in named if kinds.get(name) == _CAMERA), None)
+    info = next((name for name in named if message_types.get(name) == _CAMERA), None)
     message = None if info is None else next(messages(info), None)
     if message is None:
         return
@@ -227,14 +227,14 @@ def _decode_pixels(message: Any, source: str) -> np.ndarray:
     return lines if channels == 1 else np.ascontiguousarray(colours)
 
 
-def _write_odometry(path: Path, kinds: dict[str, str], messages: Any) -> None:
+def _write_odometry(path: Path, message_types: dict[str, str], messages: Any) -> None:
     """Write the robot's finite positions with timestamps in ns.
 
     They are read from the first Odometry topic, or else from the first NavSatFix topic (shortest name first); nothing is
     written if neither has any.
     """
     for kind, columns in zip(_ODOMETRY, ("x_m,y_m,z_m", "latitude,longitude")):
-        topics = sorted((topic for topic, of in kinds.items() if of == kind), key=lambda topic: (len(topic), topic))
+        topics = sorted((topic for topic, of in message_types.items() if of == kind), key=lambda topic: (len(topic), topic))
         if not topics:
             continue
         lines = [f"time_ns,{columns}"]

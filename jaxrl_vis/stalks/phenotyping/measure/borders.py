@@ -65,8 +65,8 @@ def _extent(image: np.ndarray, lit: Any, axis: int) -> tuple[int, int]:
     return first, last
 
 
-def _is_filled(part: np.ndarray) -> bool:
-    return bool(part.size) and float(part.mean()) <= _FILLED
+def _is_filled(border: np.ndarray) -> bool:
+    return bool(border.size) and float(border.mean()) <= _FILLED
 
 
 def _border_wedges(image: np.ndarray, dark: np.ndarray) -> np.ndarray:

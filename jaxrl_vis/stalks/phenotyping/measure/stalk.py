@@ -126,7 +126,7 @@ def measure_stalk(
         height=math.nan if ground is None else ground.height(middle + corner[1], place + corner[0], depth, calibration),
         lean=strip.lean,
         tilt=tilt,
-        confidence=confidence * min(matched.values.size / max(matched.tried, 1), 1.0),
+        confidence=confidence * min(matched.values.size / max(matched.window_count, 1), 1.0),
         both_edges_visible=near is not None or method == "ellipse",
     )
 

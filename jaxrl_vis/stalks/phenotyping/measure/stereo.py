@@ -35,13 +35,13 @@ class StalkDisparity:
         lines: [N] float64, centre row of each matched window.
         values: [N] float64, disparity of each, pixels.
         scores: [N] float64, normalised cross-correlation of each, up to 1.
-        tried: Number of windows, including unmatched ones.
+        window_count: Number of windows, including unmatched ones.
     """
 
     lines: np.ndarray
     values: np.ndarray
     scores: np.ndarray
-    tried: int
+    window_count: int
 
     def at(self, line: float) -> tuple[float, float] | None:
         """Estimate the disparity in an image row by a robust straight-line fit to the windows.
@@ -50,7 +50,7 @@ class StalkDisparity:
             Disparity and its standard error, pixels; None if there are fewer than three inliers, or fewer than 0.4 of the
             windows tried.
         """
-        minimum = max(3, math.ceil(_AGREEING * self.tried))
+        minimum = max(3, math.ceil(_AGREEING * self.window_count))
         if self.lines.size < minimum:
             return None
         offset = self.lines - line

@@ -258,9 +258,9 @@ def _common_slope(line: np.ndarray, left: np.ndarray, right: np.ndarray) -> floa
 
 
 @functools.lru_cache(maxsize=512)
-def index_pairs(count: int, apart: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs of indices below ``count`` that differ by at least ``apart``, as arrays of the lower and upper ones."""
-    return np.triu_indices(count, k=apart)
+def index_pairs(count: int, min_difference: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return all pairs of indices below ``count`` that differ by ``min_difference`` or more: lower and upper ones, [P] each."""
+    return np.triu_indices(count, k=min_difference)
 
 
 def median(values: np.ndarray) -> float:

@@ -84,14 +84,14 @@ class _LabelWriter:
         self._canvas, self._letters, self._thick = canvas, font_scale, thickness
         self._taken: list[tuple[int, int, int, int]] = []
 
-    def above(self, place: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
+    def above(self, point: tuple[int, int], text: str, colour: tuple[int, int, int]) -> None:
         """Write text above a point (column, row), as close as there is free space, with a line down to the point."""
         wide, tall = self._size(text)
-        left = min(max(place[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
-        bottom = place[1] - tall // 2
+        left = min(max(point[0] - wide // 2, 0), max(self._canvas.shape[1] - wide, 0))
+        bottom = point[1] - tall // 2
         while bottom > 2 * tall and any(_do_overlap((left, bottom - tall, left + wide, bottom), box) for box in self._taken):
             bottom -= tall // 3
-        cv2.line(self._canvas, (place[0], bottom), place, colour, 1, cv2.LINE_AA)
+        cv2.line(self._canvas, (point[0], bottom), point, colour, 1, cv2.LINE_AA)
         self._write((left, bottom), text, colour)
 
     def legend(self, title: str) -> None:

@@ -304,18 +304,20 @@ class _Pictures:
             yield f"<figure>{html_image(small, name, 'pair')}<figcaption>{_escape(name)}</figcaption></figure>"
 
 
-def html_image(image: np.ndarray, name: str, kind: str) -> _Html:
+def html_image(image: np.ndarray, name: str, css_class: str) -> _Html:
     """Return an HTML element with an image (RGB [H, W, 3] uint8) embedded as JPEG.
 
     Args:
         image: The image.
         name: Alternative text and tooltip.
-        kind: CSS class, ``stalk`` or ``pair``.
+        css_class: CSS class, ``stalk`` or ``pair``.
     """
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 75])
     source = base64.b64encode(data.tobytes()).decode()
     title = _escape(name)
-    return _Html(f'<img class="{kind}" loading="lazy" alt="{title}" title="{title}" src="data:image/jpeg;base64,{source}">')
+    return _Html(
+        f'<img class="{css_class}" loading="lazy" alt="{title}" title="{title}" src="data:image/jpeg;base64,{source}">'
+    )
 
 
 def _chart(plot: PlotResult, rejected: list[Track]) -> str:

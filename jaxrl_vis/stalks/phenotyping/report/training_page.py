@@ -13,7 +13,7 @@ from jaxrl_vis.stalks.phenotyping.detector.losses import STALK
 from jaxrl_vis.stalks.phenotyping.report.qc import html_image, html_table
 from jaxrl_vis.stalks.phenotyping.report.qc_style import SCRIPT, STYLE
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
-from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, Finds, Score
+from jaxrl_vis.stalks.phenotyping.training.held_out import MIN_SCORE, ImageDetections, Score
 
 _ANNOTATED, _RIGHT, _FALSE = (255, 225, 60), (70, 235, 100), (255, 105, 75)
 _MAX_IMAGES = 60  # images shown
@@ -35,7 +35,7 @@ def write_page(
     path: Path,
     facts: Sequence[str],
     examples: Sequence[Example],
-    finds: Mapping[str, Sequence[Finds]],
+    finds: Mapping[str, Sequence[ImageDetections]],
     scores: Mapping[str, Score],
     overlaps: Mapping[str, float],
 ) -> None:
@@ -59,7 +59,7 @@ def write_page(
         rows.append({"weights": name, **{key: "" if text == "nan" else text for key, text in texts.items()}})
     figures = []
     for index, example in enumerate(examples[:_MAX_IMAGES]):
-        shown = {name: draw_finds(example, of_set[index]) for name, of_set in finds.items()}
+        shown = {name: draw_detections(example, of_set[index]) for name, of_set in finds.items()}
         pictures = "".join(html_image(image, f"image {index + 1}, {name}", "pair") for name, image in shown.items())
         figures.append(f"<figure>{pictures}<figcaption>{' | '.join(shown)}</figcaption></figure>")
     parts = [
@@ -76,12 +76,12 @@ def write_page(
     write_atomically(path, "".join(parts))
 
 
-def draw_finds(example: Example, finds: Finds) -> np.ndarray:
+def draw_detections(example: Example, detections: ImageDetections) -> np.ndarray:
     """Draw the annotations and the detections of at least `MIN_SCORE` on a copy of an example's image, RGB [h, w, 3] uint8."""
     canvas = example.image.copy()
     for stalk in example.stalks[example.kinds == STALK]:
         _draw_box(canvas, stalk, _ANNOTATED)
-    for stalk, score, right in zip(finds.stalks, finds.scores, finds.right):
+    for stalk, score, right in zip(detections.stalks, detections.scores, detections.is_correct):
         if score >= MIN_SCORE:
             colour = _RIGHT if right else _FALSE
             _draw_box(canvas, stalk, colour)

@@ -99,7 +99,7 @@ class _OpenTrack:
         """Return the position along the row, m, assuming a depth in m."""
         return float(np.median([offset + ray * depth for offset, ray in self.rays]))
 
-    def place(self) -> tuple[float, float]:
+    def locate(self) -> tuple[float, float]:
         """Return the median position along the row and depth of the last nine sightings, m; NaN for an unknown depth."""
         depths = [depth for depth in self.depth[-9:] if math.isfinite(depth)]
         return float(np.median(self.along[-9:])), float(np.median(depths)) if depths else math.nan
@@ -134,17 +134,19 @@ def track_stalks(
         view = _PairView.of(sightings, calibration, usual)
         positions[frame] = driven[frame] + correction
         pairs = _assign(tracks, view, positions[frame], gates)
-        moves = [tracks[track].place()[0] - view.along[new] - positions[frame] for track, new in pairs if view.known[new]]
+        moves = [
+            tracks[track].locate()[0] - view.along[new] - positions[frame] for track, new in pairs if view.is_measured[new]
+        ]
         if len(moves) >= 3:
             correction += float(np.median(moves))
             positions[frame] = driven[frame] + correction
             pairs = _assign(tracks, view, positions[frame], gates)
         taken = {new: track for track, new in pairs}
         for new in map(int, np.flatnonzero(view.is_candidate)):
-            depth = float(view.depth[new]) if view.known[new] else math.nan
+            depth = float(view.depth[new]) if view.is_measured[new] else math.nan
             if new in taken:
                 track = tracks[taken[new]]
-                along = view.along[new] if view.known[new] else view.along_at(track.place()[1])[new]
+                along = view.along[new] if view.is_measured[new] else view.along_at(track.locate()[1])[new]
             else:
                 track, along = _OpenTrack(), view.along[new]
                 tracks.append(track)
@@ -152,7 +154,7 @@ def track_stalks(
             track.along.append(float(along + positions[frame]))
             track.depth.append(depth)
             track.rays.append((float(positions[frame]) - view.half, float(view.rays[new])))
-            track.feet.append(float(along + positions[frame] - view.over[new]))
+            track.feet.append(float(along + positions[frame] - view.foot_offset[new]))
     step = float(np.median(np.diff(positions))) if len(positions) > 1 else 0.0
     field = tuple(
         (column - 0.5 - calibration.centre[0]) / calibration.focal for column in columns or (0.0, float(calibration.width))
@@ -188,9 +190,9 @@ class _PairView:
         rays: Tangent of the horizontal angle at which the left camera sees the stalk.
         along: Position along the row relative to the midpoint of the cameras, m; at the usual depth if not measured.
         depth: Depth of the front surface, m; NaN if not measured.
-        known: True if position and depth were measured.
+        is_measured: True if position and depth were measured.
         is_candidate: True if the sighting may be a stalk of the row.
-        over: Distance along the row from the stalk's foot to the place of its measurement, m; 0 if its height is unknown.
+        foot_offset: Distance along the row from the stalk's foot to its measurement, m; 0 if its height is unknown.
         half: Half the baseline (scalar), m.
         usual: Median depth over all pairs (scalar), m.
     """
@@ -198,9 +200,9 @@ class _PairView:
     rays: np.ndarray
     along: np.ndarray
     depth: np.ndarray
-    known: np.ndarray
+    is_measured: np.ndarray
     is_candidate: np.ndarray
-    over: np.ndarray
+    foot_offset: np.ndarray
     half: float
     usual: float
 
@@ -250,13 +252,13 @@ def _are_distinct(sightings: list[Sighting]) -> np.ndarray:
     return own
 
 
-def _assign(tracks: list[_OpenTrack], view: _PairView, place: float, gates: Gates) -> list[tuple[int, int]]:
+def _assign(tracks: list[_OpenTrack], view: _PairView, position: float, gates: Gates) -> list[tuple[int, int]]:
     """Assign sightings to tracks by minimum cost; return pairs (track, sighting) of indices, each used at most once."""
     if not tracks or not view.rays.size:
         return []
-    there = np.array([track.place() for track in tracks])
+    there = np.array([track.locate() for track in tracks])
     # A sighting without depth is compared at the depth of the track.
-    along = np.where(view.known, view.along, [view.along_at(depth) for _, depth in there]) + place
+    along = np.where(view.is_measured, view.along, [view.along_at(depth) for _, depth in there]) + position
     aside = np.abs(there[:, :1] - along) / gates.along
     away = np.nan_to_num(np.abs(there[:, 1:] - view.depth[None]) / gates.depth, nan=0.4)
     cost = np.where((aside < 1.0) & (away < 1.0) & view.is_candidate, aside + 0.5 * away, _FORBIDDEN_COST)

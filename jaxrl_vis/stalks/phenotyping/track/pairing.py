@@ -96,14 +96,14 @@ def _distance_fault(detections: list[Detection], left: np.ndarray, right: np.nda
     )
 
 
-def _unconstrained_depth(find: Detection, left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float | None:
+def _unconstrained_depth(detection: Detection, left: np.ndarray, right: np.ndarray, calibration: Calibration) -> float | None:
     """Return the depth of a detection without the usual limits, m; None if it has no clear match in the right image."""
-    strip = find.strip or fit_strip(find.mask)
+    strip = detection.strip or fit_strip(detection.mask)
     if strip is None:
         return None
     nearest = float(calibration.disparity(np.array(_MIN_DEPTH_RATIO * calibration.baseline)))
-    matched = stalk_disparity(strip, find.corner, left, right, calibration, (calibration.offset + _MIN_DISPARITY, nearest))
-    at = matched.at(strip.reference + find.corner[0])
+    matched = stalk_disparity(strip, detection.corner, left, right, calibration, (calibration.offset + _MIN_DISPARITY, nearest))
+    at = matched.at(strip.reference + detection.corner[0])
     return None if at is None else float(calibration.depth(np.array(at[0])))
 
 

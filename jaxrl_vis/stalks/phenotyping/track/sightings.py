@@ -353,7 +353,7 @@ def _make_sighting(
     line = measurement.line if math.isfinite(measurement.line) else 0.5 * (detection.box[1] + detection.box[3])
     column = measurement.column if math.isfinite(measurement.column) else 0.5 * sum(detection.axis)
 
-    def known(value: float | None, digits: int) -> float | None:
+    def round_or_none(value: float | None, digits: int) -> float | None:
         return None if value is None or not math.isfinite(value) else round(value, digits)
 
     # Another stalk may stand where this one's axis was extrapolated to.
@@ -370,16 +370,16 @@ def _make_sighting(
         score=round(detection.score, 4),
         line=round(line, 2),
         column=round(column, 2),
-        width_px=known(measurement.width, 3),
-        lean_deg=known(math.degrees(measurement.lean), 2),
-        diameter_mm=known(measurement.diameter_mm, 4),
-        deviation_mm=known(measurement.deviation_mm, 4),
-        depth_m=known(measurement.depth, 5),
-        along_m=known(along, 5),
-        height_m=known(measurement.height, 4),
-        upper_mm=known(higher.diameter_mm, 4),
-        upper_deviation_mm=known(higher.deviation_mm, 4),
-        upper_height_m=known(higher.height, 4),
+        width_px=round_or_none(measurement.width, 3),
+        lean_deg=round_or_none(math.degrees(measurement.lean), 2),
+        diameter_mm=round_or_none(measurement.diameter_mm, 4),
+        deviation_mm=round_or_none(measurement.deviation_mm, 4),
+        depth_m=round_or_none(measurement.depth, 5),
+        along_m=round_or_none(along, 5),
+        height_m=round_or_none(measurement.height, 4),
+        upper_mm=round_or_none(higher.diameter_mm, 4),
+        upper_deviation_mm=round_or_none(higher.deviation_mm, 4),
+        upper_height_m=round_or_none(higher.height, 4),
         upper_confidence=round(higher.confidence, 4),
         upper_place=None
         if higher.diameter_mm is None

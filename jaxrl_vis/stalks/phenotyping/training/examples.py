@@ -156,11 +156,11 @@ def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
 
 
 def _instance_masks(
-    instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
+    instance: jax.Array, indices: np.ndarray, selected: np.ndarray, stalks: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
     """Cut the masks of stalk crops out of an instance segmentation; see `_MaskFunction`."""
-    cut_out = np.asarray(cut_crops(instance + 1, places, shape))[: len(parts)]  # 0 is outside the image
-    return cut_out == indices[parts][:, None, None] + 1
+    cut_out = np.asarray(cut_crops(instance + 1, stalks, shape))[: len(selected)]  # 0 is outside the image
+    return cut_out == indices[selected][:, None, None] + 1
 
 
 def true_boxes(
@@ -291,8 +291,8 @@ def _cover_crowds(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarra
 def _own_masks(
     annotations: list[dict[str, Any]],
     size: tuple[int, int],
-    parts: np.ndarray,
-    places: np.ndarray,
+    selected: np.ndarray,
+    stalks: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
     """Cut the masks of stalk crops out of annotations; see `_MaskFunction`.
@@ -300,8 +300,8 @@ def _own_masks(
     One at a time: masks may overlap, and all of an image together could exceed the memory.
     """
     crops = [
-        np.asarray(cut_crops(jnp.asarray(_annotated_mask(annotations[part], size)), places[index : index + 1], shape))
-        for index, part in enumerate(parts)
+        np.asarray(cut_crops(jnp.asarray(_annotated_mask(annotations[part], size)), stalks[index : index + 1], shape))
+        for index, part in enumerate(selected)
     ]
     return np.concatenate(crops)
 

@@ -20,20 +20,20 @@ MIN_SCORE = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Finds:
+class ImageDetections:
     """Detections in one image, matched with its annotations.
 
     Attributes:
         stalks: Boxes and axes [K, 6] float32, pixels of the resized image.
         scores: [K] float32.
-        right: [K] bool, True for true positives.
+        is_correct: [K] bool, True for true positives.
         ignored: [K] bool, True for detections of unclear stalks or in crowd regions, which are not counted.
         labels: Number of annotated stalks.
     """
 
     stalks: np.ndarray
     scores: np.ndarray
-    right: np.ndarray
+    is_correct: np.ndarray
     ignored: np.ndarray
     labels: int
 
@@ -64,7 +64,7 @@ class Score:
 
 def detect_in_examples(
     params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any
-) -> list[Finds]:
+) -> list[ImageDetections]:
     """Detect stalks in the images of examples and match them with the true ones.
 
     Args:
@@ -82,12 +82,14 @@ def detect_in_examples(
         image = batch_images([example], shape)[0][0]
         there = jax.device_get(detect(params, image, settings, dtype))
         stalks, scores = there.stalks[there.valid], there.scores[there.valid]
-        matched = match_finds(stalks, scores, example.stalks, example.kinds)
-        finds.append(Finds(stalks, scores, *matched, int((example.kinds == STALK).sum())))
+        matched = match_to_annotations(stalks, scores, example.stalks, example.kinds)
+        finds.append(ImageDetections(stalks, scores, *matched, int((example.kinds == STALK).sum())))
     return finds
 
 
-def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def match_to_annotations(
+    stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Match detections with true stalks greedily by score, one to one, at a box overlap of at least 0.5.
 
     Args:
@@ -130,16 +132,16 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
     return float(np.mean(overlaps)) if overlaps else float("nan")
 
 
-def score_finds(finds: Sequence[Finds]) -> Score:
+def score_detections(detections: Sequence[ImageDetections]) -> Score:
     """Compute the metrics of the detections in several images, pooled; ignored detections are left out."""
-    labels = sum(image.labels for image in finds)
-    scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])
-    right = np.concatenate([image.right[~image.ignored] for image in finds] or [np.zeros(0, bool)])
+    labels = sum(image.labels for image in detections)
+    scores = np.concatenate([image.scores[~image.ignored] for image in detections] or [np.zeros(0)])
+    right = np.concatenate([image.is_correct[~image.ignored] for image in detections] or [np.zeros(0, bool)])
     counted = scores >= MIN_SCORE
     hits, count = int(right[counted].sum()), int(counted.sum())
     nothing = float("nan")
     return Score(
-        images=len(finds),
+        images=len(detections),
         labels=labels,
         finds=count,
         right=hits,

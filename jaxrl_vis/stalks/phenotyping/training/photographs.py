@@ -87,7 +87,7 @@ def split_images(photographs: np.ndarray, seed: int) -> Split:
     test = max(round(count / 5), 1) if count >= MIN_IMAGES else 0
     stop = max(round((count - test) / 6), 1) if count >= MIN_IMAGES else 0
 
-    def part(chosen: np.ndarray) -> tuple[int, ...]:
+    def select(chosen: np.ndarray) -> tuple[int, ...]:
         return tuple(np.flatnonzero(np.isin(photographs, chosen)).tolist())
 
-    return Split(part(groups[test + stop :]), part(groups[test : test + stop]), part(groups[:test]), count)
+    return Split(select(groups[test + stop :]), select(groups[test : test + stop]), select(groups[:test]), count)

@@ -26,7 +26,7 @@ from jaxrl_vis.stalks.phenotyping.training.detector_training import (
     update_networks,
 )
 from jaxrl_vis.stalks.phenotyping.training.examples import Example, crop_randomly, resize_crops
-from jaxrl_vis.stalks.phenotyping.training.held_out import Finds, detect_in_examples, score_finds
+from jaxrl_vis.stalks.phenotyping.training.held_out import ImageDetections, detect_in_examples, score_detections
 from jaxrl_vis.stalks.phenotyping.training.photographs import Split
 
 FROZEN = ("stem", "fine")
@@ -81,15 +81,15 @@ class TuningResult:
     best_step: int
     updates: int
     stop_reason: str
-    before: list[Finds]
-    after: list[Finds]
+    before: list[ImageDetections]
+    after: list[ImageDetections]
     compile_s: float
     update_s: float
 
 
 def tune(
     examples: Sequence[Example],
-    parts: Split,
+    split: Split,
     settings: Settings,
     tuning: Tuning,
     start: Any,
@@ -100,7 +100,7 @@ def tune(
 
     Args:
         examples: Examples of all images.
-        parts: Split of the examples.
+        split: Split of the examples.
         settings: Settings of the networks.
         tuning: Fine-tuning schedule.
         start: Initial parameters, whose first layers are frozen; None for random initialisation.
@@ -119,8 +119,8 @@ def tune(
     detector_key, segmenter_key, steps_key = jax.random.split(jax.random.key(tuning.seed), 3)
     state = init_state(start if start is not None else init_networks(settings, detector_key, segmenter_key))
     shape = padded_shape(_largest(examples))
-    batches = _Batches([examples[place] for place in parts.train], shape, tuning)
-    stop, test = ([examples[place] for place in part] for part in (parts.stop, parts.test))
+    batches = _Batches([examples[place] for place in split.train], shape, tuning)
+    stop, test = ([examples[place] for place in part] for part in (split.stop, split.test))
 
     began = time.monotonic()
     words = f"compiling for images of {shape[1]} x {shape[0]} pixels on {jax.default_backend()}"
@@ -179,7 +179,11 @@ class _EarlyStopping:
         self.best = self._score(params)
 
     def _score(self, params: Any) -> float:
-        return score_finds(detect_in_examples(params["detector"], self._examples, *self._about)).soft if self._examples else 0.0
+        return (
+            score_detections(detect_in_examples(params["detector"], self._examples, *self._about)).soft
+            if self._examples
+            else 0.0
+        )
 
     def evaluate(self, params: Any, step: int) -> str:
         """Evaluate new parameters and return text for the progress line, empty without held-out images."""

@@ -80,13 +80,13 @@ def _read(folder: Path) -> list[tuple[Any, Annotated]]:
     return annotated
 
 
-def _convert_errors(file: Path, read: Any, kind: str) -> Any:
+def _convert_errors(file: Path, read: Any, format_name: str) -> Any:
     """Call ``read``, converting errors of the readers to a `RequestError`.
 
     Args:
         file: The file that it reads, for messages.
         read: Reader without arguments.
-        kind: Name of the expected format, for messages.
+        format_name: Name of the expected format, for messages.
 
     Raises:
         RequestError: The file cannot be read, or has another format.
@@ -98,7 +98,7 @@ def _convert_errors(file: Path, read: Any, kind: str) -> Any:
     except OSError as error:
         raise RequestError(f"cannot read {file}: {error.strerror or error}") from error
     except _MALFORMED as error:
-        what = "not COCO: it needs images and annotations" if kind == "COCO" else f"no annotation of {kind}"
+        what = "not COCO: it needs images and annotations" if format_name == "COCO" else f"no annotation of {format_name}"
         raise RequestError(f"{file} is {what}{_error_reason(error)}") from error
 
 

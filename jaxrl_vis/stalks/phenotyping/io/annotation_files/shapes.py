@@ -44,9 +44,9 @@ def from_box(name: str, box: list[float], source: str, group: Any = None) -> Ann
     return {"name": name, "bbox": box, "source": source, "group": group}
 
 
-def shape_without_width(name: str, kind: str, source: str) -> Annotation:
+def shape_without_width(name: str, shape_type: str, source: str) -> Annotation:
     """Return an unusable annotation: a shape such as a point or a line, which has no width."""
-    return {"name": name, "problem": f"is a {kind[:40]}, {_NO_WIDTH}", "source": source, "group": None}
+    return {"name": name, "problem": f"is a {shape_type[:40]}, {_NO_WIDTH}", "source": source, "group": None}
 
 
 def rotated_box(centre: tuple[float, float], size: tuple[float, float], angle: float) -> np.ndarray:

@@ -278,15 +278,15 @@ def _project_to_plane(degrees: np.ndarray) -> np.ndarray:
     return _EARTH_RADIUS * np.stack([turned[:, 0], turned[:, 1] * np.cos(np.radians(degrees[:1, 0]))], axis=1)
 
 
-def _project_on_path(places: np.ndarray) -> np.ndarray:
+def _project_on_path(positions: np.ndarray) -> np.ndarray:
     """Return distances [N] along the straight line fitted to positions [N, 2 or 3], from the first one; NaN if any is invalid.
 
     Lateral deviations from the line do not count. The direction of travel is positive.
     """
-    if not np.isfinite(places).all() or np.abs(places).max(initial=0.0) > 1e9:
-        return np.full(len(places), np.nan)
-    centred = places - places.mean(axis=0)
-    direction = np.linalg.svd(centred, full_matrices=False)[2][0] if len(places) > 1 else np.eye(places.shape[1])[0]
+    if not np.isfinite(positions).all() or np.abs(positions).max(initial=0.0) > 1e9:
+        return np.full(len(positions), np.nan)
+    centred = positions - positions.mean(axis=0)
+    direction = np.linalg.svd(centred, full_matrices=False)[2][0] if len(positions) > 1 else np.eye(positions.shape[1])[0]
     along = centred @ direction
     along = along if along[-1] >= along[0] else -along
     return along - along[0]
