@@ -33,7 +33,7 @@ class Picture:
     def __init__(self, env):
         self.env = env
 
-    def image(self):
+    def render(self):
         return np.full(host_fetch.SHAPE, np.clip(100 + 400 * self.env.grip[0], 0, 255), np.uint8)
 
     def close(self):
