@@ -23,7 +23,7 @@ OF_LEARNING = {
 
 
 def ledger_differences() -> Iterator[str]:
-    """Yield a line for each table of the ledger that differs from the records."""
+    """Yield a line for each table of `OF_LEARNING` that differs from the records."""
     for page, name in OF_LEARNING.items():
         text = (CHECKOUT / page).read_text(encoding="utf-8")
         if ledger.fill_page(text, {name: ledger.PAGES[page][name]}) != text:

@@ -144,7 +144,7 @@ def measure(with_calls: bool = True) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Print the figures; return the exit status."""
+    """Print the figures, and write them to ``--json`` if given; return 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", type=Path, help="a file for the figures")
     parser.add_argument("--without-calls", action="store_true", help="trace nothing")

@@ -47,6 +47,13 @@ def fresh_score(run_dir: Path, checkpoint: Choice, seed: int, iteration: int, ep
 def ship(run_dir: Path, name: str, checkpoint: Choice = None, seed: int | None = None, episodes: int = 256) -> Score:
     """Write the folder of a policy in the package; return the score of the shipped weights on fresh episodes.
 
+    Args:
+        run_dir: Run folder.
+        name: Name of the policy's folder.
+        checkpoint: Checkpoint to ship; None for that of `load_policy`.
+        seed: Seed to ship; None for that of `load_policy`.
+        episodes: Number of fresh episodes.
+
     Raises:
         RequestError: The run cannot be used, or its policy is too large.
     """

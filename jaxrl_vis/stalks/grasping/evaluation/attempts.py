@@ -304,7 +304,7 @@ def redetecting_observer(stands: Stands, stalks: np.ndarray, redetected: np.ndar
     Args:
         stands: True stalks around each arm.
         stalks: [B] int, index of the stalk that each arm reaches for; -1 for none.
-        redetected: [B, 2], see `Plan`.
+        redetected: [B, 2], m, see `Plan.redetection_errors`.
     """
     known = (stands.stalk == stalks[:, None]) & (stalks >= 0)[:, None]
     slot = known.argmax(axis=1)

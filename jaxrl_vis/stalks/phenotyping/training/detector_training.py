@@ -55,7 +55,12 @@ Images = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def batch_images(examples: Sequence[Example], shape: tuple[int, int]) -> Images:
-    """Batch examples; images are zero-padded at the bottom and on the right to ``shape`` (height, width)."""
+    """Return a batch of examples (`Images`); images are zero-padded at the bottom and on the right to ``shape``.
+
+    Args:
+        examples: The examples, none of whose images is larger than ``shape``.
+        shape: Height and width of the batch.
+    """
     sizes = np.array([example.image.shape[:2] for example in examples], np.int32)
     images = np.zeros((len(examples), *shape, 3), np.uint8)
     for image, example in zip(images, examples):
