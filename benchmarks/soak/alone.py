@@ -83,9 +83,9 @@ def nan_on_one_seed(folder: Path, rng: random.Random, _: "References") -> None:
     run, steps = folder / "run", 4 * 50
     options = ["broken_task:BrokenReach", "--env-folder", str(folder), "--preset", "debug", "--seeds", "2"]
     options += ["--env-steps", str(400 * steps), "--seed", str(rng.randrange(10**6)), "--checkpoint-interval", "3"]
-    part = RunProcess.start(run, {"SOAK_NAN": str(1.0 / rng.uniform(100, 800))}, options)
-    _wait_until_finished(part, 4)
-    (line,) = [line for line in part.lines if "non-finite" in line]
+    process = RunProcess.start(run, {"SOAK_NAN": str(1.0 / rng.uniform(100, 800))}, options)
+    _wait_until_finished(process, 4)
+    (line,) = [line for line in process.lines if "non-finite" in line]
     seeds = re.search(r"seeds? ([\d, ]+)", line)
     if seeds is None or "," in seeds.group(1):
         raise Broken(f"not one seed is named: {line}")
@@ -155,21 +155,21 @@ def _check_single_line(process: RunProcess, text: str) -> None:
 def worker_of_a_study(folder: Path, rng: random.Random, references: "References", executor: Sequence[str] = ()) -> None:
     """Kill one of two cells: the other continues, and the next start finishes both, with the rows of undisturbed ones."""
     words = _sweep_arguments(folder, executor)
-    part = _start_command(words, folder)
-    with kill_on_exit(part):
+    process = _start_command(words, folder)
+    with kill_on_exit(process):
         cells = folder / "runs"
-        struck = _kill_a_worker(part, "jaxrl_vis train", rng, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
-        part.wait()
-    part.check_output()
+        struck = _kill_a_worker(process, "jaxrl_vis train", rng, 1.0, lambda: bool(list(cells.glob("*/checkpoints"))))
+        process.wait()
+    process.check_output()
     if struck:
-        if part.popen.returncode == 0:
+        if process.popen.returncode == 0:
             raise NotStruck
-        if part.popen.returncode not in (1, 3):
-            raise Broken(f"ended with {part.popen.returncode}: {part.lines[-5:]}")
-        _check_single_line(part, "failed with exit status")
+        if process.popen.returncode not in (1, 3):
+            raise Broken(f"ended with {process.popen.returncode}: {process.lines[-5:]}")
+        _check_single_line(process, "failed with exit status")
     _wait_until_finished(_start_command(words, folder), 0)
     if _cell_rows(folder) != references.study():
-        raise Broken(f"rows differ from those of an undisturbed study: {part.lines}")
+        raise Broken(f"rows differ from those of an undisturbed study: {process.lines}")
     if not struck:
         raise NotStruck
 
@@ -232,17 +232,17 @@ class NotStruck(Exception):
 def _check_pool(arguments: Sequence[str], folder: Path, rng: random.Random) -> None:
     """Kill a worker of a pool, and check that the same command finishes when started again."""
     folder.mkdir(exist_ok=True)
-    part = _start_command(arguments, folder)
-    with kill_on_exit(part):
-        struck = _kill_a_worker(part, "spawn_main", rng, 4.0, lambda: True)
-        part.wait()
-    part.check_output()
-    if struck and part.popen.returncode == 0:
+    process = _start_command(arguments, folder)
+    with kill_on_exit(process):
+        struck = _kill_a_worker(process, "spawn_main", rng, 4.0, lambda: True)
+        process.wait()
+    process.check_output()
+    if struck and process.popen.returncode == 0:
         raise NotStruck  # the worker had finished its work
     if struck:
-        if part.popen.returncode not in (1, 2):
-            raise Broken(f"ended with {part.popen.returncode}: {part.lines[-5:]}")
-        _check_single_line(part, "processes was killed from outside")
+        if process.popen.returncode not in (1, 2):
+            raise Broken(f"ended with {process.popen.returncode}: {process.lines[-5:]}")
+        _check_single_line(process, "processes was killed from outside")
     _wait_until_finished(_start_command(arguments, folder), 0)
     if not struck:
         raise NotStruck

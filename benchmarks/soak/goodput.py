@@ -43,18 +43,18 @@ def train_with_kills(folder: Path, every: float, minutes: float, options: Sequen
     asked = [*options, "--env-steps", str(_FOREVER)]
     while True:
         left = started + 60.0 * minutes - time.monotonic()
-        with kill_on_exit(RunProcess.start(folder, options=asked)) as part:
-            part.wait_for(lambda: False, min(every, left))
-            if not part.is_running():
-                raise Broken(f"it ended by itself: {part.lines[-3:]}")
+        with kill_on_exit(RunProcess.start(folder, options=asked)) as process:
+            process.wait_for(lambda: False, min(every, left))
+            if not process.is_running():
+                raise Broken(f"it ended by itself: {process.lines[-3:]}")
             if left > every:
-                part.send(signal.SIGKILL)
+                process.send(signal.SIGKILL)
                 kills += 1
                 lines = read_processes(folder / "processes.jsonl")
                 print(f"kill {kills}: {len(lines)} processes, iterations begun {lines[-1]}", flush=True)
                 continue
-            if part.stop() not in (0, 143):
-                raise Broken(f"SIGTERM was not heeded: {part.lines[-3:]}")
+            if process.stop() not in (0, 143):
+                raise Broken(f"SIGTERM was not heeded: {process.lines[-3:]}")
             break
     wall = earlier["minutes"] + (time.monotonic() - started) / 60.0
     notes.write_text(json.dumps({"kills": kills, "minutes": wall}))
@@ -62,9 +62,9 @@ def train_with_kills(folder: Path, every: float, minutes: float, options: Sequen
     copy = folder.with_name(f"{folder.name}-evaluated")
     shutil.rmtree(copy, ignore_errors=True)
     shutil.copytree(folder, copy)
-    with kill_on_exit(RunProcess.start(copy, options=["--env-steps", "1"])) as part:
-        if part.wait() != 0:
-            raise Broken(f"it could not be evaluated: {part.lines[-3:]}")
+    with kill_on_exit(RunProcess.start(copy, options=["--env-steps", "1"])) as process:
+        if process.wait() != 0:
+            raise Broken(f"it could not be evaluated: {process.lines[-3:]}")
     last = read_rows(copy)[-1]
     total = account(read_processes(folder / "processes.jsonl"), last["iteration"])
     if total.goodput is None:
@@ -81,9 +81,9 @@ def train_undisturbed(folder: Path, env_steps: int, options: Sequence[str]) -> l
     Raises:
         Broken: The run fails, or takes more than a day.
     """
-    with kill_on_exit(RunProcess.start(folder, options=[*options, "--env-steps", str(env_steps)])) as part:
-        if part.wait(86400.0) != 0:
-            raise Broken(f"the undisturbed run ended early: {part.lines[-3:]}")
+    with kill_on_exit(RunProcess.start(folder, options=[*options, "--env-steps", str(env_steps)])) as process:
+        if process.wait(86400.0) != 0:
+            raise Broken(f"the undisturbed run ended early: {process.lines[-3:]}")
     return _success(folder)
 
 

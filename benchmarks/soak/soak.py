@@ -50,10 +50,10 @@ class Soak:
         Raises:
             Broken: The run failed.
         """
-        with kill_on_exit(RunProcess.start(self._folder / "reference")) as part:
-            if part.wait() != 0:
-                raise Broken("\n".join(part.lines))
-        self.reference = read_rows(part.folder)
+        with kill_on_exit(RunProcess.start(self._folder / "reference")) as process:
+            if process.wait() != 0:
+                raise Broken("\n".join(process.lines))
+        self.reference = read_rows(process.folder)
 
     def _next_fault(self, faults: dict[str, Any]) -> str | None:
         """Draw the next fault of these kinds, all equally often; None if it is time to end."""
@@ -137,10 +137,10 @@ class Soak:
         if not faults:  # the run finished before the first fault, or it is time to end
             shutil.rmtree(folder, ignore_errors=True)
             return fault is not None
-        with kill_on_exit(RunProcess.start(folder)) as part:
-            if (status := part.wait()) != 0:
-                raise Broken(f"it did not finish: status {status}, {part.lines[-5:]}")
-            part.check_output()
+        with kill_on_exit(RunProcess.start(folder)) as process:
+            if (status := process.wait()) != 0:
+                raise Broken(f"it did not finish: status {status}, {process.lines[-5:]}")
+            process.check_output()
         self._check_end(folder, spoilt)
         return True
 
