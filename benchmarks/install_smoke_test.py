@@ -149,7 +149,12 @@ def mistakes() -> list[tuple[str, Mapping[str, str]]]:
 
 
 def wheel(shell: Shell, python: Path) -> None:
-    """Test the installation of a wheel with pip."""
+    """Test the installation of a wheel with pip, and the program's commands; failures are added to ``shell.failures``.
+
+    Args:
+        shell: Shell of a new user.
+        python: Interpreter of the virtual environment.
+    """
     shell.run(f"git clone --quiet {CHECKOUT} source")
     shell.run(f"{python.name} -m venv .venv")
     shell.activate(shell.folder / ".venv")
@@ -201,7 +206,12 @@ def tiny(line: str) -> str:
 
 
 def clone(shell: Shell, python: Path) -> None:
-    """Test the installation of a clone with make, and the commands of docs/start.md."""
+    """Test the installation of a clone with make, and the commands of docs/start.md; failures are added to ``shell.failures``.
+
+    Args:
+        shell: Shell of a new user.
+        python: Interpreter of the virtual environment.
+    """
     shell.run(f"git clone --quiet {CHECKOUT} jaxrl-vis")
     shell.folder /= "jaxrl-vis"
     shell.run("make help", shows="make train")
@@ -219,7 +229,13 @@ def clone(shell: Shell, python: Path) -> None:
 
 
 def notebooks(shell: Shell, python: Path, full: bool) -> None:
-    """Test the notebooks, in a separate folder, in a Jupyter without this project."""
+    """Test the notebooks, in a separate folder, in a Jupyter without this project; failures are added to ``shell.failures``.
+
+    Args:
+        shell: Shell of a new user.
+        python: Interpreter of the virtual environment.
+        full: Whether to run them in full length.
+    """
     shell.run(f"{python.name} -m venv .venv")
     shell.activate(shell.folder / ".venv")
     shell.run("pip install --quiet nbconvert nbclient ipykernel")
