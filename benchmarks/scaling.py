@@ -156,7 +156,7 @@ def all_reduce_seconds(numbers: int, devices: int) -> float:
 
 
 def words(tree: Any) -> dict[str, bytes]:
-    """Return the bytes of all leaves of a learner or a replay, by name."""
+    """Return the bytes of all leaves of a loop state, by name."""
     plain = {
         name: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
         for name, leaf in named_leaves(tree).items()
@@ -209,7 +209,7 @@ class Comparison:
 
 
 def make_comparisons(base: Config, env: Any, numbers: list[int], batches: tuple[int, ...], seeds: int) -> list[Comparison]:
-    """Create all configurations to be measured."""
+    """Create all configurations to be measured, for ``numbers`` of devices and ``seeds`` per device."""
     one_of = {batch: Timed(base.replace(batch_size=batch), env, False) for batch in batches}
     one_seeds, comparisons = Timed(base.replace(seeds=seeds), env, True), []
     for count in numbers:

@@ -28,7 +28,7 @@ _PARTS = {
 
 @functools.cache
 def run(task: str, variant: str) -> Record:
-    """Return a run of these studies, with fresh seeds if there are any."""
+    """Return the run of a variant of rewards on a task, with fresh seeds if there are any."""
     return study("indicator", f"{task}-{variant}-fast", is_fresh=True)
 
 
@@ -36,15 +36,23 @@ def _rows(task: str, labels: Mapping[str, str]) -> list[Row]:
     return [Row(label, run(task, variant)) for variant, label in labels.items()]
 
 
-def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, more: Sequence[c.Column] = ()) -> str:
-    """Return the table of results at the end and over training, with a test against one of the rows."""
+def _ends(task: str, labels: Mapping[str, str], reference: str, label: str, extra_columns: Sequence[c.Column] = ()) -> str:
+    """Return the Markdown table of results at the end and over training, with a test against one of the rows.
+
+    Args:
+        task: Name of the environment.
+        labels: First cell of each row, by variant.
+        reference: Variant that the others are tested against.
+        label: Name of the reference in the title of the test's column.
+        extra_columns: Further columns.
+    """
     base = run(task, reference)
     columns = [
         c.final(),
         c.final_distance(),
         c.mean_success(),
-        c.p(base, label),
-        *more,
+        c.p_value_against(base, label),
+        *extra_columns,
     ]
     return table([f"{task}, {format_steps(base.end)} steps"], _rows(task, labels), columns)
 

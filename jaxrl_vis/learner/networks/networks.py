@@ -248,7 +248,7 @@ class Networks:
     def prepare_batch(self, scaling: BatchScaling, batch: Batch) -> Inputs:
         """Apply `prepare` to all observations of B transitions."""
         of_observations, of_goals, of_states = scaling
-        states = None if of_states is None else self._normalized(_with_goals(batch), *of_states)
+        states = None if of_states is None else self._normalize(_with_goals(batch), *of_states)
         views = {name: self.prepare(of_observations, images, batch.shift) for name, images in batch.views.items()}
         if of_goals is None:  # together, and while they are bytes
             count, size, *shape = batch.observations.shape

@@ -68,5 +68,11 @@ def find_stalks(
         image: Left image [H, W, 3] uint8.
         pixels_per_metre: Resolution of the image at the row; None if the camera is unknown.
         plot, pair: Folder and files of the image; unused.
+
+    Returns:
+        The detections, a `Detections`, sorted from left to right.
+
+    Raises:
+        RequestError: The weights cannot be read.
     """
     return _cached_finder(weights, min_score)(image, pixels_per_metre)

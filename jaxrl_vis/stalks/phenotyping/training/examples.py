@@ -16,11 +16,11 @@ from jaxrl_vis.errors import RequestError
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings
 from jaxrl_vis.stalks.phenotyping.detector.finder import resize, resize_factor, upper_segment
 from jaxrl_vis.stalks.phenotyping.detector.losses import NOTHING, STALK, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut
+from jaxrl_vis.stalks.phenotyping.detector.stalk_crops import crop_shape, cut_crops
 from jaxrl_vis.stalks.phenotyping.io.annotations import read_annotations
 from jaxrl_vis.stalks.phenotyping.io.calibration import check_size, find_calibration, read_calibration
-from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, rgb8
-from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, outlined_mask
+from jaxrl_vis.stalks.phenotyping.io.images import image_size, read_image, to_rgb8
+from jaxrl_vis.stalks.phenotyping.io.masks import decode_mask, rasterise_polygons
 from jaxrl_vis.stalks.phenotyping.track.sightings import USUAL_DISTANCE
 from jaxrl_vis_envs.plants import Calibration, Family, draw
 from jaxrl_vis_envs.plants.cameras import Pose
@@ -65,11 +65,13 @@ class Example:
 def synthetic_examples(family: Family, settings: Settings, seed: int, frames: int = 4) -> list[Example]:
     """Render the training examples of one synthetic plot.
 
+    Images of a daylight family are rendered at random scales and cropped at random to the size in ``settings``.
+
     Args:
         family: Family from which the plot is sampled.
         settings: Settings of the networks.
         seed: Seed of the plot.
-        frames: Number of images, spread over the plot; fewer if it has fewer.
+        frames: Maximum number of images, spread over the plot.
     """
     sequence = Sequence.of(draw(family, seed))
     settled = sequence.plot.family
@@ -88,17 +90,20 @@ def synthetic_examples(family: Family, settings: Settings, seed: int, frames: in
         thinned = np.asarray(instance[::_THIN, ::_THIN]), np.asarray(depth[::_THIN, ::_THIN])
         stalks, kinds, indices = true_boxes(sequence.plot, sequence.drive.poses[frame], true, *thinned)
         mask_function = functools.partial(_instance_masks, instance, indices)
-        example = _example(image, pixels_per_metre, stalks, kinds, mask_function, settings, rng, _HIGHER)
+        example = _make_example(image, pixels_per_metre, stalks, kinds, mask_function, settings, rng, _HIGHER)
         if by_day:
             # Lenses and scales differ between plots, and each shape of crops would need a compilation.
             shape = crop_shape((settings.crop_height, settings.crop_width), family.rig.width / settings.full_width)
-            example = resize_crops(cut_out(example, (settings.lines, settings.width), rng), shape)
+            example = resize_crops(crop_randomly(example, (settings.lines, settings.width), rng), shape)
         examples.append(example)
     return examples
 
 
 def resize_crops(example: Example, shape: tuple[int, int]) -> Example:
-    """Resize the stalk crops and masks of an example to ``shape`` (height, width)."""
+    """Resize the stalk crops and masks of an example to ``shape`` (height, width).
+
+    Return the example itself if they have that size, or if there are none.
+    """
     if not len(example.crops) or example.crops.shape[1:3] == shape:
         return example
     size = (shape[1], shape[0])
@@ -107,7 +112,7 @@ def resize_crops(example: Example, shape: tuple[int, int]) -> Example:
     return dataclasses.replace(example, crops=crops, masks=np.stack(masks))
 
 
-def cut_out(example: Example, max_size: tuple[int, int], rng: np.random.Generator) -> Example:
+def crop_randomly(example: Example, max_size: tuple[int, int], rng: np.random.Generator) -> Example:
     """Crop the image of an example at random, mostly around a stalk.
 
     Args:
@@ -151,11 +156,11 @@ def _clip_stalks(stalks: np.ndarray, lines: int, columns: int) -> np.ndarray:
 
 
 def _instance_masks(
-    instance: jax.Array, indices: np.ndarray, parts: np.ndarray, places: np.ndarray, shape: tuple[int, int]
+    instance: jax.Array, indices: np.ndarray, selected: np.ndarray, stalks: np.ndarray, shape: tuple[int, int]
 ) -> np.ndarray:
     """Cut the masks of stalk crops out of an instance segmentation; see `_MaskFunction`."""
-    cut_out = np.asarray(cut(instance + 1, places, shape))[: len(parts)]  # 0 is outside the image
-    return cut_out == indices[parts][:, None, None] + 1
+    cut_out = np.asarray(cut_crops(instance + 1, stalks, shape))[: len(selected)]  # 0 is outside the image
+    return cut_out == indices[selected][:, None, None] + 1
 
 
 def true_boxes(
@@ -189,7 +194,7 @@ def true_boxes(
     return np.array(stalks, np.float32).reshape(-1, 6), np.array(kinds, np.int32), np.array(indices, np.int32)
 
 
-def _example(
+def _make_example(
     image: Any,
     pixels_per_metre: float | None,
     stalks: np.ndarray,
@@ -219,7 +224,7 @@ def _example(
     if len(clear):
         filled = -(-len(clear) // 16) * 16  # few shapes, few compilations
         places = np.pad(places, ((0, filled - len(clear)), (0, 0)), mode="edge")
-        crops = np.asarray(cut(on_device, places, shape))[: len(clear)]
+        crops = np.asarray(cut_crops(on_device, places, shape))[: len(clear)]
         masks = mask_function(clear, places, shape)
     divisor = np.array([scale[1], scale[0], scale[1], scale[0], scale[1], scale[1]], np.float32)
     count = min(len(stalks), MAX_STALKS)
@@ -234,7 +239,8 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
     The scale of the images is taken from the calibration in the folder, if there is one.
 
     Raises:
-        RequestError: Annotations are missing or invalid, or an image is missing or differs in size from its annotations.
+        RequestError: Annotations are missing or invalid, the calibration is invalid or for images of another size, or an image
+            is missing or differs in size from its annotations.
     """
     data = read_annotations(folder, labels)
     resolution_of = _resolutions(folder, data["images"])
@@ -245,7 +251,7 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         size, path = (about["height"], about["width"]), folder / about["file_name"]
         try:
             there = image_size(path)
-            image = rgb8(read_image(path)) if there == size else None
+            image = to_rgb8(read_image(path)) if there == size else None
         except OSError as error:
             raise RequestError(f"the annotations in {folder} name an image that cannot be read: {error}") from error
         if image is None or image.shape[:2] != size:
@@ -257,16 +263,16 @@ def annotated_examples(folder: Path, settings: Settings, labels: tuple[str, ...]
         every = of_image.get(about["id"], [])
         annotations = [annotation for annotation in every if not annotation.get("iscrowd")]
         stalks = np.array([_annotated_stalk(annotation, size) for annotation in annotations], np.float32).reshape(-1, 6)
-        strips = _strips([annotation for annotation in every if annotation.get("iscrowd")], stalks)
+        strips = _cover_crowds([annotation for annotation in every if annotation.get("iscrowd")], stalks)
         kinds = np.array([STALK] * len(stalks) + [UNCLEAR] * len(strips), np.int32)
         stalks = np.concatenate([stalks, strips])
         rng = np.random.default_rng([number, 18])
-        yield _example(
+        yield _make_example(
             image, resolution_of[about["id"]], stalks, kinds, functools.partial(_own_masks, annotations, size), settings, rng
         )
 
 
-def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
+def _cover_crowds(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
     """Cover crowd regions (stalks annotated together) with overlapping strips [N, 6] float32 as wide as the image's stalks.
 
     Detections are ignored by their overlap with unclear stalks, and would hardly overlap the box of a whole region.
@@ -285,8 +291,8 @@ def _strips(crowds: list[dict[str, Any]], stalks: np.ndarray) -> np.ndarray:
 def _own_masks(
     annotations: list[dict[str, Any]],
     size: tuple[int, int],
-    parts: np.ndarray,
-    places: np.ndarray,
+    selected: np.ndarray,
+    stalks: np.ndarray,
     shape: tuple[int, int],
 ) -> np.ndarray:
     """Cut the masks of stalk crops out of annotations; see `_MaskFunction`.
@@ -294,8 +300,8 @@ def _own_masks(
     One at a time: masks may overlap, and all of an image together could exceed the memory.
     """
     crops = [
-        np.asarray(cut(jnp.asarray(_annotated_mask(annotations[part], size)), places[index : index + 1], shape))
-        for index, part in enumerate(parts)
+        np.asarray(cut_crops(jnp.asarray(_annotated_mask(annotations[part], size)), stalks[index : index + 1], shape))
+        for index, part in enumerate(selected)
     ]
     return np.concatenate(crops)
 
@@ -320,7 +326,7 @@ _MAX_CROP_WIDTH = 512  # pixels
 _MAX_WIDTH = 2048  # pixels: maximum width of a resized image
 
 
-def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
+def fit_settings(folder: Path, settings: Settings, labels: tuple[str, ...] = ()) -> Settings:
     """Return settings with anchors adapted to the boxes of a folder's annotations.
 
     If the folder has no calibration, images are resized so that boxes are as tall as the band; detection with networks trained
@@ -353,8 +359,12 @@ def settings_for(folder: Path, settings: Settings, labels: tuple[str, ...] = ())
     )
 
 
-def any_outlined(folder: Path, labels: tuple[str, ...] = ()) -> bool:
-    """Return whether any annotated stalk of a folder has a segmentation besides its box."""
+def has_outlines(folder: Path, labels: tuple[str, ...] = ()) -> bool:
+    """Return True if any annotated stalk of a folder has a segmentation besides its box.
+
+    Raises:
+        RequestError: The annotations of the folder cannot be read.
+    """
     annotations = read_annotations(folder, labels)["annotations"]
     return any(annotation["segmentation"] and not annotation.get("iscrowd") for annotation in annotations)
 
@@ -366,11 +376,11 @@ def _annotated_mask(annotation: dict[str, Any], size: tuple[int, int]) -> np.nda
         return decode_mask(segmentation)
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
-    return outlined_mask(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
+    return rasterise_polygons(segmentation or [[left, top, right, top, right, bottom, left, bottom]], size)
 
 
 def _annotated_stalk(annotation: dict[str, Any], size: tuple[int, int]) -> list[float]:
-    """Return the box and axis [6] of one annotation; the axis is fitted to its mask."""
+    """Return the box and axis [6] of one annotation; the axis is fitted to its mask, and vertical if that is small."""
     left, top, wide, tall = annotation["bbox"]
     right, bottom = left + wide, top + tall
     line, column = np.nonzero(_annotated_mask(annotation, size))

@@ -10,8 +10,8 @@ import numpy as np
 from jaxrl_vis.stalks.phenotyping.detector.detect import Settings, detect
 from jaxrl_vis.stalks.phenotyping.detector.finder import segment
 from jaxrl_vis.stalks.phenotyping.detector.losses import STALK, UNCLEAR
-from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, overlaps_with
-from jaxrl_vis.stalks.phenotyping.training.detector_training import image_batch
+from jaxrl_vis.stalks.phenotyping.evaluation.scoring import IOU, average_precision, iou_with_boxes
+from jaxrl_vis.stalks.phenotyping.training.detector_training import batch_images
 from jaxrl_vis.stalks.phenotyping.training.examples import Example
 
 _CROPS = 8  # stalk crops per batch
@@ -20,20 +20,20 @@ MIN_SCORE = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Finds:
+class ImageDetections:
     """Detections in one image, matched with its annotations.
 
     Attributes:
         stalks: Boxes and axes [K, 6] float32, pixels of the resized image.
         scores: [K] float32.
-        right: [K] bool, True for true positives.
+        is_correct: [K] bool, True for true positives.
         ignored: [K] bool, True for detections of unclear stalks or in crowd regions, which are not counted.
         labels: Number of annotated stalks.
     """
 
     stalks: np.ndarray
     scores: np.ndarray
-    right: np.ndarray
+    is_correct: np.ndarray
     ignored: np.ndarray
     labels: int
 
@@ -62,7 +62,9 @@ class Score:
     soft: float
 
 
-def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any) -> list[Finds]:
+def detect_in_examples(
+    params: Any, examples: Sequence[Example], shape: tuple[int, int], settings: Settings, dtype: Any
+) -> list[ImageDetections]:
     """Detect stalks in the images of examples and match them with the true ones.
 
     Args:
@@ -71,18 +73,23 @@ def find_in(params: Any, examples: Sequence[Example], shape: tuple[int, int], se
         shape: Height and width to which images are padded.
         settings: Settings of the networks.
         dtype: Compute dtype of the convolutions.
+
+    Returns:
+        Detections down to `Settings.min_score` in each image, in the same order.
     """
     finds = []
     for example in examples:
-        image = image_batch([example], shape)[0][0]
+        image = batch_images([example], shape)[0][0]
         there = jax.device_get(detect(params, image, settings, dtype))
         stalks, scores = there.stalks[there.valid], there.scores[there.valid]
-        matched = match_finds(stalks, scores, example.stalks, example.kinds)
-        finds.append(Finds(stalks, scores, *matched, int((example.kinds == STALK).sum())))
+        matched = match_to_annotations(stalks, scores, example.stalks, example.kinds)
+        finds.append(ImageDetections(stalks, scores, *matched, int((example.kinds == STALK).sum())))
     return finds
 
 
-def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def match_to_annotations(
+    stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Match detections with true stalks greedily by score, one to one, at a box overlap of at least 0.5.
 
     Args:
@@ -97,10 +104,10 @@ def match_finds(stalks: np.ndarray, scores: np.ndarray, truth: np.ndarray, kinds
     clear, unclear = truth[kinds == STALK], truth[kinds == UNCLEAR]
     right, free = np.zeros(len(stalks), bool), np.ones(len(clear), bool)
     for place in np.argsort(-scores, kind="stable"):
-        fitting = np.where(free, overlaps_with(stalks[place, :4], clear[:, :4]), 0.0)
+        fitting = np.where(free, iou_with_boxes(stalks[place, :4], clear[:, :4]), 0.0)
         if fitting.size and fitting.max() >= IOU:
             right[place], free[int(fitting.argmax())] = True, False
-    on_unclear = np.array([bool((overlaps_with(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
+    on_unclear = np.array([bool((iou_with_boxes(stalk[:4], unclear[:, :4]) >= IOU).any()) for stalk in stalks], bool)
     return right, on_unclear & ~right
 
 
@@ -125,16 +132,16 @@ def mask_overlap(params: Any, examples: Sequence[Example], settings: Settings, d
     return float(np.mean(overlaps)) if overlaps else float("nan")
 
 
-def score(finds: Sequence[Finds]) -> Score:
-    """Compute the metrics of the detections in several images, pooled."""
-    labels = sum(image.labels for image in finds)
-    scores = np.concatenate([image.scores[~image.ignored] for image in finds] or [np.zeros(0)])
-    right = np.concatenate([image.right[~image.ignored] for image in finds] or [np.zeros(0, bool)])
+def score_detections(detections: Sequence[ImageDetections]) -> Score:
+    """Compute the metrics of the detections in several images, pooled; ignored detections are left out."""
+    labels = sum(image.labels for image in detections)
+    scores = np.concatenate([image.scores[~image.ignored] for image in detections] or [np.zeros(0)])
+    right = np.concatenate([image.is_correct[~image.ignored] for image in detections] or [np.zeros(0, bool)])
     counted = scores >= MIN_SCORE
     hits, count = int(right[counted].sum()), int(counted.sum())
     nothing = float("nan")
     return Score(
-        images=len(finds),
+        images=len(detections),
         labels=labels,
         finds=count,
         right=hits,
