@@ -317,7 +317,7 @@ def _ablation_rows(variant: str, claim: str) -> Claim:
 def _finger() -> Claim:
     comparisons = _rewards(OURS, "oracle", (FINGER,)) + _rewards("autoencoder", "oracle", (FINGER,))
     named = [
-        dataclasses.replace(comparison, place=f"finger, {method}")
+        dataclasses.replace(comparison, setting=f"finger, {method}")
         for comparison, method in zip(comparisons, ("indicator, balanced and filtered", "autoencoder"), strict=True)
     ]
     ends = [indicator.run(FINGER, variant).median() for variant in (OURS, "oracle", "autoencoder")]

@@ -71,6 +71,7 @@ def mesh_table(results: Path) -> str:
         config, size = record["config"], record["config"]["image_size"]
         names = [name for name in ("textures", "shadows") if config.get(name)]
         scene = config["scene"] + (f", with {' and '.join(names)}" if names else "")
-        rates = f"{format_short(ours[str(config)]['value'])} | {format_short(record['value'])} | {record['details']['ours_over_peer']:.3g}"
-        lines.append(f"| {scene} | {size}x{size}, {config['images']:,} | {rates} |")
+        rates = (format_short(each["value"]) for each in (ours[str(config)], record))
+        cells = [scene, f"{size}x{size}, {config['images']:,}", *rates, f"{record['details']['ours_over_peer']:.3g}"]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
