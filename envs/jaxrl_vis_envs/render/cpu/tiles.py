@@ -27,8 +27,8 @@ _MIN_PIXELS = 48 * 48
 
 def _culls_per_tile(scene: Scene) -> bool:
     """Return True if objects are culled per tile; otherwise `raycast.nearest_key` tests them all."""
-    is_small = len(raycast.primitive_rows(scene, transparent=False)) <= raycast.MAX_UNROLLED
-    return is_small and scene.height * scene.width >= _MIN_PIXELS
+    has_few = len(raycast.primitive_rows(scene, transparent=False)) <= raycast.MAX_UNROLLED
+    return has_few and not raycast.has_separate_rows(scene) and scene.height * scene.width >= _MIN_PIXELS
 
 
 def layout(scene: Scene) -> blocks.Layout:
