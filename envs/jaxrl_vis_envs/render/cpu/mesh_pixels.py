@@ -4,6 +4,7 @@ Triangles are shaded for a list of pixels, because few pixels show one, and each
 looks up the triangle, and lights three corners.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -54,21 +55,19 @@ def draw(
         bits: Bits per channel of a packed colour.
     """
 
-    @sequential_vmap
-    def draw_image(scene: Scene, unit: shapes.UnitShapes, light_table: jax.Array | None, rays: Rays) -> MeshPixels:
-        far = jnp.broadcast_to(scene.zfar, rays.u.shape)
-        depth, triangle, owner = raster.nearest_triangle(scene, unit, rays, far, layout)
-        # The lowest bits of the depths hold other information: the middle of their range.
-        middle = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~triangles.NUMBER) | (triangles.NUMBER + 1) // 2
-        near = jnp.where(owner >= 0, middle, jax.lax.bitcast_convert_type(far, jnp.int32))
-        if light_table is None:
-            return MeshPixels(near, owner, None)
-        return MeshPixels(near, owner, _colour(scene, unit, light_table, rays, near, triangle, owner, bits))
-
-    return draw_image(scene, unit, light_table, rays)
+    far = jnp.broadcast_to(scene.zfar, rays.u.shape)
+    depth, triangle, owner = raster.nearest_triangle(scene, unit, far, layout)
+    # The lowest bits of the depths hold other information: the middle of their range.
+    middle = (jax.lax.bitcast_convert_type(depth, jnp.int32) & ~triangles.NUMBER) | (triangles.NUMBER + 1) // 2
+    near = jnp.where(owner >= 0, middle, jax.lax.bitcast_convert_type(far, jnp.int32))
+    if light_table is None:
+        return MeshPixels(near, owner, None)
+    colour = sequential_vmap(functools.partial(_colour, bits))(scene, unit, light_table, rays, near, triangle, owner)
+    return MeshPixels(near, owner, colour)
 
 
 def _colour(
+    bits: int,
     scene: Scene,
     unit: shapes.UnitShapes,
     light_table: jax.Array,
@@ -76,7 +75,6 @@ def _colour(
     near: jax.Array,
     triangle: jax.Array,
     owner: jax.Array,
-    bits: int,
 ) -> jax.Array:
     """Return the packed colours of the pixels with a triangle, [blocks, P] int32, any value elsewhere."""
     shape = owner.shape

@@ -1,19 +1,21 @@
-"""Nearest triangles of an image on a CPU, by rasterisation: each triangle is tested at the pixels within its bounds only.
+"""Nearest triangles of images on a CPU, by rasterisation: each triangle is tested at the pixels within its bounds only.
 
 Most triangles of a fine mesh lie between the middles of pixels, or face away from the camera. So clusters of triangles are
 selected by their bounds, then single triangles by theirs, and the pairs of a triangle and a pixel that remain are tested as in
 the plain renderer: some thousand pairs in an image of 64x64, where testing blocks of pixels takes millions.
 
-How many there are differs between images. They are processed in groups of a fixed size, and the images of a batch one after
-another, so that none waits for those of another image, and all of an image's arrays stay in the cache.
+How many there are differs between images. Those of some images are therefore listed one after another, and processed in chunks
+of a fixed size, so that no image waits for another one, and the arrays of a chunk stay in the cache.
 """
 
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import sequential_vmap
+from jax.custom_batching import custom_vmap
 
 from jaxrl_vis_envs.compiling.compilation import targets_cpu
 from jaxrl_vis_envs.render import camera
@@ -22,23 +24,67 @@ from jaxrl_vis_envs.render.model import meshes
 from jaxrl_vis_envs.render.pixel import blocks, raycast, shapes, triangles
 from jaxrl_vis_envs.render.scene import Scene
 
-# Clusters, and pairs of a triangle and a pixel, that are processed together.
+# Maximum number of images whose triangles are in one list.
+_IMAGES = 8
+# Clusters, and pairs of a triangle and a pixel, in a chunk, per image of the list.
 _CLUSTERS, _PAIRS = 256, 1024
 # Part of a pixel, and of a triangle's size, by which its bounds are enlarged; more than the rounding errors.
 _ROUNDING, _RELATIVE = 1e-2, 1e-4
-_FACING = 1e-5  # m, height above a triangle's plane from which its front may be visible
+_FACING = 1e-5  # height above a triangle's plane in m, or sine of the angle to it, below which its front is invisible
 _UNSET = np.iinfo(np.int32).max
+_TABLES = ("triangles", "clusters", "cluster_places")
+_LENS = ("fovy", "focal", "principal", "sensor", "znear")
 
 
-class _Boxes(NamedTuple):
-    """Pixels that triangles may cover, [T] int32 each.
+class _Views(NamedTuple):
+    """Images to search, [B, ...].
 
     Attributes:
-        first: Index of the first pixel, in row-major order.
-        width: Number of columns.
-        ends: Cumulative numbers of pixels.
+        lens: Leaves of the scene by name, those in `_LENS`.
+        unit: Rendered objects.
+        depth: [B, P] float32, metres, maximum depth.
     """
 
+    lens: dict[str, jax.Array]
+    unit: shapes.UnitShapes
+    depth: jax.Array
+
+
+class _List(NamedTuple):
+    """Images whose triangles are in one list, G.
+
+    Attributes:
+        scene: Scene with the leaves in `_TABLES` only.
+        ends: [G * K] int32, cumulative number of clusters that may be visible.
+        axes, origin: Of the objects of all images, one after another, see `UnitShapes`.
+        lens: [G, 5] float32: u and v in the middle of the image, change of u and of v from one pixel to the next, and depth of
+            the near plane, m.
+        rays: [G * P].
+        places: [H * W] int32, places of the pixels among the P, NumPy.
+    """
+
+    scene: Scene
+    ends: jax.Array
+    axes: jax.Array
+    origin: jax.Array
+    lens: jax.Array
+    rays: Rays
+    places: np.ndarray
+
+
+class _Chunk(NamedTuple):
+    """Some of the clusters of a list, Q, and the pixels that their triangles may cover, T = Q * CLUSTER.
+
+    Attributes:
+        image: [Q] int32.
+        cluster: [Q] int32.
+        first: [T] int32, first pixel in row-major order.
+        width: [T] int32, number of columns, at least 1.
+        ends: [T] int32, cumulative number of pixels.
+    """
+
+    image: jax.Array
+    cluster: jax.Array
     first: jax.Array
     width: jax.Array
     ends: jax.Array
@@ -57,157 +103,202 @@ def nearest(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> blocks.Nearest
         unit: Rendered objects.
         rays: [blocks, P], those of all pixels, in the order of `blocks.layout`.
     """
-    layout = blocks.layout(scene)
     scene, unit = jax.lax.stop_gradient((scene, unit))
     key, row = blocks.nearest_primitives(scene, unit, rays)
-
-    @sequential_vmap
-    def search(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array) -> tuple[jax.Array, ...]:
-        return nearest_triangle(scene, unit, rays, depth, layout)
-
-    found = search(scene, unit, rays, raycast.decode(scene, key, row)[0])
+    found = nearest_triangle(scene, unit, raycast.decode(scene, key, row)[0], blocks.layout(scene))
     return blocks.add_triangles(scene, key, row, found)
 
 
 def nearest_triangle(
-    scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Array, layout: blocks.Layout
+    scene: Scene, unit: shapes.UnitShapes, depth: jax.Array, layout: blocks.Layout
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Find the nearest triangle of an opaque object in front of ``depth``, as `triangles.nearest_triangle`.
+    """Find the nearest triangle of an opaque object in front of ``depth``. Not differentiable.
 
     Args:
         scene: Scene with triangles.
         unit: Rendered objects.
-        rays: [blocks, P], those of all pixels.
         depth: [blocks, P] float32, metres, maximum depth.
         layout: Order of the pixels.
+
+    Returns:
+        As `triangles.nearest_triangle`, [blocks, P] each. The lowest bits of the depths are those of `triangles.NUMBER`.
     """
-    shape = depth.shape
-    rays, depth = jax.tree.map(jnp.ravel, (rays, depth))
-    bounds = triangles.opaque_bounds(scene, unit)
-    counts = jnp.cumsum(triangles.bounded(scene, bounds, rays, depth).astype(jnp.int32), dtype=jnp.int32)
-    last = counts.shape[0] - 1
+    leaves = [field.name for field in dataclasses.fields(scene) if not field.metadata.get("static")]
+    tables = {name: getattr(scene, name) for name in _TABLES}
+    views = _Views({name: getattr(scene, name) for name in _LENS}, unit, depth.ravel())
+    search = _by_image(scene.replace(**dict.fromkeys(leaves)), layout)
+    best, index = search(tables, jax.tree.map(lambda leaf: leaf[None], views))
+    best, index = best.reshape(depth.shape), index.reshape(depth.shape)
+    return jax.lax.bitcast_convert_type(best, jnp.float32), *triangles.place(scene, index)
+
+
+def _by_image(bare: Scene, layout: blocks.Layout) -> Callable[[dict, _Views], tuple[jax.Array, jax.Array]]:
+    """Return `_search_list` of any number of images; axes of `jax.vmap` are merged into that of the images."""
+
+    @custom_vmap
+    def search(tables: dict[str, jax.Array], views: _Views) -> tuple[jax.Array, jax.Array]:
+        count = views.depth.shape[0]
+        size = max(size for size in range(1, _IMAGES + 1) if count % size == 0)
+        lists = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), views)
+        found = jax.lax.map(lambda views: _search_list(bare.replace(**tables), layout, views), lists)
+        return jax.tree.map(lambda plane: plane.reshape(count, -1), found)
+
+    @search.def_vmap
+    def _(size: int, in_batched: list, tables: dict, views: _Views) -> tuple[tuple, tuple]:
+        def spread(leaf: jax.Array, is_batched: bool) -> jax.Array:
+            return leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
+
+        views = jax.tree.map(spread, views, in_batched[1])
+        if any(jax.tree.leaves(in_batched[0])):  # meshes differ between images
+            tables = jax.tree.map(spread, tables, in_batched[0])
+            return jax.lax.map(lambda given: search(*given), (tables, views)), (True, True)
+        merged = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), views)
+        found = search(tables, merged)
+        return jax.tree.map(lambda plane: plane.reshape(size, -1, plane.shape[-1]), found), (True, True)
+
+    return search
+
+
+def _search_list(scene: Scene, layout: blocks.Layout, views: _Views) -> tuple[jax.Array, jax.Array]:
+    """Find the nearest triangles of images.
+
+    Args:
+        scene: Scene with the leaves in `_TABLES` only.
+        layout: Order of the pixels.
+        views: The images, [G, ...].
+
+    Returns:
+        Bits of the depth, with the triangle's number in the lowest ones; and the triangle, which is its cluster times
+        `CLUSTER` plus its number, -1 for none; [G * P] int32 each.
+    """
     inside = (layout.rows < scene.height) & (layout.columns < scene.width)
     places = np.zeros(scene.height * scene.width, np.int32)
     places[(layout.rows * scene.width + layout.columns)[inside]] = np.flatnonzero(inside)
 
-    def draw_clusters(state: tuple) -> tuple:
-        step, *image = state
-        ordinals = step * _CLUSTERS + np.arange(_CLUSTERS, dtype=np.int32)
-        cluster = jnp.minimum(triangles.kth(counts, ordinals), last)
-        boxes = _triangle_boxes(scene, unit, cluster, ordinals < counts[last])
+    def see(lens: dict[str, jax.Array], unit: shapes.UnitShapes, depth: jax.Array) -> tuple:
+        seen = scene.replace(**lens)
+        rays = camera.pixel_rays(seen, layout.rows.ravel(), layout.columns.ravel())
+        visible = triangles.bounded(seen, triangles.opaque_bounds(seen, unit), rays, depth)
+        numbers = (*camera.lens(seen)[:2], *camera.pixel_pitch(seen), seen.znear)
+        return visible, jnp.stack(numbers), rays
 
-        def draw_pairs(state: tuple) -> tuple:
-            step, *image = state
-            return step + 1, *_draw_pairs(scene, unit, cluster, boxes, step, rays, jnp.asarray(places), *image)
+    visible, lens, rays = jax.vmap(see)(*views)
+    ends = jnp.cumsum(visible.ravel().astype(jnp.int32), dtype=jnp.int32)
+    axes, origin = views.unit.axes.reshape(-1, 3, 3), views.unit.origin.reshape(-1, 3)
+    listed = _List(scene, ends, axes, origin, lens, jax.tree.map(jnp.ravel, rays), places)
+    clusters, pairs = (size * len(views.depth) for size in (_CLUSTERS, _PAIRS))
 
-        return step + 1, *_loop(boxes.ends[-1], _PAIRS, draw_pairs, image)
+    def draw_clusters(step: jax.Array, image: tuple) -> tuple:
+        chunk = _make_chunk(listed, step * clusters + np.arange(clusters, dtype=np.int32))
 
-    image = [jax.lax.bitcast_convert_type(depth, jnp.int32), jnp.full(depth.shape, -1, jnp.int32)]
-    best, index = _loop(counts[last], _CLUSTERS, draw_clusters, image)
-    found = (jax.lax.bitcast_convert_type(best, jnp.float32), *triangles.place(scene, index))
-    return jax.tree.map(lambda plane: plane.reshape(shape), found)
+        def draw_pairs(step: jax.Array, image: tuple) -> tuple:
+            return _draw_pairs(listed, chunk, step * pairs + np.arange(pairs, dtype=np.int32), *image)
+
+        return _in_chunks(chunk.ends[-1], pairs, draw_pairs, image)
+
+    far = jax.lax.bitcast_convert_type(views.depth.ravel(), jnp.int32)
+    return _in_chunks(ends[-1], clusters, draw_clusters, (far, jnp.full(far.shape, -1, jnp.int32)))
 
 
-def _loop(count: jax.Array, size: int, advance: object, image: list) -> list:
-    """Advance the state ``(step, *image)`` for each group of ``size`` of ``count`` elements; return the image."""
-    return jax.lax.while_loop(lambda state: state[0] * size < count, advance, (jnp.zeros((), jnp.int32), *image))[1:]
+def _in_chunks(count: jax.Array, size: int, draw: Callable[[jax.Array, tuple], tuple], image: tuple) -> tuple:
+    """Draw chunks of ``size`` of ``count`` elements, by their number, over an image."""
+    state = (jnp.zeros((), jnp.int32), image)
+    return jax.lax.while_loop(lambda state: state[0] * size < count, lambda s: (s[0] + 1, draw(*s)), state)[1]
 
 
-def _triangle_boxes(scene: Scene, unit: shapes.UnitShapes, cluster: jax.Array, valid: jax.Array) -> _Boxes:
-    """Return the boxes of the triangles of clusters [Q], those of a cluster one after another; empty unless ``valid`` [Q]."""
-    place = scene.cluster_places[cluster]
-    axes, origin = unit.axes[place[:, 0]], unit.origin[place[:, 0]]
+def _get(array: jax.Array, index: jax.Array) -> jax.Array:
+    return array.at[index].get(mode="promise_in_bounds")
 
-    def columns(first: int, count: int) -> jax.Array:
-        size = (meshes.CLUSTER, count)
-        return jax.vmap(lambda row: jax.lax.dynamic_slice(scene.triangles, (row, np.int32(first)), size))(place[:, 1])
 
-    normal, corners = columns(meshes.MAP.start + 8, 4), columns(meshes.CORNERS.start, 9)
-    sides = []
-    depths, us, vs = [], [], []
+def _make_chunk(listed: _List, ordinals: jax.Array) -> _Chunk:
+    """Return the clusters with numbers ``ordinals`` [Q] in the list. Those beyond its end have triangles without pixels."""
+    scene, count = listed.scene, listed.scene.cluster_places.shape[0]
+    element = jnp.minimum(triangles.kth(listed.ends, ordinals), len(listed.ends) - 1)
+    image, cluster = element // count, element % count
+    place = _get(scene.cluster_places, cluster)
+    pose = image * (len(listed.origin) // len(listed.lens)) + place[:, 0]
+    axes, origin, lens = _get(listed.axes, pose)[:, None], _get(listed.origin, pose)[:, None], _get(listed.lens, image)[:, None]
+    normal = _columns(scene, place[:, 1], meshes.CLUSTER, meshes.MAP.start + 8, 4)  # the map's third row
+    corners = _columns(scene, place[:, 1], meshes.CLUSTER, meshes.CORNERS.start, 9)
+    is_flat = scene.projection == "orthographic"
+
+    depths, coordinates = [], ([], [])
     for corner in range(3):
-        offset = [corners[:, :, 3 * corner + i] - origin[:, None, i] for i in range(3)]
-        x, y, z = (sum(axes[:, None, i, j] * offset[i] for i in range(3)) for j in range(3))
-        depths.append(-z)
-        scale = 1.0 if scene.projection == "orthographic" else 1.0 / jnp.maximum(-z, 1e-6)
-        us.append(x * scale)
-        vs.append(y * scale)
-    nearest = jnp.minimum(jnp.minimum(depths[0], depths[1]), depths[2])
-    farthest = jnp.maximum(jnp.maximum(depths[0], depths[1]), depths[2])
-    if scene.projection == "orthographic":
-        ahead = -sum(normal[:, :, i] * axes[:, None, i, 2] for i in range(3))
-        is_front = ahead < _FACING
+        offset = [corners[..., 3 * corner + i] - origin[..., i] for i in range(3)]
+        point = [sum(axes[..., i, j] * offset[i] for i in range(3)) for j in range(3)]
+        depths.append(-point[2])
+        scale = 1.0 if is_flat else 1.0 / jnp.maximum(-point[2], 1e-6)
+        for values, component in zip(coordinates, point, strict=False):
+            values.append(component * scale)
+    if is_flat:
+        height = sum(normal[..., i] * axes[..., i, 2] for i in range(3))
     else:
-        height = sum(normal[:, :, i] * origin[:, None, i] for i in range(3)) + normal[:, :, 3]
-        is_front = height > -_FACING
-    is_front &= valid[:, None] & (farthest > scene.znear)
-    crosses = (nearest < scene.znear) & (scene.projection != "orthographic")
-    middles = camera.lens(scene)
-    sides = []
-    for coordinates, middle, pitch, count, sign in (
-        (us, middles[0], camera.pixel_pitch(scene)[0], scene.width, 1.0),
-        (vs, middles[1], camera.pixel_pitch(scene)[1], scene.height, -1.0),  # rows are counted from the top
-    ):
-        at = [sign * (coordinate - middle) / pitch + 0.5 * (count - 1) for coordinate in coordinates]
-        low, high = jnp.minimum(jnp.minimum(at[0], at[1]), at[2]), jnp.maximum(jnp.maximum(at[0], at[1]), at[2])
+        height = sum(normal[..., i] * origin[..., i] for i in range(3)) + normal[..., 3]
+    is_front = (height > -_FACING) & (_largest(depths) > lens[..., 4]) & (ordinals < listed.ends[-1])[:, None]
+    # A triangle that is partly behind the near plane may cover any pixel.
+    is_cut = (_smallest(depths) < lens[..., 4]) & (not is_flat)
+    ranges = []
+    for axis, (values, length, sign) in enumerate(zip(coordinates, (scene.width, scene.height), (1.0, -1.0), strict=True)):
+        at = [sign * (value - lens[..., axis]) / lens[..., 2 + axis] + 0.5 * (length - 1) for value in values]
+        low, high = _smallest(at), _largest(at)
         margin = _ROUNDING + _RELATIVE * (high - low)
-        low = jnp.clip(jnp.ceil(low - margin), 0.0, count)
-        high = jnp.clip(jnp.floor(high + margin), -1.0, count - 1.0)
-        sides.append((jnp.where(crosses, 0.0, low).astype(jnp.int32), jnp.where(crosses, count - 1.0, high).astype(jnp.int32)))
-    (left, right), (top, bottom) = sides
-    width = jnp.maximum(right - left + 1, 0)
-    size = jnp.where(is_front, width * jnp.maximum(bottom - top + 1, 0), 0).ravel()
-    return _Boxes((top * scene.width + left).ravel(), width.ravel(), jnp.cumsum(size, dtype=jnp.int32))
+        low = jnp.where(is_cut, 0.0, jnp.clip(jnp.ceil(low - margin), 0.0, length))
+        high = jnp.where(is_cut, length - 1.0, jnp.clip(jnp.floor(high + margin), -1.0, length - 1.0))
+        ranges.append((low.astype(jnp.int32), jnp.maximum(high - low + 1.0, 0.0).astype(jnp.int32)))
+    (left, width), (top, height) = ranges
+    pixels = jnp.where(is_front, width * height, 0).ravel()
+    first = (top * scene.width + left).ravel()
+    return _Chunk(image, cluster, first, jnp.maximum(width, 1).ravel(), jnp.cumsum(pixels, dtype=jnp.int32))
+
+
+def _smallest(values: list[jax.Array]) -> jax.Array:
+    return jnp.minimum(jnp.minimum(values[0], values[1]), values[2])
+
+
+def _largest(values: list[jax.Array]) -> jax.Array:
+    return jnp.maximum(jnp.maximum(values[0], values[1]), values[2])
+
+
+def _columns(scene: Scene, row: jax.Array, rows: int, first: int, count: int) -> jax.Array:
+    """Return columns of successive rows of `Scene.triangles`: [Q, ``rows``, ``count``], from the rows given [Q]."""
+    return jax.vmap(lambda row: jax.lax.dynamic_slice(scene.triangles, (row, np.int32(first)), (rows, count)))(row)
 
 
 def _draw_pairs(
-    scene: Scene,
-    unit: shapes.UnitShapes,
-    cluster: jax.Array,
-    boxes: _Boxes,
-    step: jax.Array,
-    rays: Rays,
-    places: jax.Array,
-    best: jax.Array,
-    index: jax.Array,
+    listed: _List, chunk: _Chunk, ordinals: jax.Array, best: jax.Array, index: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Draw a group of pairs of a triangle and a pixel into an image.
+    """Draw pairs of a triangle and a pixel.
 
     Args:
-        scene: The scene.
-        unit: Rendered objects.
-        cluster: [Q] int32.
-        boxes: Those of the clusters' triangles.
-        step: [] int32, number of the group.
-        rays: [P].
-        places: [H * W] int32, places of the pixels among the P.
-        best: [P] int32, bits of the depth of the nearest intersection, of which the lowest hold the triangle's number.
-        index: [P] int32, the triangle: cluster times `CLUSTER` plus number; -1 for none.
+        listed: The images.
+        chunk: Triangles.
+        ordinals: [N] int32, numbers of the pairs among those of the chunk; those beyond the last have no effect.
+        best: [G * P] int32, see `_search_list`.
+        index: [G * P] int32.
 
     Returns:
         The new ``best`` and ``index``.
     """
-    ordinals = step * _PAIRS + np.arange(_PAIRS, dtype=np.int32)
-    item = jnp.minimum(triangles.kth(boxes.ends, ordinals), boxes.ends.shape[0] - 1)
-    before = jnp.where(item > 0, boxes.ends[jnp.maximum(item - 1, 0)], 0)
-    number, width = ordinals - before, jnp.maximum(boxes.width[item], 1)
-    pixel = boxes.first[item] + number // width * scene.width + number % width
-    valid = ordinals < boxes.ends[-1]
-    pixel = places[jnp.where(valid, pixel, 0)]
-    own, member = cluster[item // meshes.CLUSTER], item % meshes.CLUSTER
-    place = scene.cluster_places[own]
-    axes, origin = unit.axes[place[:, 0]], unit.origin[place[:, 0]]
-    row = place[:, 1] + member
-    maps = jax.vmap(lambda row: jax.lax.dynamic_slice(scene.triangles, (row, np.int32(meshes.MAP.start)), (1, 12)))(row)
-    maps = maps.reshape(_PAIRS, 3, 4)
-    local = [[sum(maps[:, i, k] * axes[:, k, j] for k in range(3)) for j in range(3)] for i in range(3)]
+    scene, valid = listed.scene, ordinals < chunk.ends[-1]
+    item = jnp.minimum(triangles.kth(chunk.ends, ordinals), len(chunk.ends) - 1)
+    number = ordinals - jnp.where(item > 0, _get(chunk.ends, jnp.maximum(item - 1, 0)), 0)
+    width, own, member = _get(chunk.width, item), item // meshes.CLUSTER, item % meshes.CLUSTER
+    pixel = _get(chunk.first, item) + number // width * scene.width + number % width
+    image, cluster = _get(chunk.image, own), _get(chunk.cluster, own)
+    pixel = image * (len(best) // len(listed.lens)) + _get(jnp.asarray(listed.places), jnp.where(valid, pixel, 0))
+    place = _get(scene.cluster_places, cluster)
+    pose = image * (len(listed.origin) // len(listed.lens)) + place[:, 0]
+    axes, origin = _get(listed.axes, pose), _get(listed.origin, pose)
+    maps = _columns(scene, place[:, 1] + member, 1, meshes.MAP.start, 12).reshape(-1, 3, 4)
+    local_map = [[sum(maps[:, i, k] * axes[:, k, j] for k in range(3)) for j in range(3)] for i in range(3)]
     begin = [sum(maps[:, i, k] * origin[:, k] for k in range(3)) + maps[:, i, 3] for i in range(3)]
-    t, margin, is_front = triangles.cross(scene, local, begin, Rays(rays.u[pixel], rays.v[pixel]))
+    rays = Rays(_get(listed.rays.u, pixel), _get(listed.rays.v, pixel))
+    t, margin, is_front = triangles.cross(scene.replace(znear=_get(listed.lens, image)[:, 4]), local_map, begin, rays)
     meets = valid & is_front & (margin >= -triangles.SEAM)
-    key = (jax.lax.bitcast_convert_type(t, jnp.int32) & ~triangles.NUMBER) | member
-    nearest = best.at[pixel].min(jnp.where(meets, key, _UNSET))
-    # Of triangles at the same depth, the first one counts, also if it was drawn in an earlier group.
+    key = jnp.where(meets, (jax.lax.bitcast_convert_type(t, jnp.int32) & ~triangles.NUMBER) | member, _UNSET)
+    nearest = best.at[pixel].min(key, mode="promise_in_bounds")
+    # Of triangles at the same depth, the first one counts, also if it was drawn in an earlier chunk.
     is_new = nearest < best
-    first = meets & (key == nearest[pixel])
-    index = jnp.where(is_new, _UNSET, index)
-    return nearest, index.at[pixel].min(jnp.where(first & is_new[pixel], own * meshes.CLUSTER + member, _UNSET))
+    is_first = (key == _get(nearest, pixel)) & _get(is_new, pixel)
+    triangle = jnp.where(is_first, cluster * meshes.CLUSTER + member, _UNSET)
+    return nearest, jnp.where(is_new, _UNSET, index).at[pixel].min(triangle, mode="promise_in_bounds")

@@ -146,8 +146,8 @@ def place(scene: Scene, index: jax.Array) -> tuple[jax.Array, jax.Array]:
     their index in it: [P] int32 each, -1 for none.
     """
     places = scene.cluster_places.at[jnp.maximum(index, 0) // meshes.CLUSTER].get(mode="promise_in_bounds")
-    row = jnp.where(index >= 0, places[:, 1] + (index & NUMBER), -1)
-    return row, jnp.where(index >= 0, places[:, 0], -1)
+    row = jnp.where(index >= 0, places[..., 1] + (index & NUMBER), -1)
+    return row, jnp.where(index >= 0, places[..., 0], -1)
 
 
 def bounded(scene: Scene, bounds: Bounds, rays: Rays, depth: jax.Array) -> jax.Array:
