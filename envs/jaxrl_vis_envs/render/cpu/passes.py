@@ -128,12 +128,16 @@ def _render_tiles(
         key, row, own_keys = tiles.nearest_key(scene, unit, rays, visible, tile.own_keys, labelled)
         if mesh is not None:
             key, row = mesh_pixels.put_in_front(scene, mesh, key, row, labelled)
-        sheet_keys = tiles.keys_of_objects(scene, unit, sheet_rows, rays, visible, tile.sheet_keys, labelled)
-        tile = tile._replace(key=key, row=row, own_keys=own_keys, sheet_keys=sheet_keys)
+        tile = tile._replace(key=key, row=row, own_keys=own_keys)
+        if sheet_rows:
+            mask = raycast.code_mask(scene) if labelled else 0
+            missed = raycast.sky_key(scene, mask)
+            own_keys = tiles.keys_of_objects(scene, unit, sheet_rows, rays, visible, tile.sheet_keys, missed, mask)
+            tile = tile._replace(sheet_keys=own_keys)
         if colouring is not None:
             tile = colouring.colour(tile, rays, visible, mesh)
-        for number_of_sheet, own in zip(sheet_rows, sheet_keys, strict=True):
-            key = jnp.where(visible[number_of_sheet], jnp.minimum(key, own), key)
+        for sheet, own in zip(sheet_rows, tile.sheet_keys, strict=True):
+            key = jnp.where(visible[sheet], jnp.minimum(key, own), key)
         tile = tile._replace(key=key)
         return (number + 1, tile, results), None
 

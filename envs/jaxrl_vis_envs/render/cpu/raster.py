@@ -139,7 +139,7 @@ def _by_image(bare: Scene, layout: blocks.Layout) -> Callable[[dict, _Views], tu
     def search(tables: dict[str, jax.Array], views: _Views) -> tuple[jax.Array, jax.Array]:
         count = views.depth.shape[0]
         size = max(size for size in range(1, _IMAGES + 1) if count % size == 0)
-        lists = jax.tree.map(lambda leaf: leaf.reshape(-1, size, *leaf.shape[1:]), views)
+        lists = jax.tree.map(lambda leaf: leaf.reshape(count // size, size, *leaf.shape[1:]), views)
         found = jax.lax.map(lambda views: _search_list(bare.replace(**tables), layout, views), lists)
         return jax.tree.map(lambda plane: plane.reshape(count, -1), found)
 
@@ -152,7 +152,7 @@ def _by_image(bare: Scene, layout: blocks.Layout) -> Callable[[dict, _Views], tu
         if any(jax.tree.leaves(in_batched[0])):  # meshes differ between images
             tables = jax.tree.map(spread, tables, in_batched[0])
             return jax.lax.map(lambda given: search(*given), (tables, views)), (True, True)
-        merged = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), views)
+        merged = jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), views)
         found = search(tables, merged)
         return jax.tree.map(lambda plane: plane.reshape(size, -1, plane.shape[-1]), found), (True, True)
 

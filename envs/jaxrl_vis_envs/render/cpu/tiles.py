@@ -93,7 +93,7 @@ def nearest_key(
     mask = raycast.code_mask(scene) if labelled else 0
     sky = raycast.sky_key(scene, mask)
     rows = non_plane_rows(scene)
-    object_keys = keys_of_objects(scene, unit, rows, rays, visible, object_keys, labelled)
+    object_keys = keys_of_objects(scene, unit, rows, rays, visible, object_keys, sky, mask)
     best = jnp.broadcast_to(sky, rays.u.shape)
     for row in raycast.primitive_rows(scene, transparent=False):
         if row not in rows:
@@ -110,7 +110,8 @@ def keys_of_objects(
     rays: Rays,
     visible: jax.Array,
     object_keys: tuple[jax.Array, ...],
-    labelled: bool,
+    sky: jax.Array,
+    mask: int,
 ) -> tuple[jax.Array, ...]:
     """Compute the keys [P] int32 of each of some objects in one tile; any value unless it is ``visible`` there.
 
@@ -121,10 +122,9 @@ def keys_of_objects(
         rays: [P].
         visible: [G] bool, a row of `visible_in_tiles`.
         object_keys: Buffers [P] for the results, with any contents.
-        labelled: As in `nearest_key`.
+        sky: [] int32, key where a ray misses an object.
+        mask: As in `raycast.sky_key`.
     """
-    mask = raycast.code_mask(scene) if labelled else 0
-    sky = raycast.sky_key(scene, mask)
 
     def make_key_function(row: int) -> Callable[[jax.Array], jax.Array]:
         def compute(zero: jax.Array) -> jax.Array:
