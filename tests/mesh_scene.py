@@ -55,9 +55,7 @@ def spec_of_scene(lens: str, glass: str, more: str) -> mujoco.MjSpec:
     return spec
 
 
-def prepared(
-    lens: str = "", glass: str = "", more: str = "", **options: Any
-) -> tuple[Scene, mujoco.MjModel, SimpleNamespace]:
+def prepared(lens: str = "", glass: str = "", more: str = "", **options: Any) -> tuple[Scene, mujoco.MjModel, SimpleNamespace]:
     """Return the scene, its model, and its poses, as arrays.
 
     Args:

@@ -4,7 +4,7 @@ There are three stages: all linear work, once per environment (`pixel.shapes`, `
 (`pixel.raycast`, `pixel.triangles`), an integer that is never differentiated; and, once per pixel, depth, normal and colour of
 that object from a row of a table (`pixel.surface`, `pixel.shade`). For most scenes the last two stages are one kernel on a GPU
 (`gpu.kernel`), and passes without redundant computation on a CPU (`cpu.passes`). In scenes with meshes or height fields, a
-kernel on a GPU searches for their triangles (`gpu.search`).
+kernel on a GPU searches for their triangles (`gpu.search`), and a CPU rasterises them (`cpu.raster`).
 """
 
 import dataclasses

@@ -54,7 +54,6 @@ def draw(
         layout: Order of the pixels.
         bits: Bits per channel of a packed colour.
     """
-
     far = jnp.broadcast_to(scene.zfar, rays.u.shape)
     depth, triangle, owner = raster.nearest_triangle(scene, unit, far, layout)
     # The lowest bits of the depths hold other information: the middle of their range.
@@ -102,7 +101,7 @@ def _colour(
 def put_in_front(
     scene: Scene, pixels: MeshPixels, key: jax.Array, row: jax.Array | None, labelled: bool
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Return the keys of primitives, and their rows (see `tiles.nearest_key`), with those of nearer triangles put in; [P] each."""
+    """Return the keys and rows of primitives (see `tiles.nearest_key`) with those of nearer triangles put in, [P] each."""
     is_triangle = pixels.owner >= 0
     if row is not None:
         is_nearer = is_triangle & (pixels.bits <= key)

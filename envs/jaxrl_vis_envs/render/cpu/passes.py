@@ -6,6 +6,9 @@ nearest object (`raycast`), its normal (in octahedral encoding, 16 bits per axis
 the final colour (8 bits per channel). Each pass over a tile is a loop of one iteration (`tiles.once`), because XLA would fuse
 the passes otherwise; if only planes are visible in a tile, a cheaper version runs.
 
+Triangles are found and shaded before all tiles (`mesh_pixels`), as there are few pixels that show one. Transparent primitives
+have passes of their own (`sheets`).
+
 Per pixel, the code is that of the plain renderer, and results agree up to the last bits: in images with colours, depths are
 decoded from the keys.
 """

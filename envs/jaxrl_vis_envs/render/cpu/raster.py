@@ -10,7 +10,7 @@ of a fixed size, so that no image waits for another one, and the arrays of a chu
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp

@@ -36,7 +36,14 @@ def sheet_rows(scene: Scene) -> list[int]:
 
 
 def face(
-    scene: Scene, unit: shapes.UnitShapes, table: jax.Array, light_table: Any, row: int, rays: Rays, own: jax.Array, key: jax.Array
+    scene: Scene,
+    unit: shapes.UnitShapes,
+    table: jax.Array,
+    light_table: Any,
+    row: int,
+    rays: Rays,
+    own: jax.Array,
+    key: jax.Array,
 ) -> jax.Array:
     """Compute the packed colour of an object's face, [P] int32, with a bit that is set where it is visible.
 

@@ -148,7 +148,7 @@ class Nearest(NamedTuple):
 
 
 def nearest_primitives(scene: Scene, unit: shapes.UnitShapes, rays: Rays) -> tuple[jax.Array, jax.Array | None]:
-    """Return the keys of the nearest opaque primitives along rays [blocks, P], and their rows if the scene has separate rows."""
+    """Return the keys of the nearest opaque primitives along rays [blocks, P], and their rows unless part of the keys."""
     if raycast.has_separate_rows(scene):
         bits_and_row = scan_one(lambda rays: raycast.nearest_row(scene, unit, rays), rays)
         return bits_and_row[:, 0], bits_and_row[:, 1]

@@ -166,7 +166,7 @@ def _candidates(scene: Scene, unit: shapes.UnitShapes, rays: Rays, depth: jax.Ar
 
 
 def kth(counts: jax.Array, step: jax.Array) -> jax.Array:
-    """Return the index of the first of the cumulative ``counts`` [K] that exceeds ``step``, K if there is none; int32, any shape.
+    """Return the index of the first of the cumulative ``counts`` [K] that exceeds ``step``, K for none; int32, any shape.
 
     A bisection: a count of all that do not exceed it would read the whole array for every cluster.
     """
