@@ -57,8 +57,8 @@ class _List(NamedTuple):
         scene: Scene with the leaves in `_TABLES` only.
         ends: [G * K] int32, cumulative number of clusters that may be visible.
         axes, origin: Of the objects of all images, one after another, see `UnitShapes`.
-        lens: [G, 5] float32: u and v in the middle of the image, change of u and of v from one pixel to the next, and depth of
-            the near plane, m.
+        lens: [G, 5] float32: the column is the first number times u plus the third, and the row the second times v plus the
+            fourth; the fifth is the depth of the near plane, m.
         rays: [G * P].
         places: [H * W] int32, places of the pixels among the P, NumPy.
     """
@@ -179,8 +179,13 @@ def _search_list(scene: Scene, layout: blocks.Layout, views: _Views) -> tuple[ja
         seen = scene.replace(**lens)
         rays = camera.pixel_rays(seen, layout.rows.ravel(), layout.columns.ravel())
         visible = triangles.bounded(seen, triangles.opaque_bounds(seen, unit), rays, depth)
-        numbers = (*camera.lens(seen)[:2], *camera.pixel_pitch(seen), seen.znear)
-        return visible, jnp.stack(numbers), rays
+        slopes, shifts = [], []
+        for length, middle, pitch, sign in zip(
+            (scene.width, scene.height), camera.lens(seen), camera.pixel_pitch(seen), (1.0, -1.0), strict=False
+        ):
+            slopes.append(sign / pitch)  # rows are counted from the top
+            shifts.append(0.5 * (length - 1) - slopes[-1] * middle)
+        return visible, jnp.stack([*slopes, *shifts, seen.znear]), rays
 
     visible, lens, rays = jax.vmap(see)(*views)
     ends = jnp.cumsum(visible.ravel().astype(jnp.int32), dtype=jnp.int32)
@@ -238,8 +243,8 @@ def _make_chunk(listed: _List, ordinals: jax.Array) -> _Chunk:
     # A triangle that is partly behind the near plane may cover any pixel.
     is_cut = (_smallest(depths) < lens[..., 4]) & (not is_flat)
     ranges = []
-    for axis, (values, length, sign) in enumerate(zip(coordinates, (scene.width, scene.height), (1.0, -1.0), strict=True)):
-        at = [sign * (value - lens[..., axis]) / lens[..., 2 + axis] + 0.5 * (length - 1) for value in values]
+    for axis, (values, length) in enumerate(zip(coordinates, (scene.width, scene.height), strict=True)):
+        at = [lens[..., axis] * value + lens[..., 2 + axis] for value in values]
         low, high = _smallest(at), _largest(at)
         margin = _ROUNDING + _RELATIVE * (high - low)
         low = jnp.where(is_cut, 0.0, jnp.clip(jnp.ceil(low - margin), 0.0, length))
